@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 class VplogError(Exception):
@@ -63,3 +68,14 @@ def nearest(name: str, choices: Iterable[str], key: Callable[[str], str] = str, 
         spelled.setdefault(key(choice).lower(), choice)
     found = difflib.get_close_matches(name.lower(), spelled, n=1, cutoff=cutoff)
     return f" Did you mean {spelled[found[0]]}?" if found else ""
+
+
+def nearest_path(path: Path) -> str:
+    """` Did you mean PATH?`: the entry with the nearest name in the folder of a path that does not exist, or empty."""
+    if "://" in str(path) or os.path.exists(path):  # noqa: PTH110 (false for a name that is too long)
+        return ""
+    try:
+        entries = sorted(map(str, path.parent.iterdir()))
+    except OSError:
+        return ""
+    return nearest(path.name, entries, key=os.path.basename, cutoff=0.75)

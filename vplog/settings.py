@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from vplog.errors import SettingsError, nearest
+from vplog.errors import SettingsError, nearest, nearest_path
 
 _NOT_YAML = (yaml.YAMLError, ValueError, RecursionError)
 """Errors of the parser: a date like 2024-13-45 or too long a number is a ValueError, deep nesting ends the stack."""
@@ -143,7 +143,7 @@ def load_yaml(path: Path, remedy: str = _A_FILE) -> dict[str, Any]:
         tree = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         why = (error.strerror or error) if isinstance(error, OSError) else error
-        raise SettingsError(f"Cannot read {path}: {why}. {remedy}") from None
+        raise SettingsError(f"Cannot read {path}: {why}. {remedy}{nearest_path(path)}") from None
     except _NOT_YAML as error:
         mark = getattr(error, "problem_mark", None)
         line = "" if mark is None else f" in line {mark.line + 1}"

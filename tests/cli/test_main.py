@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -149,6 +150,9 @@ def test_wrong_usage_exits_with_2(verb: Verb, arguments: tuple[str, ...]) -> Non
         ("run --closuer none A", "no option --closuer. Did you mean --closure of vplog explain?"),
         ("run A -o OUT --topic /cam", "Write it in full: --image-topic, --depth-topic,"),
         ("help fly", "Verbs: info"),
+        ("query MAP LOG", "Did you mean vplog map query?"),
+        ("run A -o OUT \u2014resume", "\u2014resume begins with another dash. Write --resume"),
+        ("run A -o OUT --resume=yes", "argument --resume: takes no value, not 'yes'"),
         ("run -o OUT", "LOG"),
     ],
 )
@@ -160,6 +164,53 @@ def test_wrong_usage_says_what_is_meant_in_one_line(verb: Verb, arguments: str, 
     assert said in error
     assert error.split(": error: ")[1].count("All options: vplog") == 1
     assert "invalid" not in error
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("x" * 300,), ("info", "x" * 300), ("localize", "M", "P", "-o", "x" * 300), ("schemas", "-o", "x" * 300),
+        ("run", "A", "-o", "OUT", "--mask", "x" * 300), ("info", "a\nb"), ("run", "--resume", "-o", "a\nb"),
+        ("map", "info", "a\x1bb\n"), ("info", "a", "b\nc"), ("config", "--pipeline", "x" * 300 + ".yaml"),
+    ],
+    ids=lambda words: " ".join(word[:9] for word in words),
+)  # fmt: skip
+def test_a_name_that_is_too_long_or_has_line_ends_is_an_error_in_one_line(
+    verb: Verb, arguments: tuple[str, ...]
+) -> None:
+    said = verb(*arguments)
+    assert said.code in (1, 2)
+    *usage, error = said.err.splitlines()
+    assert error.startswith("vplog")
+    assert "error: " in error
+    assert "\x1b" not in error
+    assert said.code == 2 or not usage
+
+
+@pytest.mark.parametrize("words", ["info s3://", "diff A gs:///run", "batch http:// -o B", "run https://?a -o B"])
+def test_a_url_without_a_server_is_refused(verb: Verb, words: str) -> None:
+    said = verb(*words.split())
+    assert said.code in (1, 2)
+    assert re.search("names no (bucket|server). Write [a-z0-9]+://", said.err)
+
+
+def test_a_path_that_does_not_exist_names_the_nearest(
+    verb: Verb, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("drive.mcap", "truth.tum", "calibration.yaml", "graph.g2o"):
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "runs").mkdir()
+    for words, meant in {
+        "info drive.mcp": "drive.mcap",
+        "optimize grahp.g2o -o out.g2o": "graph.g2o",
+        "evaluate run --truth truth.tum": "runs",
+        "map info rums": "runs",
+        "config --pipeline calibratoin.yaml": "calibration.yaml",
+    }.items():
+        said = verb(*words.split())
+        assert said.code == 1
+        assert f"Did you mean {meant}?" in said.err
 
 
 def test_what_export_lacks_is_said_beside_what_its_output_may_be(verb: Verb) -> None:

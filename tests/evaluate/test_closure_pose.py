@@ -75,6 +75,46 @@ def test_a_truth_of_another_point_is_estimated(kind: str, seed: int) -> None:
     np.testing.assert_array_equal(found.right, drive.right)
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_marker_as_far_from_the_body_as_it_moves_is_estimated(seed: int) -> None:
+    drive, random = draw("room", 100 + seed), np.random.default_rng(100 + seed)
+    marker = se3.exp(np.concatenate([random.normal(size=3), random.uniform(-0.5, 0.5, 3)]))
+    _, found, of_body = judged(drive, Trajectory(drive.truth.stamp_ns, drive.truth.world_from_body @ marker))
+    assert of_body.frame == "estimated"
+    np.testing.assert_array_equal(found.right, drive.right)
+    np.testing.assert_array_equal(found.wrong, ~drive.right)
+
+
+@pytest.mark.parametrize("scale", [0.3, 7.0])
+@pytest.mark.parametrize("kind", KINDS)
+def test_odometry_without_metres_finds_the_frame_of_the_truth(kind: str, scale: float) -> None:
+    """As that of a single camera."""
+    drive = draw(kind, 3)
+    poses = drive.odometry.world_from_body.copy()
+    poses[:, :3, 3] *= scale
+    drive = replace(drive, odometry=Trajectory(drive.odometry.stamp_ns, poses))
+    _, found, of_body = judged(drive, Trajectory(drive.truth.stamp_ns, drive.truth.world_from_body @ drive.camera))
+    assert (of_body.frame, of_body.offset_s) == ("camera", 0.0)
+    np.testing.assert_array_equal(found.right, drive.right)
+    np.testing.assert_array_equal(found.wrong, ~drive.right)
+    seconds = slice(7, None, 20)
+    _, found, _ = judged(drive, Trajectory(drive.truth.stamp_ns[seconds], drive.truth.world_from_body[seconds]))
+    assert not (found.right & ~drive.right).any()
+    assert not (found.wrong & drive.right).any()
+    assert (found.right | found.wrong)[found.known].mean() > 0.9
+
+
+@pytest.mark.parametrize("offset_s", [-2.0, 0.1, 0.5])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_truth_of_another_clock_is_known_as_such(kind: str, offset_s: float) -> None:
+    drive = draw(kind, 4)
+    for truth in (drive.truth.world_from_body, drive.truth.world_from_body @ drive.camera):
+        late = Trajectory(drive.truth.stamp_ns + round(offset_s * 1e9), truth)
+        found = body_truth(late, drive.odometry, drive.camera).offset_s
+        assert found == pytest.approx(-offset_s, abs=0.03)
+        assert body_truth(Trajectory(drive.truth.stamp_ns, truth), drive.odometry, drive.camera).offset_s == 0.0
+
+
 @pytest.mark.parametrize("times", [1, 10])
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("kind", KINDS)

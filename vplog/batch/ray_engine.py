@@ -210,7 +210,7 @@ def translated(error: BaseException) -> BaseException:
         (exceptions.ObjectLostError, "What it gave back was lost along with a machine. Look at `ray status`"),
         (exceptions.ObjectStoreFullError, "The cluster has no room for what it gives back"),
         (exceptions.OutOfDiskError, "The cluster's disks have no room for what it gives back"),
-        (exceptions.RayError, f"Its worker was killed, as for want of memory ({type(error).__name__})"),
+        (exceptions.RayError, f"Its worker was killed, as by a system that is out of memory ({type(error).__name__})"),
     ):
         if isinstance(error, kind):
             return BrokenExecutor(f"{text}, and run again.")

@@ -23,7 +23,7 @@ def sequence_warning(pairs: Pairs, settings: SequenceSettings, has_truth: bool) 
     if settings.length == 1:
         return []
     if not has_truth:
-        return [f"{length} takes query and map to advance alike, frame by frame; without a truth that is not checked."]
+        return [f"{length} assumes that query and map advance alike, frame by frame; only a truth checks that."]
     queries = np.flatnonzero(pairs.positive)
     queries = queries[np.unique(np.linspace(0, len(queries) - 1, min(_TRIED, len(queries))).astype(int))]
     shares = np.array(

@@ -75,7 +75,7 @@ def _truth_options(required: bool) -> argparse.ArgumentParser:
     option(sub, "--distance-m", positive, "M", "poses, utm, gps: same place within (default: 6; utm: 25)")
     option(sub, "--heading-deg", positive, "DEG", "poses, utm: and turned by at most (default: 45; utm: any)")
     option(sub, "--min-gap", at_least_one, "N", "a drive against itself: matches are N frames older or more")
-    option(sub, "--library-size", at_least_one, "L", "its images (default: 100)", default=100)
+    option(sub, "--library-size", at_least_one, "L", "reference images of the library (default: 100)", default=100)
     cache_options(sub, "features are kept between calls")
     return sub
 
@@ -87,7 +87,7 @@ def _add_comparison(sub: argparse.ArgumentParser) -> None:
     option(sub, "--methods", str, "A,B", text, required=True)
     option(sub, "--sequence", at_least_one, "L", "also match sequences of L frames")
     option(sub, "--library", place, "LOG|LIB", "reference images for all methods (default: MAP)")
-    option(sub, "--library-seed", at_least(0), "S", "of that choice (default: 0)", default=0)
+    option(sub, "--library-seed", at_least(0), "S", "seed of the random choice of these images (default: 0)", default=0)
     option(sub, "-o --output", local, "OUT", "folder for compare.json, answers.csv, scores and figures")
 
 

@@ -340,7 +340,9 @@ def _parser() -> argparse.ArgumentParser:
     add("config", config, settings)
     sub = group("help", "Show what a verb does, and all its options.")
     sub.add_argument("words", nargs="*", metavar="VERB", help="such as `run` or `map query` (default: list the verbs)")
-    sub.set_defaults(verb=lambda arguments: parser.parse_args([*arguments.words, "--help"]), debug=False)
+    sub.set_defaults(
+        verb=lambda arguments: parser.parse_args([*" ".join(arguments.words).split(), "--help"]), debug=False
+    )
     return parser
 
 

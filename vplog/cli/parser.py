@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from vplog.errors import VplogError, nearest
-from vplog.storage.urls import without_secrets
+from vplog.storage.urls import printable, without_secrets
 
 if TYPE_CHECKING:
     from vplog.logs import TopicChoice
@@ -25,6 +26,8 @@ STDOUT = Path("-")
 words: list[str] = []
 """The words of the command line."""
 _ROLES = ("image", "depth", "right", "camera-info", "odometry", "gps", "imu", "mask")
+_DASHES = "\u2013\u2014\u2212"
+"""What text editors make of two hyphens."""
 _MOST = 10**9
 """Largest count an option may have: far above any drive, and whole in every number type."""
 
@@ -65,6 +68,8 @@ class Parser(argparse.ArgumentParser):
         for text in args:
             name = text.partition("=")[0]
             known = self._option_string_actions
+            if name.lstrip(_DASHES) != name:
+                self.error(f"{name} begins with another dash. Write --{name.lstrip(_DASHES)}")
             short = name[:2] in known and not name.startswith("--")  # -oOUT
             if name[:1] != "-" or name in ("-", "--") or name in known or short or " " in text or _is_number(text):
                 continue
@@ -87,7 +92,10 @@ class Parser(argparse.ArgumentParser):
         near, listed = nearest(str(value), known), ", ".join(known)
         if not isinstance(action, argparse._SubParsersAction):
             raise argparse.ArgumentError(action, f"{value!r} is none of {listed}.{near}")
-        if not near and Path(value).exists():
+        inner = [one.prog for one in self._family if one.prog.endswith(f" {value}")]
+        if not near and inner:
+            near = f" Did you mean {' or '.join(inner)}?"
+        elif not near and os.path.exists(value):  # noqa: PTH110 (false for a name that is too long)
             near = f" To look into it: {self.prog} info {value}"
         self.error(f"{value!r} is no verb of {self.prog}.{near or f' Verbs: {listed}.'}")
 
@@ -98,10 +106,10 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """The shortest usage, then what is wrong in one line; exit 2."""
+        message = message.replace("ignored explicit argument", "takes no value, not")
         usage, end = self._brief_usage or self._required_usage(), "" if message.endswith((".", "?", "!")) else "."
-        self.exit(
-            2, f"{usage}{self.prog}: error: {without_secrets(message, words)}{end} All options: {self.prog} --help\n"
-        )
+        wrong = f"{printable(without_secrets(message, words))}{end}"
+        self.exit(2, f"{usage}{self.prog}: error: {wrong} All options: {self.prog} --help\n")
 
     def _required_usage(self) -> str:
         usage = self._get_formatter()
@@ -152,13 +160,13 @@ local_file = _local("file")
 def output_file(text: str) -> Path:
     """A single local file that is written, and no input of anything."""
     path = _replaceable(local_file(text))
-    if path.is_dir():
+    if os.path.isdir(path):  # noqa: PTH112 (false for a name that is too long)
         raise argparse.ArgumentTypeError(f"{path} is a folder: name a file")
     return path
 
 
 def _replaceable(path: Path) -> Path:
-    if path.is_file():
+    if os.path.isfile(path):  # noqa: PTH113
         from vplog.run.run_folder import check_output
 
         try:
@@ -226,7 +234,7 @@ def topic_options() -> argparse.ArgumentParser:
     text = "YAML of ROS, OpenCV, Kalibr, EuRoC, VSLAM-LAB or ORB-SLAM, KITTI's calib.txt, COLMAP's cameras"
     option(topics, "--calibration", resolved, "FILE", text, dest="calibration_file")
     text = (
-        "image whose zero px give no features, of a camera with several TOPIC=FILE; or a folder of one for each image"
+        "image whose zero pixels give no features, TOPIC=FILE with several cameras; or a folder with one for each image"
     )
     option(topics, "--mask", _mask, "[TOPIC=]FILE", text, action="append", default=[])
     return topics
@@ -235,7 +243,7 @@ def topic_options() -> argparse.ArgumentParser:
 def _mask(text: str) -> tuple[str, Path]:
     """Image topic, empty where none is named, and file or folder."""
     topic, given, path = text.partition("=")
-    if not given or Path(text).exists():
+    if not given or os.path.exists(text):  # noqa: PTH110
         topic, path = "", text
     return topic, resolved(path)
 

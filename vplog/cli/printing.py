@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from vplog.cli.parser import words
 from vplog.errors import plural
-from vplog.storage.urls import without_secrets
+from vplog.storage.urls import printable, without_secrets
 
 if TYPE_CHECKING:
     from vplog.batch.worker import Drive
@@ -33,7 +33,8 @@ _UNMOVED_M = 1e-3
 def print_status(message: str) -> None:
     """A line on stderr, wrapped as those of results; a closed or full stderr is ignored."""
     with suppress(OSError):
-        print(_wrapped(f"vplog: {without_secrets(message, words)}", terminal_width(sys.stderr)), file=sys.stderr)
+        text = printable(without_secrets(message, words))
+        print(_wrapped(f"vplog: {text}", terminal_width(sys.stderr)), file=sys.stderr)
 
 
 def print_traceback(_: type[BaseException], error: BaseException, __: TracebackType | None) -> None:
@@ -55,7 +56,8 @@ def terminal_width(stream: TextIO) -> int | None:
 
 def print_line(label: str, text: str) -> None:
     """A label and a text, wrapped between words where stdout is a terminal: names are whole and can be copied."""
-    print(_wrapped(f"{label:10}{' ' if len(label) > 9 else ''}{text}", terminal_width(sys.stdout)))
+    line = printable(f"{label:10}{' ' if len(label) > 9 else ''}{text}")
+    print(_wrapped(line, terminal_width(sys.stdout)))
 
 
 def _wrapped(line: str, width: int | None) -> str:
@@ -74,7 +76,7 @@ def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """
     from rich.cells import cell_len
 
-    cells = [["".join(c if c.isprintable() else repr(c)[1:-1] for c in cell) for cell in row] for row in rows]
+    cells = [[*map(printable, row)] for row in rows]
     heads = [list(line) for line in zip_longest(*(title.split("\n") for title in titles), fillvalue="")]
     widths = [max(map(cell_len, column)) for column in zip(*heads, *cells, strict=True)]
     right = [all(re.fullmatch(r"[-+.\d]*", cell) for cell in column) for column in zip(*cells, strict=True)]
@@ -233,6 +235,11 @@ def _truth_notes(found: dict[str, Any]) -> list[str]:
     if truth is not None and truth["frame"] != "body":
         what = "the camera" if truth["frame"] == "camera" else "another point of the body, found by the odometry"
         notes.append(f"The truth is that of {what}: closures and drift are the body's, ATE and RPE are not.")
+    if truth is not None and truth["offset_s"] is not None:
+        notes.append(
+            "The truth is of another clock: it moves as the odometry does with "
+            f"--truth-offset-s {truth['offset_s']:g}. Without that, figures and closures are judged at wrong times."
+        )
     if truth is not None and truth["odometry"]:
         notes.append("The odometry of this run is the truth itself: ATE, RPE and drift say nothing, closures do.")
     if truth is not None and not truth["oriented"]:

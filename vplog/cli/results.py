@@ -181,8 +181,8 @@ def add_results(
     option(sub, "--fail-on", str, "LIMIT", text, action="append", default=[])
     sub = add("export", export, threads)
     option(sub, "run", place, "RUN")
-    sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
-    text = "what to write; - writes a file to stdout"
+    sub.add_argument("--format", required=True, choices=_FORMATS, help="format to write")
+    text = "file to write, a folder for colmap and nerfstudio; - writes a file to stdout"
     option(sub, "-o --output", output_or_stdout, "FILE|FOLDER|-", text, required=True)
     option(sub, "--log", place, "LOG", "log of the run, for the pictures of colmap and nerfstudio, where it has moved")
     sub = add("optimize", optimize)

@@ -22,10 +22,18 @@ _MOTION_SHARE = 20
 """Each takes one part in 20 of the drive: the drift of the odometry over it is a twentieth of the drive's."""
 _PRIOR = 1e-3
 """Weight of no turn at all against the motions: it settles what they leave open, and nothing else."""
+_ROUNDS = 10
+"""Of rotation and lever in turn: a lever of a motion's length takes so many to settle to a tenth of a degree."""
 _LEAST_SHOWN = 0.02
 """Singular values of the lever's equations below this share of the largest are noise."""
 _NOISE_BOUND = 2.62
 """The length of three Gaussians: its 99.9 % bound, 4.03 sigma, over its median, 1.54 sigma."""
+_MOST_OFFSET_NS = 5_000_000_000
+"""Furthest that a truth's clock is looked for on either side of the log's."""
+_WINDOW_NS = 1_000_000_000
+"""Time of the motions that clocks are compared on: a second, as GNSS has fixes, and less than most manoeuvres take."""
+_CLOCK_MOTIONS, _LEAST_MOTIONS = 100, 20
+"""Motions that clocks are compared on."""
 _LEAST_TURN_DEG = 5.0
 """What the odometry must turn for a truth that never does to hold positions alone."""
 
@@ -49,13 +57,15 @@ class BodyTruth:
     trajectory: Trajectory
     """world_from_body."""
     odometry: Trajectory | None = None
-    """Moves the truth from sample to sample; None interpolates on the geodesic."""
+    """Moves the truth from sample to sample, in its metres; None interpolates on the geodesic."""
     frame: str = "body"
     """What the truth is of: `body`, `camera`, or `estimated`, a point that was found from the odometry."""
     oriented: bool = True
     """Whether the truth has orientations, not positions alone."""
     noise: tuple[float, float] = (0.0, 0.0)
     """rad and m by which single poses of the truth are off their neighbours."""
+    offset_s: float = 0.0
+    """s to add to the truth's stamps for its motions to be those of the odometry; 0 where that is not clear."""
 
     def at(self, stamp_ns: Ints) -> TruthAt:
         """Poses at the stamps.
@@ -96,9 +106,40 @@ def body_truth(truth: Trajectory, odometry: Trajectory, body_from_camera: Floats
     turned = [se3.angle(se3.between(poses[:1], poses)).max() for poses in (true, moved)]
     if turned[0] < np.radians(0.01) and turned[1] > np.radians(_LEAST_TURN_DEG):
         return BodyTruth(truth, oriented=False)
-    frame, truth_from_body = _frame(true, moved, body_from_camera)
+    frame, truth_from_body, scale = _frame(true, moved, body_from_camera)
+    poses = odometry.world_from_body.copy()
+    poses[:, :3, 3] *= scale if scale > 0 else 1.0
+    odometry = Trajectory(odometry.stamp_ns, poses)
     found = BodyTruth(Trajectory(truth.stamp_ns, truth.world_from_body @ truth_from_body), odometry, frame)
-    return replace(found, noise=_noise(found.trajectory, odometry))
+    frames = [truth_from_body, np.eye(4)] + ([] if body_from_camera is None else [se3.inverse(body_from_camera)])
+    return replace(found, noise=_noise(found.trajectory, odometry), offset_s=_offset_s(truth, odometry, frames))
+
+
+def _offset_s(truth: Trajectory, odometry: Trajectory, frames: list[Floats]) -> float:
+    """s to add to the stamps of the truth for its motions over _WINDOW_NS to be those of the odometry; 0 where that
+    does not halve their disagreement. `frames` are what truth_from_body may be: a wrong clock hides which."""
+    ends = odometry.stamp_ns[[0, -1]] + np.array([_MOST_OFFSET_NS, -_MOST_OFFSET_NS - _WINDOW_NS])
+    first = np.flatnonzero((truth.stamp_ns >= ends[0]) & (truth.stamp_ns <= ends[1]))
+    first = first[:: max(1, len(first) // _CLOCK_MOTIONS)]
+    last = np.searchsorted(truth.stamp_ns, truth.stamp_ns[first] + _WINDOW_NS).clip(max=len(truth.stamp_ns) - 1)
+    near = np.abs(truth.stamp_ns[last] - truth.stamp_ns[first] - 1.5 * _WINDOW_NS) <= 0.5 * _WINDOW_NS
+    first, last = first[near], last[near]
+    if len(first) < _LEAST_MOTIONS:
+        return 0.0
+    a = se3.between(truth.world_from_body[first], truth.world_from_body[last])
+    weight = _weights(a)
+
+    def apart(shifts_ns: Ints) -> Floats:
+        here, there = (_at(odometry, truth.stamp_ns[rows] + shifts_ns[:, None]) for rows in (first, last))
+        motions = se3.between(here, there)
+        return np.array([min(_disagreement(a, b, frame, weight)[0] for frame in frames) for b in motions])
+
+    best = 0
+    for step_ns in (_MOST_OFFSET_NS // 25, _MOST_OFFSET_NS // 500):
+        shifts_ns = best + step_ns * np.arange(-25, 26)
+        best = int(shifts_ns[apart(shifts_ns).argmin()])
+    least, given = apart(np.array([best, 0]))
+    return best / 1e9 if least < _BETTER * given else 0.0
 
 
 def _noise(truth: Trajectory, odometry: Trajectory) -> tuple[float, float]:
@@ -122,22 +163,29 @@ def _at(trajectory: Trajectory, stamp_ns: Ints) -> Floats:
     return se3.interpolate_at(trajectory.stamp_ns, trajectory.world_from_body, within)
 
 
-def _frame(true: Floats, moved: Floats, body_from_camera: Floats | None) -> tuple[str, Floats]:
-    """What the truth's poses (T, 4, 4) are of, by those of the odometry: a name, and truth_from_body (4, 4)."""
+def _frame(true: Floats, moved: Floats, body_from_camera: Floats | None) -> tuple[str, Floats, float]:
+    """What the truth's poses (T, 4, 4) are of, by those of the odometry: a name, truth_from_body (4, 4), and the true
+    metres of one of the odometry's, which has no metres of its own where a single camera made it."""
     step = max(1, len(true) // _MOTION_SHARE)
     first = np.unique(np.linspace(0, len(true) - 1 - step, _MOTIONS).astype(np.int64))
     a, b = (se3.between(poses[first], poses[first + step]) for poses in (true, moved))
-    shift = np.linalg.norm(b[:, :3, 3], axis=1)
-    weight = 1.0 / np.maximum(shift, max(float(shift.mean()), 1e-6))  # turns on the spot tell no share of a shift
-    best, least = ("body", np.eye(4)), _BETTER * _disagreement(a, b, np.eye(4), weight)
+    weight = _weights(b)
+    apart, scale = _disagreement(a, b, np.eye(4), _weights(a))
+    best, least = ("body", np.eye(4), scale), _BETTER * apart
     others = [("estimated", _hand_eye(a, b, weight))]
     if body_from_camera is not None:
         others.insert(0, ("camera", se3.inverse(body_from_camera)))
     for name, truth_from_body in others:
-        apart = _disagreement(a, b, truth_from_body, weight)
+        apart, scale = _disagreement(a, b, truth_from_body, _weights(a))
         if apart < least:
-            best, least = (name, truth_from_body), _BETTER * apart
+            best, least = (name, truth_from_body, scale), _BETTER * apart
     return best
+
+
+def _weights(motions: Floats) -> Floats:
+    """(W,) one over the shift of each motion (W, 4, 4), the mean shift at least: a turn on the spot has no share."""
+    shift = np.linalg.norm(motions[:, :3, 3], axis=1)
+    return 1.0 / np.maximum(shift, max(float(shift.mean()), 1e-6))
 
 
 def _hand_eye(a: Floats, b: Floats, weight: Floats) -> Floats:
@@ -148,7 +196,7 @@ def _hand_eye(a: Floats, b: Floats, weight: Floats) -> Floats:
     """
     size = float(np.linalg.norm(b[:, :3, 3], axis=1).mean())  # the lever in units of a motion, as the scale is
     lever, rotation, weight = np.zeros(3), np.eye(3), weight[:, None]
-    for _ in range(3):  # turn and lever hardly depend on each other
+    for _ in range(_ROUNDS):
         straight = a[:, :3, 3] + a[:, :3, :3] @ lever - lever
         across = se3.so3_log(a[:, :3, :3]).T @ se3.so3_log(b[:, :3, :3])
         across += (straight * weight).T @ (b[:, :3, 3] * weight)
@@ -161,7 +209,13 @@ def _hand_eye(a: Floats, b: Floats, weight: Floats) -> Floats:
     return se3.pose(rotation, lever)
 
 
-def _disagreement(a: Floats, b: Floats, truth_from_body: Floats, weight: Floats) -> float:
-    """Median of what the motions differ by, rad and shares of a shift."""
-    apart = se3.between(truth_from_body @ b @ se3.inverse(truth_from_body), a)
-    return float(np.median(np.hypot(se3.angle(apart), np.linalg.norm(apart[:, :3, 3], axis=1) * weight)))
+def _disagreement(a: Floats, b: Floats, truth_from_body: Floats, weight: Floats) -> tuple[float, float]:
+    """Median of what the motions differ by, rad and shares of a shift, and the scale of b's shifts that it is with."""
+    turned = truth_from_body[:3, :3] @ b[:, :3, :3] @ truth_from_body[:3, :3].T
+    lever = truth_from_body[:3, 3] - turned @ truth_from_body[:3, 3]
+    shift, wanted = b[:, :3, 3] @ truth_from_body[:3, :3].T, a[:, :3, 3] - lever
+    square = (shift**2).sum(1)
+    long = square >= max(float(square.mean()), 1e-12)
+    scale = float(np.median((shift * wanted).sum(1)[long] / square[long])) if long.any() else 1.0
+    turn = se3.angle(se3.pose(np.swapaxes(turned, 1, 2) @ a[:, :3, :3], np.zeros(3)))
+    return float(np.median(np.hypot(turn, np.linalg.norm(wanted - scale * shift, axis=1) * weight))), scale

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from vplog.data import Ints
-from vplog.errors import TruthError, VplogError
+from vplog.errors import TruthError, VplogError, nearest_path
 from vplog.evaluate.image_names import row_finder
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def read_lines(path: Path, form: str = _CSV, error: type[VplogError] = TruthErro
                 if line.strip():
                     yield f"{path}:{number}", [cell.strip() for cell in next(csv.reader([line]))]
     except OSError as fault:
-        raise error(f"Cannot read {path}: {fault.strerror}. {form}") from None
+        raise error(f"Cannot read {path}: {fault.strerror}. {form}{nearest_path(path)}") from None
     except (UnicodeDecodeError, csv.Error):
         raise error(f"{path} is not text, and so not a CSV file. {form}") from None
 

@@ -94,8 +94,8 @@ class OnnxFeatureSettings(NetworkSettings):
     def _wrong(self, name: str, found: NDArray[Any]) -> LibraryError:
         shape = " x ".join(map(str, found.shape))
         return LibraryError(
-            f"{self.model}: output {getattr(self.network, name)} has {shape} values of {found.dtype}, or such as are "
-            f"not finite, which are no {name}. Name the right outputs in its .yaml."
+            f"{self.model}: output {getattr(self.network, name)} has {shape} values of {found.dtype}, which have the "
+            f"wrong shape or type for {name} or are not finite. Name the right outputs in its .yaml."
         )
 
 

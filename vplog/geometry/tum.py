@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.data import Floats, Ints, Trajectory
+from vplog.errors import nearest_path
 from vplog.geometry import se3
 from vplog.storage.remote_path import reason
 from vplog.storage.scratch import replacing
@@ -45,7 +46,9 @@ def read_tum(path: Path, failure: type[VplogError], option: str) -> tuple[Ints, 
                     stamps.append(stamp_ns)
                     rows.append(row)
     except OSError as error:
-        raise failure(f"Cannot read {path}: {reason(error)}. Give a TUM file with {option}.") from None
+        raise failure(
+            f"Cannot read {path}: {reason(error)}. Give a TUM file with {option}.{nearest_path(path)}"
+        ) from None
     except UnicodeDecodeError:
         raise failure(f"{path} is not text. {_FORMAT}") from None
     if not rows:

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 
 from vplog.data import EdgeKind, PoseGraph, Verdict
-from vplog.errors import GraphError
+from vplog.errors import GraphError, plural
 from vplog.geometry import se3
 
 if TYPE_CHECKING:
@@ -131,9 +131,9 @@ def checked(graph: PoseGraph) -> tuple[PoseGraph, list[str]]:
     if len(negative):
         edge = unsure[negative[0]]
         warnings.append(
-            f"The information of {len(negative)} edges is not positive (first: edge {edge}, {graph.a[edge]} to "
-            f"{graph.b[edge]}); entries off the diagonal that no such matrix has were taken for 0, and what was "
-            "negative still was cut off."
+            f"The information of {plural(len(negative), 'edge')} is not positive definite (first: edge {edge}, "
+            f"{graph.a[edge]} to {graph.b[edge]}): entries off the diagonal that are too large for its diagonal are "
+            "taken as 0, and negative eigenvalues too."
         )
     return replace(graph, information=repaired), warnings
 

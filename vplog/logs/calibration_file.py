@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import yaml
 
 from vplog.data import Odometry
-from vplog.errors import LogError
+from vplog.errors import LogError, nearest_path
 from vplog.geometry import se3
 from vplog.geometry.tum import read_tum
 from vplog.logs.calibrations.camera import BadCalibrationError
@@ -38,7 +38,9 @@ def read_calibrations(path: Path) -> list[CalibratedCamera]:
             raise LogError(f"{path} is larger than 1 MB, so it is no calibration. {_KINDS}.")
         return _cameras(path.name, path.read_bytes())
     except (OSError, UnicodeDecodeError) as error:
-        raise LogError(f"Cannot read {path}: {error}. Give a calibration with --calibration.") from None
+        why = (error.strerror or error) if isinstance(error, OSError) else "it is not text"
+        near = nearest_path(path)
+        raise LogError(f"Cannot read {path}: {why}. Give a calibration with --calibration.{near}") from None
     except BadCalibrationError as error:
         raise LogError(f"{path}: {error}. {_KINDS}.") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:

@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vplog.errors import LogError, plural
+from vplog.errors import LogError, nearest_path, plural
 from vplog.logs import image_folder
 from vplog.logs.datasets import video
 from vplog.logs.datasets.find import find_roots, read_folder
@@ -95,7 +95,7 @@ def _unreadable(path: Path, error: OSError) -> LogError:
 
 def _check_there(path: Path) -> None:
     if not path.exists():
-        raise LogError(f"No log at {path}: there is no such file or folder.")
+        raise LogError(f"No log at {path}: there is no such file or folder.{nearest_path(path)}")
     if not (path.is_dir() or path.is_file()):  # to open a pipe would wait for its writer
         raise LogError(f"{path} is neither a file nor a folder. A log is {_KNOWN}.")
 
@@ -156,9 +156,9 @@ def open_drive(paths: Sequence[Path], choice: TopicChoice) -> Log:
         return open_log(paths[0], choice)
     notes, parts = Notes(), []
     for path in paths:
-        if path.is_dir() or not path.exists():
-            what = "a folder; give it by itself" if path.is_dir() else "no file"
-            raise LogError(f"{path} is {what}. Give a drive in several logs as its files.")
+        _check_there(path)
+        if path.is_dir():
+            raise LogError(f"{path} is a folder; give it by itself. Give a drive in several logs as its files.")
         same_name = sum(other.name == path.name for other in paths) > 1
         try:
             container, kind = open_container(path, notes, str(path) if same_name else path.name)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from vplog.errors import LogError, plural
+from vplog.errors import LogError, nearest_path, plural
 from vplog.logs.image_folder import is_image
 from vplog.storage.image_file import JPEG, BadImageError, decode_image, image_size
 
@@ -88,7 +88,7 @@ class Masks:
             )
         used, own = first.used(size), first.size
         if not used.any():
-            raise LogError(f"{first.path} is black, so nothing of {self._topic} would count. Zero is masked.")
+            raise LogError(f"{first.path} is black, which masks all of {self._topic}: zero is masked. Invert it.")
         if own != size:
             notes.add(
                 f"{first.path.name} has {own[0]} x {own[1]} px and is resized to the images' {size[0]} x {size[1]}."
@@ -112,7 +112,9 @@ def masks_of(
         if name and name not in topics:
             raise LogError(f"--mask {name}={path}: the log has no topic {name}. Topics: {', '.join(sorted(topics))}.")
         if not path.exists():
-            raise LogError(f"There is no mask at {path}. --mask takes an image, or a folder of them.")
+            raise LogError(
+                f"There is no mask at {path}: --mask takes an image or a folder of them.{nearest_path(path)}"
+            )
     found = []
     for number, image in enumerate(images):
         topic = image.topic if image else ""

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vplog.errors import LibraryError, ResultError, SettingsError
+from vplog.errors import LibraryError, ResultError, SettingsError, nearest_path
 from vplog.execution.execution import Execution
 from vplog.maps.import_places import PLACES_ONLY, drives_of_file, import_places_of
 from vplog.maps.joining.drive_pairs import DRIVE_FILES
@@ -81,7 +81,7 @@ def _check_libraries(sources: Sequence[Path], target: Path) -> str:
             wanted = map_store.common_library(store)[0] if store.drives() else store.head().library
     for source in sources:
         if not source.exists():
-            raise ResultError(f"There is neither a map nor an exported file at {source}.")
+            raise ResultError(f"There is neither a map nor an exported file at {source}.{nearest_path(source)}")
         if source.is_file():
             found, name = read_places_header(source).library, original(source)
             again = "Describe its map again (vplog map redescribe), and export that."

@@ -17,7 +17,7 @@ import pyarrow as pa
 
 import vplog
 from vplog.data import THUMBNAIL_SIDE, Features, Reference
-from vplog.errors import LibraryError
+from vplog.errors import LibraryError, nearest_path
 from vplog.execution.execution import Execution
 from vplog.settings import Settings
 from vplog.storage.folders import check_regular
@@ -174,7 +174,8 @@ def read_library_record(folder: Path) -> dict[str, Any]:
         record = json.loads((folder / "library.json").read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise LibraryError(
-            f"{folder} is not a library: it has no library.json. Build one: vplog library LOG -o {folder}"
+            f"{folder} is not a library: it has no library.json.{nearest_path(folder)} "
+            f"Build one: vplog library LOG -o {folder}"
         ) from None
     except (OSError, ValueError, RecursionError) as error:
         raise LibraryError(

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vplog.data import Bools, EdgeKind, Floats, Int32s, Ints, PoseGraph
-from vplog.errors import GraphError
+from vplog.errors import GraphError, nearest_path, plural
 from vplog.geometry import se3
 from vplog.storage.scratch import replacing
 
@@ -115,10 +115,10 @@ def read_g2o(path: Path) -> GraphFile:
     poses, given = np.tile(np.eye(4), (len(ids), 1, 1)), np.zeros(len(ids), bool)
     at = np.searchsorted(ids, known)
     poses[at], given[at] = _poses(path, vertices, places), True
-    warnings += [f"{count} lines of {name} were left out: only poses are solved." for name, count in left_out.items()]
+    warnings += [f"{plural(count, 'line')} of {name} left out: they are no poses." for name, count in left_out.items()]
     if not given.all():
         if given.any():
-            warnings.append(f"{int((~given).sum())} of {len(ids)} poses have no VERTEX line; edges place them.")
+            warnings.append(f"{int((~given).sum())} of {len(ids)} poses without a VERTEX line: placed by their edges.")
         _place(poses, given, a, b, measured, kind)
     information = _information(path, edges, values[:, layout.pose :], layout)
     held = 0
@@ -138,7 +138,7 @@ def _about_self_edges(edges: _Lines, ends: Ints, itself: Bools) -> list[str]:
     if not itself.any():
         return []
     line, name = edges.line[int(np.argmax(itself))], ends[itself][0, 0]
-    return [f"{int(itself.sum())} edges of a pose to itself were left out (first: line {line}, vertex {name})."]
+    return [f"{plural(int(itself.sum()), 'edge')} of a pose to itself left out (first: line {line}, vertex {name})."]
 
 
 def _split(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counter[str]]:
@@ -149,7 +149,7 @@ def _split(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counte
     ends = {layout.vertex: 1 for layout in _LAYOUTS.values()} | {layout.edge: 2 for layout in _LAYOUTS.values()}
     try:
         if not path.is_file():
-            raise GraphError(f"{path} is not a file. Give the path of a .g2o file.")
+            raise GraphError(f"{path} is not a file. Give the path of a .g2o file.{nearest_path(path)}")
         if path.stat().st_size > _MOST_BYTES:
             raise GraphError(
                 f"{path} has {path.stat().st_size >> 20} MB; graphs of up to {_MOST_BYTES >> 20} MB are read."
@@ -210,7 +210,7 @@ def _numbers(path: Path, lines: _Lines, columns: int) -> Floats:
     for line, text in zip(lines.line, lines.numbers, strict=True):  # which one is it?
         words = text.partition("#")[0].split()
         if len(words) != columns:
-            raise _at(path, line, f"{len(words)} numbers after the ids, where {columns} belong")
+            raise _at(path, line, f"{len(words)} numbers after the ids instead of {columns}")
         for word in words:
             try:
                 finite = np.isfinite(np.loadtxt([word])).all()

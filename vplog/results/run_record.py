@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from vplog.errors import ResultError
+from vplog.errors import ResultError, nearest_path
 from vplog.results.staging import recover
 from vplog.storage.folders import check_regular
 from vplog.storage.json_records import has_checksum, plain, with_checksum
@@ -50,6 +50,7 @@ def read_run_json(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise ResultError(
             f"Cannot read {path}: {error.strerror or error}. Is {path.parent} the output of `vplog run`?"
+            f"{_run_meant(path.parent)}"
         ) from None
     except (ValueError, RecursionError):
         raise ResultError(f"{path} is not JSON: it is damaged. Copy it back from a backup, or run again.") from None
@@ -61,6 +62,13 @@ def read_run_json(path: Path) -> dict[str, Any]:
         check_version(path, version, FORMAT, record.get("vplog"))
     _drop_retired(record.get("settings"))
     return record
+
+
+def _run_meant(folder: Path) -> str:
+    """` Did you mean FOLDER?`: the run that a file is in, or the folder with the nearest name."""
+    if folder.is_file() and (folder.parent / "run.json").is_file():
+        return f" Did you mean {folder.parent}?"
+    return nearest_path(folder)
 
 
 def _drop_retired(settings: Any) -> None:

@@ -109,8 +109,8 @@ def _admitted(closures: Closures, rate: float, ruled_out: int, mirrored: int) ->
     least = closures.p_false[verified].min(initial=1.0)
     if verified.any() and least > rate:
         _log.warning(
-            "--false-rate %g: no closure is that sure. Of the %d verified the surest are false with %.2g, by %d pairs "
-            "that odometry rules out and %d mirrored ones; ask for more than that, or for more --set "
+            "--false-rate %g: no closure is that certain. Of the %d verified the best have a false rate of %.2g, by "
+            "%d pairs that odometry rules out and %d mirrored ones. Allow more than that, or raise --set "
             "false_rate.null_pairs.",
             rate, verified.sum(), least, ruled_out, mirrored,
         )  # fmt: skip

@@ -258,7 +258,7 @@ def poor_pictures(found: Extracted, least: int) -> str:
     few = int((counts < least).sum())
     if not least or (not reasons and few < _POOR_SHARE * len(counts)):
         return ""
-    poor = f", and {few} of {len(counts)} have less than {least}: hardly a place is recognised by those" if few else ""
+    poor = f", and {few} of {len(counts)} have fewer than {least}, too few to recognise a place by" if few else ""
     return (
         f"Pictures are {' and '.join(reasons) or 'blurred, or without texture'}. With contrast and size raised, the "
         f"usual one has {int(np.median(counts))} features{poor}."

@@ -116,8 +116,8 @@ def _log_breaks(odometry: Odometry, stamp_ns: np.ndarray) -> None:
     named = ", ".join(f"{second:.1f} s" for second in seconds[:_NAMED].tolist())
     more = f" and {len(breaks) - _NAMED} more" if len(breaks) > _NAMED else ""
     _log.warning(
-        "Visual odometry starts again at %s%s after the first image: the drive has %d pieces, and only closures tell "
-        "how they lie to each other.",
+        "Visual odometry starts again at %s%s after the first image: the drive has %d pieces, which only "
+        "closures relate to each other.",
         named, more, len(breaks) + 1,
     )  # fmt: skip
 

@@ -65,6 +65,9 @@ def _checked(url: str, scheme: str) -> str:
     """The URL, if credentials are in the query of http alone. Raises SettingsError, which does not show them."""
     host, store = re.split("[/?#]", url.split("://", 1)[1], maxsplit=1)[0], scheme in ("s3", "gs")
     port = host.rpartition(":")[2]
+    if not host:
+        whose = "BUCKET/NAME" if store else "SERVER/FILE"
+        raise SettingsError(f"{shown(url)} names no {'bucket' if store else 'server'}. Write {scheme}://{whose}")
     if "@" in host or (":" in host and (store or not (port.isdigit() or port.endswith("]")))):
         raise SettingsError(
             f"A {scheme}:// URL names a user, a password, or a port that is no number, and vplog sends none. Leave "

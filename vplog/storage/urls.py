@@ -34,6 +34,11 @@ def shown(url: str) -> str:
     return found[0] + re.split(_END, place, maxsplit=1, flags=re.IGNORECASE)[0]
 
 
+def printable(text: str) -> str:
+    """A text for one line of a terminal: line ends and control characters, as file names may hold, are escaped."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
 def without_secrets(text: str, words: Iterable[str] = ()) -> str:
     """A sentence that may name URLs, without their secrets; those among `words`, which are a command's, may have blanks
     and any other character."""

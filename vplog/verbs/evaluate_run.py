@@ -98,6 +98,7 @@ def evaluate_poses(
         "truth_is": {
             "frame": of_body.frame,
             "oriented": of_body.oriented,
+            "offset_s": round(options.truth_offset_s + of_body.offset_s, 3) if of_body.offset_s else None,
             "odometry": (record.get("topics") or {}).get("odometry") == "truth",
         },
         **_trajectories(before, after, known, of_body, options),

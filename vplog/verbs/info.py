@@ -335,7 +335,7 @@ def preflight_lines(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "camera", f"{camera['name']}: {camera['width']} x {camera['height']}, {lens}{pair}"
         rate = "" if frames["rate_hz"] is None else f" at {frames['rate_hz']:.1f} Hz"
         keyframes = "" if frames["keyframes"] is None else f", about {frames['keyframes']} keyframes"
-        yield "frames", f"{frames['count']}{rate}{keyframes}; {frames['decoded']} of {frames['sampled']} tried decode"
+        yield "frames", f"{frames['count']}{rate}{keyframes}; {frames['decoded']} of {frames['sampled']} sampled decode"
     if odometry is not None:
         chain = " -> ".join(odometry["frames"]) or "no frames named"
         rate = "" if odometry["rate_hz"] is None else f" at {odometry['rate_hz']:.1f} Hz"

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from vplog.data import Ints, PoseGraph, Solution
-from vplog.errors import GraphError
+from vplog.errors import GraphError, plural
 from vplog.execution.timing import StageTimer
 from vplog.geometry.se3 import inverse
 from vplog.graph.build import checked, parts, subgraph
@@ -66,7 +66,7 @@ def _about_parts(part: Ints, ids: Ints) -> list[str]:
     size = np.bincount(part)
     first = [str(ids[np.argmax(part == number)]) for number in np.flatnonzero(size > 1)[:5].tolist()]
     alone = int((size == 1).sum())
-    warnings = [f"{alone} poses have no edge and stay where they are."] if alone else []
+    warnings = [f"{plural(alone, 'pose')} without an edge: left where the file has them."] if alone else []
     if (size > 1).sum() > 1:
         warnings.append(
             f"The graph has {int((size > 1).sum())} unconnected parts (from {', '.join(first)} "

@@ -13,7 +13,7 @@ from urllib.parse import unquote
 import pyarrow as pa
 
 import vplog
-from vplog.errors import LibraryError, NewerError, ResultError
+from vplog.errors import LibraryError, NewerError, ResultError, nearest_path
 from vplog.maps.geo_bounds import earth_from_record, earth_of_run
 from vplog.maps.storage.damage import DamagedDriveError, check_run_tables, damaged_files, reading_drive
 from vplog.maps.storage.layout import ADD_AGAIN, FORMAT, HASH, RUN_TABLES, drive_record, folder_name, write_changed
@@ -242,7 +242,10 @@ class Store:
         if not path.is_file():
             if (self.root / "run.json").is_file():
                 raise ResultError(f"{self} is the folder of one run, not a map. Make one: vplog batch LOG... -o MAP")
-            raise ResultError(f"{self} is not a map: it has no map.json. Make one: vplog batch LOG... -o {self}")
+            if self.root.is_file():
+                raise ResultError(f"{self} is a file, not a map. Make one: vplog batch LOG... -o MAP")
+            wrong = f"{self} is not a map: it has no map.json.{nearest_path(self.root)}"
+            raise ResultError(f"{wrong} Make one: vplog batch LOG... -o {self}")
         record = run_record.read_run_json(path)
         check_version(path, record.get("format"), FORMAT, record.get("vplog"))
         library, settings = record.get("library"), record.get("settings")

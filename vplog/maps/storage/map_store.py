@@ -131,7 +131,7 @@ def remove(store: Store, drives: Sequence[str]) -> None:
     try:
         _finish_removals(store)
     except ResultError as error:
-        out = f"{error} {named} out of {store}; the next command that writes to it deletes what is left of the files."
+        out = f"{error} {named} removed from {store}; the next command that writes to it deletes the rest of the files."
         if all(map(store.is_present, drives)):
             with suppress(ResultError):  # where that cannot be taken back they are out
                 store.write_removed([])
