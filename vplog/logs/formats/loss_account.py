@@ -225,7 +225,9 @@ class LossAccount:
         """Log times of the first and last message; where none was found, where most of the lost ones lie."""
         if self.start_ns is not None:
             return self.start_ns, max(self.start_ns, self.end_ns)
-        found = [ns for places in self._copy().values() for lost in places.values() for span in lost.spans for ns in span]
+        found = [
+            ns for places in self._copy().values() for lost in places.values() for span in lost.spans for ns in span
+        ]
         return main_span([ns for ns in found if ns])
 
     @property

@@ -45,6 +45,8 @@ _BEGIN = re.compile(re.escape(MAGIC))
 """How a recording begins: another one may be appended to the first."""
 _HEAD = 256
 """Bytes in which the head of a record ends, but for a connection's of a long topic."""
+_MAX_CHUNK = 2**28
+"""Bytes of a packed chunk whose end is looked for; recorders make them of 768 kB."""
 _LEAST_CHUNK = 48
 """Bytes of a chunk record without data."""
 _VALUES = re.compile(
@@ -91,7 +93,7 @@ class _LayoutReader:
             lost = False
             if header is None or not self._is_sound(header) or not self._is_record(stop, behind_chunk=inside):
                 found = self._next_record(position) if len(self.layout.gaps) < MOST_GAPS else None
-                if header is None or not self._is_sound(header):
+                if header is None or not self._is_sound(header) or (found or start) < start:
                     if position == self.layout.appended_at:
                         return
                     if found is None:
@@ -126,10 +128,11 @@ class _LayoutReader:
         if op in _ENTRY:
             return start + _ENTRY[op] * number(header, b"count")
         if op == _BAG:  # filled up with blanks
-            return start + len(re.match(b" *", self.at(start, most - start))[0])
+            return most - len(self.at(start, most - start).lstrip())
         if op != _CHUNK or header[b"compression"] == b"none":
             return start + number(header, b"size") if op == _CHUNK else None
-        length = frame_length(header[b"compression"].decode("ascii", "replace"), self.at(start, most - start))
+        data = self.at(start, min(most - start, _MAX_CHUNK))
+        length = frame_length(header[b"compression"].decode("ascii", "replace"), data)
         return None if length is None else start + length
 
     def _skip(self, position: int, found: int, known: bool = False) -> None:
@@ -158,7 +161,7 @@ class _LayoutReader:
             kind, ends = self._ends_left(position)
             behind = (end for end in sorted(ends) if position < end < found and _VALUES.match(self.at(end + 8, _HEAD)))
             end = found if found in ends else next(behind, None)
-            if end is None:
+            if end is None or len(kinds) > MOST_GAPS:
                 return None
             kinds.append(kind)
             position = end
@@ -183,6 +186,8 @@ class _LayoutReader:
         found = {chunk.record: chunk for chunk in layout.chunks}
         skipped = {chunk.record: chunk for chunk in layout.missing}
         layout.missing, listed = [], len(self._infos) == self._chunk_count
+        others = (chunk for chunk in layout.chunks if chunk.record not in self._infos and not chunk.doubtful)
+        shifted = {(frozenset(chunk.counts.items()), chunk.first_ns) for chunk in others}  # by bytes inserted or lost
         for offset, info in sorted(self._infos.items()):
             if (chunk := found.get(offset)) is not None and not _is_another(chunk, info):
                 chunk.first_ns, chunk.last_ns = info.first_ns, info.last_ns
@@ -194,7 +199,7 @@ class _LayoutReader:
                 header, start, stop = self._head(offset)
                 self._record(_CHUNK, header or {}, offset, start, stop)
                 layout.chunks[-1].counts = info.counts
-            elif any(not one.listed and _is_shifted(one, info) for one in layout.chunks):
+            elif (frozenset(info.counts.items()), info.first_ns) in shifted:
                 listed = False
             elif gaps := [start for start, stop in layout.gaps if start <= offset < stop]:  # else the index is damaged
                 own = skipped.get(gaps[0])  # by the index records behind it, the last chunk in the gap
@@ -261,7 +266,7 @@ class _LayoutReader:
     def _record(self, op: int, header: dict[bytes, bytes], position: int, start: int, stop: int) -> None:
         if op == _CHUNK:
             kind = header[b"compression"].decode("ascii", "replace")
-            cut, stop = stop > self._length, min(stop, self._length)
+            cut, stop = stop > self._length, max(start, min(stop, self._length))
             size = stop - start if kind == "none" and not cut else number(header, b"size")
             self._indexing = Chunk(start, stop, kind, size, cut=cut, record=position)
             self.layout.chunks.append(self._indexing)
@@ -325,8 +330,3 @@ def time_ns(header: dict[bytes, bytes], name: bytes) -> int:
 def _is_another(chunk: Chunk, info: Chunk) -> bool:
     """Whether a chunk is not the one that the bag's index lists at its place: none of their times are the same."""
     return bool(chunk.counts) and (chunk.last_ns < info.first_ns <= info.last_ns or chunk.first_ns > info.last_ns > 0)
-
-
-def _is_shifted(chunk: Chunk, info: Chunk) -> bool:
-    """Whether a chunk is the one that the index lists at another place: bytes were inserted or lost before it."""
-    return chunk.counts == info.counts and not chunk.doubtful and not _is_another(chunk, info)
