@@ -151,6 +151,19 @@ def test_stamps_that_run_backwards_give_way_to_the_log_times(seed: int) -> None:
     assert "backwards" not in " ".join(said)
 
 
+@given(seeds, st.floats(0.2, 1.5))
+def test_bursts_in_no_order_do_not_run_backwards(seed: int, burst_s: float) -> None:
+    """A link sends what has waited, within a few ms and the last as well first."""
+    rng = np.random.default_rng(seed)
+    true_ns, _ = topic(rng, 20, rng.uniform(10, 40))
+    burst_ns = int(burst_s * SECOND)
+    order = np.lexsort((-true_ns if seed % 2 else rng.random(len(true_ns)), -(-true_ns // burst_ns)))
+    log_ns = -(-true_ns[order] // burst_ns) * burst_ns + np.arange(len(true_ns)) * 1000
+    times, _, said = ordered(stamps(true_ns[order], log_ns))
+    np.testing.assert_array_equal(times[0], true_ns)
+    assert "backwards" not in " ".join(said)
+
+
 @given(seeds, st.floats(1.7, 60))
 def test_whole_seconds_give_way_to_finer_log_times(seed: int, hz: float) -> None:
     rng = np.random.default_rng(seed)
