@@ -143,14 +143,24 @@ class ChunkLosses:
         known = self.channels
         return not chunk.counts or any(known.get(i) in wanted or i not in known for i in chunk.counts)
 
+    def is_counted(self, number: int) -> bool:
+        """Whether a chunk has indexes, and all of them: a file may be cut between those of its last one."""
+        layout = self.layout
+        return bool(layout.chunks[number].counts) and (bool(layout.recorded) or number + 1 < len(layout.chunks))
+
     def add_chunk(self, chunk: Chunk, counts: Mapping[int, int], spans: list[Span], what: str) -> None:
         """Messages by channel id that are lost of a damaged chunk; `what` ends the sentence about it."""
         lost = topics_of(counts, self.channels) if chunk.counts else None
         detail = f"{self.name} has a damaged chunk at byte {chunk.start}{what}."
         self.notes.account.add("damaged_chunk", lost, (self.name, chunk.start), spans, detail)
 
-    def add_unknown(self, chunk: Chunk, count: int, spans: list[Span]) -> None:
-        """Messages of channels that nothing defines so far; none where they are defined by now."""
+    def add_unknown(self, chunk: Chunk, counts: Mapping[int, int], damaged: bool, spans: list[Span]) -> None:
+        """Messages of channels that nothing defines so far; none where they are defined by now. Those of a damaged
+        chunk on a channel that its indexes do not list are among what it lacks."""
+        known = self.channels
+        count = sum(
+            n for i, n in counts.items() if i not in known and (i in chunk.counts or not (damaged and chunk.counts))
+        )
         self.notes.account.add("unknown_channel", {"": count} if count else {}, (self.name, chunk.start), spans)
 
     def add_missing(self, found: Mapping[str, int], span: Span, detail: str) -> dict[str, int]:
@@ -164,6 +174,14 @@ class ChunkLosses:
             for topic, count in counts.items():
                 total[topic] = total.get(topic, 0) + count
         return total
+
+    def reconcile(self, found: Mapping[str, int], total: Mapping[str, int], span: Span, what: str) -> None:
+        """Hold messages found, and in `total` lost too, against those recorded by `what` the file says of itself."""
+        recorded = topics_of(self.layout.recorded, self.channels)
+        unexplained = self.notes.account.reconcile({self.name}, recorded, found)
+        if unexplained and sum(recorded.values()) > sum(total.values()):  # else it names other topics
+            detail = f"The {what} of {self.name} counts more messages than it holds."
+            self.notes.account.add("damaged_bytes", unexplained, (self.name, 0), [span], detail)
 
     def between(self, position: int, span: Span) -> Span:
         """The time between the chunk before a damaged place and the one behind it; `span` is that of the file."""

@@ -77,7 +77,8 @@ class McapFile:
         counts: Counter[int] = Counter()
         times: list[int] = []
         for number, chunk in enumerate(self._layout.chunks):
-            if chunk.counts and chunk.counts.keys() <= self._channels.keys() and not unpack_all:
+            sure = self._losses.is_counted(number) and not unpack_all
+            if sure and chunk.counts.keys() <= self._channels.keys():
                 counts.update(chunk.counts)
                 times += (chunk.first_ns, chunk.last_ns)
             else:
@@ -86,6 +87,8 @@ class McapFile:
                 times += sampled(reader.whole(data).log_ns)
                 damaged = self._account_for_chunk(chunk, reader) or not data
                 counts.update(reader.counts | Counter(chunk.counts) if damaged else reader.counts)
+                if not damaged:
+                    chunk.counts = dict(reader.counts)
         return counts, times
 
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
@@ -126,10 +129,7 @@ class McapFile:
         self._losses.add_end(sum(found.values()), [(span[1], span[1])])
         whole = layout.cut_at is None and not layout.gaps
         account.set_recorded(name, recorded or (total if whole or layout.missing else {}), *span)
-        unexplained = account.reconcile({name}, recorded, found)
-        if unexplained and sum(recorded.values()) > sum(total.values()):  # else it names other topics
-            detail = f"The statistics of {name} count more messages than it holds."
-            account.add("damaged_bytes", unexplained, (name, 0), [span], detail)
+        self._losses.reconcile(found, total, span, "statistics record")
 
     def _define(self, opcode: int, data: bytes, doubtful: bool = False) -> None:
         """Take a schema or a channel: the first sound definition of a number, or a doubtful one until there is a sound
@@ -174,8 +174,7 @@ class McapFile:
             span = min(last_ns, chunk.last_ns), chunk.last_ns
             short = {i: n - counts[i] for i, n in chunk.counts.items()}
             self._losses.add_chunk(chunk, short, [span], "; the rest of it is left out")
-        unknown = sum(count for channel_id, count in counts.items() if channel_id not in self._channels)
-        self._losses.add_unknown(chunk, unknown, [(chunk.first_ns, chunk.last_ns)])
+        self._losses.add_unknown(chunk, counts, damaged, [(chunk.first_ns, chunk.last_ns)])
         return damaged
 
     def _unpack(self, number: int) -> bytes:

@@ -61,7 +61,7 @@ class Ros1Bag:
         counts: Counter[int] = Counter()
         times: list[int] = []
         for row, chunk in enumerate(self._layout.chunks):
-            if chunk.counts and chunk.counts.keys() <= self._channels.keys() and chunk.last_ns:
+            if self._losses.is_counted(row) and chunk.counts.keys() <= self._channels.keys() and chunk.last_ns:
                 found = chunk.counts
                 times += chunk.first_ns, chunk.last_ns
             else:
@@ -71,6 +71,8 @@ class Ros1Bag:
                 chunk.first_ns = min([*own, chunk.first_ns] if chunk.first_ns else own, default=0)
                 chunk.last_ns = max([*own, chunk.last_ns])
                 times += sampled(own)
+                if not chunk.damaged:
+                    chunk.counts = dict(found)
             if chunk.damaged:
                 found = Counter(found) | Counter(chunk.counts)
             if chunk.listed and (chunk.disputed or not chunk.damaged) and found != chunk.listed:
@@ -100,7 +102,7 @@ class Ros1Bag:
         whole = layout.cut_at is None and all(chunk.counts for chunk in layout.missing)
         listed = topics_of(layout.recorded, self._channels)
         self._account.set_recorded(self._name, listed or (total if whole else {}), *span)
-        self._account.reconcile({self._name}, listed, found)
+        self._losses.reconcile(found, total, span, "index")
 
     def _connect(self, header: dict[bytes, bytes], data: bytes) -> None:
         """The first sound definition of a connection holds, and a damaged one where there is no sound one."""
@@ -136,7 +138,7 @@ class Ros1Bag:
             chunk.damaged = True
             short = {i: count - counts[i] for i, count in chunk.counts.items()}
             self._losses.add_chunk(chunk, short, span, "; the rest of it is left out")
-        self._losses.add_unknown(chunk, sum(n for i, n in counts.items() if i not in self._channels), span)
+        self._losses.add_unknown(chunk, counts, damaged, span)
         return found
 
     def _unpack(self, row: int) -> bytes:
