@@ -6,6 +6,7 @@ import fcntl
 import json
 import os
 import shutil
+from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from tests import durations
 from vplog.cli import main
 from vplog.demo import SMALL, make_drive
 from vplog.execution.execution import Execution
+from vplog.execution.process_pool import OwnProcesses
 from vplog.pipeline import load_pipeline, run
 
 if TYPE_CHECKING:
@@ -32,6 +34,8 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
 # servers of the tests are on this machine, whatever proxy there is
 os.environ["NO_PROXY"] = os.environ["no_proxy"] = "127.0.0.1,localhost"
+
+TINY = SMALL.model_copy(update={"laps": 1.2, "frame_rate_hz": 1.5, "width": 320, "height": 180})
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -91,6 +95,30 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def in_process() -> Iterator[pytest.MonkeyPatch]:
+    """Drives of a batch are computed in the process of the test: a new one loads modules for seconds, to the same
+    bytes. Tests of the processes themselves ask for `own_processes`."""
+
+    def submit(_: OwnProcesses, function: Callable[..., Any], *args: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_result(function(*args))
+        return future
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OwnProcesses, "submit", submit)
+        yield patch
+
+
+@pytest.fixture
+def own_processes(in_process: pytest.MonkeyPatch) -> Iterator[None]:
+    """Drives of a batch are computed in processes of their own, as users have it."""
+    instead = OwnProcesses.submit
+    in_process.undo()
+    yield
+    in_process.setattr(OwnProcesses, "submit", instead)
+
+
 @pytest.fixture
 def verb(capfd: pytest.CaptureFixture[str]) -> Callable[..., Said]:
     """Run a verb in this process; what native libraries print counts too."""
@@ -134,6 +162,18 @@ def drive(made_once: Callable[..., Path]) -> Drive:
 
     folder = made_once("drive", lambda folder: make_drive(folder, SMALL))
     return Drive(**vars(make_scene(SMALL)), log=folder / "drive.mcap", truth=folder / "truth.tum")
+
+
+@pytest.fixture(scope="session")
+def tiny_drives(made_once: Callable[..., Path]) -> list[Path]:
+    """Folders of two drives of about 25 small frames each, of one name: drive.mcap and truth.tum."""
+
+    def fill(folder: Path) -> None:
+        for number, name in enumerate("ab"):
+            make_drive(folder / name, TINY.model_copy(update={"seed": SMALL.seed + number}), Execution())
+
+    made = made_once("tiny", fill)
+    return [made / name for name in "ab"]
 
 
 @pytest.fixture(scope="session")

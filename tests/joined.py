@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from mcap.records import Message
+
     from vplog.demo.record import Drive
 
 QUICK = ("features.max_features=600", "library.size=12", "pictures.closures=0", "pictures.megapixels=0")
@@ -23,20 +25,25 @@ LOGS = {"before": "before.mcap", "after": "after.mcap", "drive": "elsewhere/driv
 """File of each drive, beside the folder of the joint run."""
 
 
-def copied(log: Path, to: Path, wanted: Callable[[str, int], bool]) -> Path:
-    """The messages of an MCAP log that are wanted by topic and log time (ns), in a file of their own."""
+def rewritten(log: Path, to: Path, change: Callable[[str, Message], bytes | None]) -> Path:
+    """An MCAP log with change(topic, message) as the data of every message, without those where that is None."""
     with log.open("rb") as stream, to.open("wb") as file:
         writer, channels = Writer(file), dict[int, int]()
         writer.start(profile="ros2")
         for schema, channel, message in make_reader(stream).iter_messages():
-            if not wanted(channel.topic, message.log_time):
+            if (data := change(channel.topic, message)) is None:
                 continue
             if channel.id not in channels:
                 known = 0 if schema is None else writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+            writer.add_message(channels[channel.id], message.log_time, data, message.publish_time)
         writer.finish()
     return to
+
+
+def copied(log: Path, to: Path, wanted: Callable[[str, int], bool]) -> Path:
+    """The messages of an MCAP log that are wanted by topic and log time (ns), in a file of their own."""
+    return rewritten(log, to, lambda topic, message: message.data if wanted(topic, message.log_time) else None)
 
 
 def cut(log: Path, at_ns: int, folder: Path, mounted: bool = True) -> list[Path]:

@@ -12,23 +12,19 @@ import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pytest
 
 import vplog
-from tests.batch.test_batch import QUICK, TINY
+from tests.batch.test_batch import QUICK
 from tests.maps.bucket import serving
 from vplog import errors
-from vplog.demo import make_drive
 from vplog.execution.process_pool import OwnProcesses
 from vplog.results.run_record import read_run_json
 from vplog.storage.remote_path import local_output, located
-
-if TYPE_CHECKING:
-    from vplog.demo.record import Drive
 
 TOP = Path(vplog.__file__).parents[1]
 EXAMPLES = TOP / "examples"
@@ -52,13 +48,18 @@ def python(*arguments: object, folder: Path) -> str:
     return done.stdout
 
 
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> Drive:
-    return make_drive(tmp_path_factory.mktemp("tiny"), TINY)
+class Tiny(NamedTuple):
+    log: Path
+    truth: Path
 
 
 @pytest.fixture(scope="module")
-def run(tiny: Drive, tmp_path_factory: pytest.TempPathFactory) -> vplog.RunFolder:
+def tiny(tiny_drives: list[Path]) -> Tiny:
+    return Tiny(tiny_drives[0] / "drive.mcap", tiny_drives[0] / "truth.tum")
+
+
+@pytest.fixture(scope="module")
+def run(tiny: Tiny, tmp_path_factory: pytest.TempPathFactory) -> vplog.RunFolder:
     """Named by text. It has pictures of its keyframes."""
     out = tmp_path_factory.mktemp("run") / "out"
     return vplog.run(str(tiny.log), str(out), settings=[*QUICK, "pictures.megapixels=0.15"], threads=2)
@@ -112,7 +113,7 @@ def test_tables_are_those_of_the_files(run: vplog.RunFolder) -> None:
         run.table("clsures")
 
 
-def test_images_are_those_of_the_run_or_of_the_log(run: vplog.RunFolder, tiny: Drive) -> None:
+def test_images_are_those_of_the_run_or_of_the_log(run: vplog.RunFolder, tiny: Tiny) -> None:
     rows = [len(run.keyframes) - 1, 0, 3]
     reduced, recorded = dict(run.images(rows)), dict(run.images(rows, from_log=True))
     assert list(reduced) == list(recorded) == sorted(rows)
@@ -132,7 +133,7 @@ def test_a_run_folder_does_not_lead_out_of_itself(tmp_path: Path) -> None:
         _ = vplog.RunFolder(tmp_path, record).drives
 
 
-def test_paths_and_urls_give_the_same(tiny: Drive, run: vplog.RunFolder) -> None:
+def test_paths_and_urls_give_the_same(tiny: Tiny, run: vplog.RunFolder) -> None:
     with serving():
         for name, source in (("log.mcap", tiny.log), ("truth.tum", tiny.truth)):
             with local_output(located(f"s3://bucket/{name}")) as out:
@@ -164,7 +165,7 @@ def test_paths_and_urls_give_the_same(tiny: Drive, run: vplog.RunFolder) -> None
         (lambda log, out: vplog.batch([log, log], out, topics={"odometry_file": "a.tum"}), "is of one drive"),
     ],
 )
-def test_mistakes_are_one_line(call: Any, message: str, tiny: Drive, tmp_path: Path) -> None:
+def test_mistakes_are_one_line(call: Any, message: str, tiny: Tiny, tmp_path: Path) -> None:
     with pytest.raises(vplog.VplogError, match=message) as error:
         call(tiny.log, tmp_path / "out")
     assert "\n" not in str(error.value)
@@ -180,7 +181,7 @@ def test_files_among_the_topics_are_found_from_any_folder(monkeypatch: pytest.Mo
     assert (choice.image, choice.odometry_file) == ("/a", tmp_path / "poses.tum")
 
 
-def test_from_a_worker_process(tiny: Drive, run: vplog.RunFolder, tmp_path: Path) -> None:
+def test_from_a_worker_process(tiny: Tiny, run: vplog.RunFolder, tmp_path: Path) -> None:
     """The function goes there by name, and what it gives comes back."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         done = pool.submit(vplog.run, tiny.log, tmp_path / "run", settings=QUICK).result()
@@ -195,7 +196,7 @@ def test_a_daemonic_process_is_refused_a_batch(monkeypatch: pytest.MonkeyPatch) 
         OwnProcesses(1).begin()
 
 
-def test_from_a_script_without_a_guard(tiny: Drive, tmp_path: Path) -> None:
+def test_from_a_script_without_a_guard(tiny: Tiny, tmp_path: Path) -> None:
     """examples/batch_and_query.py: if it ran again in the processes of the drives, these would fail."""
     out = python(EXAMPLES / "batch_and_query.py", tmp_path / "map", tiny.log, tiny.log, *QUICK, folder=tmp_path)
     assert out.splitlines()[0].split() == ["drive", "computed"]
@@ -228,7 +229,7 @@ EXAMPLE_CALLS = {
 
 @pytest.mark.parametrize("name", sorted(EXAMPLE_CALLS))
 def test_examples(
-    name: str, tiny: Drive, run: vplog.RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+    name: str, tiny: Tiny, run: vplog.RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
     if name == "own_network.py":
         pytest.importorskip("onnx", reason="onnx, which makes the network, is not installed")

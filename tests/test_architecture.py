@@ -26,7 +26,7 @@ LAYERS = (
     {"stages", "geometry", "networks", "masking"},
     {"features", "places"},
     {"logs", "loops", "graph", "results", "evaluate", "demo"},
-    {"cache", "figures", "testing", "odometry"},
+    {"cache", "testing"},
     {"run"},
     {"pipeline"},
     {"sessions", "benchmark", "verbs"},

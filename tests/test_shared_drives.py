@@ -56,10 +56,10 @@ def seven_scenes(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 @pytest.fixture(scope="module", params=GARDENS)
 def uncalibrated(request: pytest.FixtureRequest, shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """The first thirty images of a drive."""
+    """The first sixteen images of a drive."""
     drive, folder = found(shared_data / "drives" / f"{request.param}.mcap"), tmp_path_factory.mktemp(request.param)
     messages = count()
-    return run_default(copied(drive, folder / "drive.mcap", lambda *_: next(messages) < 60), folder / "run")
+    return run_default(copied(drive, folder / "drive.mcap", lambda *_: next(messages) < 32), folder / "run")
 
 
 def test_a_street_passed_again_is_found_and_drift_removed(kitti: dict[str, Any]) -> None:

@@ -8,7 +8,7 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from vplog.data import Camera
     from vplog.execution.process_pool import OwnProcesses
     from vplog.localize.localize import LocalizedPicture
-    from vplog.localize.localizer import Localizer
     from vplog.logs import TopicChoice
     from vplog.pipeline import Pipeline
     from vplog.stages import Log
@@ -167,7 +166,7 @@ class RunFolder:
         return self._localizer(image, camera)
 
     @cached_property
-    def _localizer(self) -> Localizer:
+    def _localizer(self) -> Callable[..., LocalizedPicture]:
         return _localizer(self, self.folder)
 
     def images(
@@ -485,18 +484,19 @@ class Map:
         return self._localizer(image, camera)
 
     @cached_property
-    def _localizer(self) -> Localizer:
+    def _localizer(self) -> Callable[..., LocalizedPicture]:
         return _localizer(self, self.place)
 
 
-def _localizer(owner: object, root: Path) -> Localizer:
-    """A run or map that is open as long as `owner` lives."""
-    from vplog.localize.localizer import Localizer
+def _localizer(owner: object, root: Path) -> Callable[..., LocalizedPicture]:
+    """`localize_image` of a run or map that is open as long as `owner` lives."""
+    from vplog.localize.places import opened
+    from vplog.localize.single_image import localize_image
 
     with ExitStack() as stack:
-        found = stack.enter_context(Localizer.opened(root))
+        places = stack.enter_context(opened(root, Execution()))
         weakref.finalize(owner, stack.pop_all().close)
-    return found
+    return partial(localize_image, places)
 
 
 @dataclass(frozen=True)

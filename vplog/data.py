@@ -51,7 +51,7 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One decoded image. Streamed, never kept."""
+    """One decoded image. Streamed, never stored."""
 
     stamp_ns: int
     camera: Camera
@@ -343,12 +343,12 @@ class Solution:
     weight: Floats
     """(E,) 0..1; 1 for every edge that is not robust."""
     error_before: float
-    """Half the chi-square of the graph at its initial poses, over the edges kept."""
+    """Half the chi-square of the graph at its initial poses, over the inlier edges."""
     error_after: float
     iterations: int
     converged: bool
     reason: str
-    """One sentence: why it stopped, or why odometry was kept."""
+    """One sentence: why it stopped, or why the result is the odometry."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -438,7 +438,7 @@ class LogInfo:
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """Points of a drive, and in which of its images they are seen."""
+    """3D points of a drive, and their observations in its images."""
 
     world: Floats
     """(P, 3) m."""

@@ -1,4 +1,4 @@
-"""The whole job: a tree of settings, and the stages in order."""
+"""The pipeline of one drive: its tree of settings, and run(), the stages in order."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import model_validator
 from vplog import logs
 from vplog.cache.input_hashes import files_of
 from vplog.cache.steps import Steps
-from vplog.errors import SettingsError, nearest
+from vplog.errors import ResultError, SettingsError, nearest
 from vplog.execution.execution import Execution
 from vplog.features.extractors import FeatureSettings
 from vplog.features.sift import SiftSettings
@@ -43,7 +43,7 @@ from vplog.run.outputs import Run, finish, report, write
 from vplog.run.place_recognition import describe, find_candidates, name_shared
 from vplog.run.reference_library import check_library, cover, given_references, learn, own_images, own_references
 from vplog.run.run_folder import CacheOptions, staged_run
-from vplog.run.verification import verify
+from vplog.run.verification import DriveFeatures, verify
 from vplog.settings import Settings, load_yaml, override
 
 
@@ -81,12 +81,12 @@ class Pipeline(Settings):
     join: JoinSettings = JoinSettings()
     """Several drives in one map."""
     pictures: PictureSettings = PictureSettings()
-    """What result.mcap and report.html show of the camera's images."""
+    """Images of the camera in result.mcap and report.html."""
 
     @property
     def null_pairs(self) -> FalseRateSettings:
-        """`false_rate`, without mirrored candidates for features whose descriptors do not say how a mirror changes
-        them."""
+        """`false_rate`, without mirrored candidates where features are not SIFT: only its descriptors are mirrored
+        without the image."""
         mirrored = {} if self.features.kind == "sift" else {"null_pairs": 0}
         return self.false_rate.model_copy(update=mirrored)
 
@@ -123,6 +123,14 @@ def pipeline_from(tree: dict[str, Any], where: str, assignments: Iterable[str] =
     for assignment in assignments:
         tree = override(tree, assignment)
     return Pipeline.read(tree, where, assignments)
+
+
+def recorded_pipeline(folder: Path, record: dict[str, Any]) -> Pipeline:
+    """The settings of a run. Raises ResultError."""
+    try:
+        return Pipeline.read(record.get("settings") or {}, f"{folder}/run.json")
+    except SettingsError as error:
+        raise ResultError(f"{error} The run is of another version of vplog: run it again.") from None
 
 
 def pipeline_schema() -> dict[str, Any]:
@@ -172,13 +180,13 @@ def run(
         coverage = do(cover, keyframes, references, library is not None, features)
         descriptors = do(describe, state, log, features)
         proposals = do(find_candidates, state, descriptors, keyframes, pipeline.propose, pipeline.sequence)
-        closures = do(verify, proposals, keyframes, camera, features, pipeline.verify)
+        drive = DriveFeatures(keyframes, camera, features, pipeline.verify)
+        closures = do(verify, proposals, drive)
         closures = do(
-            rate_closures, closures, odometry, keyframes, camera, features, pipeline.null_pairs, pipeline.propose,
-            pipeline.verify, pipeline.noise,
+            rate_closures, closures, odometry, drive, pipeline.null_pairs, pipeline.propose, pipeline.noise
         )  # fmt: skip
         if decisions is not None:
-            closures = do(decide, closures, decisions, keyframes, camera, features, pipeline.verify)
+            closures = do(decide, closures, decisions, drive)
         closures = name_shared(closures, state, descriptors)
         solved = do(solve, odometry, keyframes, closures, log.gps(), pipeline)
         result = Run(

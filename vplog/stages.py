@@ -65,7 +65,7 @@ class Log(Protocol):
         ...
 
     def without_odometry(self) -> str:
-        """What can be done where `odometry()` is None, in a sentence."""
+        """The remedy where `odometry()` is None, in a sentence."""
         ...
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import cv2
-import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from vplog import logs
+from tests.pictures import day_and_dusk
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,11 +25,8 @@ QUICK = ("--set", "features.max_features=250", "--set", "features.max_megapixels
 @pytest.fixture(scope="module")
 def pictures(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folders `day`, whose images are in folders of their own, and `dusk`, the same views with noise."""
-    root, rng = tmp_path_factory.mktemp("pictures"), np.random.default_rng(0)
-    log = logs.open(drive.log)
-    for number, frame in enumerate(log.frames(log.stamps()[:FRAMES])):
-        image = frame.decode().image
-        dusk = np.clip(0.8 * image + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
+    root = tmp_path_factory.mktemp("pictures")
+    for number, (image, dusk) in enumerate(day_and_dusk(drive.log, FRAMES)):
         for folder, picture in ((root / "day" / f"place {number}", image), (root / "dusk", dusk)):
             folder.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(folder / f"view_{number}.png"), picture)

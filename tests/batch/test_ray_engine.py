@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -17,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tests.batch.test_batch import OPTIONS, QUICK, TINY, tables
+from tests.batch.test_batch import OPTIONS, QUICK, tables
+from tests.conftest import TINY
 from vplog.batch import ray_cluster, ray_engine
 from vplog.batch.batch import run_batch
 from vplog.batch.engine import BatchOptions
@@ -43,13 +45,13 @@ STORE_BYTES = 80 * 2**20
 
 
 @pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def logs(tiny_drives: list[Path], tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two short drives, a file that is none, and a longer drive."""
     folder = tmp_path_factory.mktemp("logs")
-    kinds = {"first": TINY, "second": TINY, "third": LONG}
-    for number, (name, kind) in enumerate(kinds.items()):
-        settings = kind.model_copy(update={"seed": SMALL.seed + number})
-        make_drive(folder / "made" / name, settings, Execution()).log.rename(folder / f"{name}.mcap")
+    for name, made in zip(("first", "second"), tiny_drives, strict=True):
+        shutil.copy(made / "drive.mcap", folder / f"{name}.mcap")
+    longer = LONG.model_copy(update={"seed": SMALL.seed + 2})
+    make_drive(folder / "made", longer, Execution()).log.rename(folder / "third.mcap")
     (folder / "bad.mcap").write_bytes(b"no log at all")
     return [folder / f"{name}.mcap" for name in ("first", "bad", "second", "third")]
 

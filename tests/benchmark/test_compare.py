@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from tests.pictures import day_and_dusk
 from tests.places.sequence_matrix import match_sequences
 from vplog import logs
 from vplog.benchmark import compare
@@ -63,16 +64,11 @@ TIMES = {"encode_ms", "feature_ms", "mining_ms", "query_ms", "learn_s"}
 
 @pytest.fixture(scope="module")
 def traversals(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Two folders of the same 16 frames: as they are, and darker with other noise."""
-    log = logs.open(drive.log)
     folders = tmp_path_factory.mktemp("traversals") / "day", tmp_path_factory.mktemp("traversals") / "dusk"
     for folder in folders:
         folder.mkdir()
-    rng = np.random.default_rng(0)
-    for number, frame in enumerate(log.frames(log.stamps()[:FRAMES])):
-        day = frame.decode().image
-        dusk = np.clip(day * 0.8 + rng.normal(0, 2, day.shape), 0, 255).astype(np.uint8)
-        for folder, image in zip(folders, (day, dusk), strict=True):
+    for number, images in enumerate(day_and_dusk(drive.log, FRAMES)):
+        for folder, image in zip(folders, images, strict=True):
             cv2.imwrite(str(folder / f"{number}.png"), image)
     return folders
 

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from tests.benchmarks.measure import Figure, in_turns, seconds
-from vplog.data import EdgeKind, PoseGraph
+from vplog.data import Bools, EdgeKind, Floats, Ints, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.consistency import is_loop, odometry_chain
 from vplog.graph.solve import LmSettings, OptimiserSettings, decided
@@ -213,10 +213,8 @@ def _one(graph: PoseGraph, false: np.ndarray, optimiser: Any, optimum: Floats) -
 # --- false closures as a recogniser makes them ----------------------------------------------------------------------
 
 
-def bicocca(place: Path, methods: Sequence[str]) -> Iterator[Figure]:
-    """Bicocca 25b (Latif, Cadena, Neira, IJRR 2013): error against its GPS truth, as a share of the best method's."""
-    if not place.is_dir():
-        return
+def bicocca_truth(place: Path) -> tuple[Bools, Floats]:
+    """Which poses (N,) have a place by GPS, and those places (N, 4, 4), without directions."""
     stamps = np.loadtxt(place / "timestamps" / "B25b_timestamps.txt")
     truth = np.loadtxt(place / "timestamps" / "Bicocca_2009-02-25b-GT-extended.csv", delimiter=",")
     after = np.clip(np.searchsorted(truth[:, 0], stamps), 1, len(truth) - 1)
@@ -224,14 +222,26 @@ def bicocca(place: Path, methods: Sequence[str]) -> Iterator[Figure]:
     known = (stamps >= truth[0, 0]) & (stamps <= truth[-1, 0]) & (truth[after, 0] - truth[after - 1, 0] <= 1.0)
     places = np.tile(np.eye(4), (len(stamps), 1, 1))
     places[:, 0, 3], places[:, 1, 3] = (np.interp(stamps, truth[:, 0], truth[:, axis]) for axis in (1, 2))
+    return known, places
+
+
+def false_by_gps(graph: PoseGraph, loops: Ints, known: Bools, places: Floats) -> Bools:
+    """Closures (K,) of other distances than between those places. 3 m: twice what the fixes are off."""
+    a, b = graph.a[loops], graph.b[loops]
+    apart = np.linalg.norm((places[a] - places[b])[:, :2, 3], axis=1)
+    return known[a] & known[b] & (np.abs(apart - np.linalg.norm(graph.a_from_b[loops, :2, 3], axis=1)) > 3.0)
+
+
+def bicocca(place: Path, methods: Sequence[str]) -> Iterator[Figure]:
+    """Bicocca 25b (Latif, Cadena, Neira, IJRR 2013): error against its GPS truth, as a share of the best method's."""
+    if not place.is_dir():
+        return
+    known, places = bicocca_truth(place)
     for threshold in ("0.150", "0.300", "0.500"):
         graph = read_g2o(place / f"B25b_{threshold}.g2o").graph
         odometry = aligned_error(odometry_chain(graph)[0][known], places[known])
         loops = np.flatnonzero(is_loop(graph))
-        apart = np.linalg.norm((places[graph.a[loops]] - places[graph.b[loops]])[:, :2, 3], axis=1)
-        claimed = np.linalg.norm(graph.a_from_b[loops, :2, 3], axis=1)
-        # 3 m: twice what the fixes are off
-        false = known[graph.a[loops]] & known[graph.b[loops]] & (np.abs(apart - claimed) > 3.0)
+        false = false_by_gps(graph, loops, known, places)
         facts: dict[str, Any] = {"odometry_m": round(odometry, 3), "closures": len(loops), "false": int(false.sum())}
         for kind in methods:
             optimiser = method(kind)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from tests.cli.test_main import rewritten, without
+from tests.cli.test_main import changed, without
 from tests.logs.drives import Drive as Recorded
 from tests.logs.drives import ros_messages, write_ros2
 from vplog.cli import printing
@@ -216,7 +216,7 @@ def test_a_joint_run_says_what_next(joint: Path, capsys: pytest.CaptureFixture[s
 def test_a_command_of_an_odd_name_can_be_copied(drive: Drive, verb: Verb, tmp_path: Path) -> None:
     import shlex
 
-    log = rewritten(drive.log, tmp_path / "my drive's.mcap", without("/none"))
+    log = changed(drive.log, tmp_path / "my drive's.mcap", without("/none"))
     [line] = [line for line in verb("info", log).out.splitlines() if line.startswith("run ")]
     assert shlex.split(line)[1:4] == ["vplog", "run", str(log)]
     assert IMAGE in verb("info", log).out

@@ -9,10 +9,10 @@ import sys
 ENDED_WHILE_THEY_LOAD = """
 import time
 from vplog.execution.process_pool import OwnProcesses
-for number in range(10):
-    with OwnProcesses(8) as processes:
+for number in range(6):
+    with OwnProcesses(4) as processes:
         processes.begin()
-        time.sleep(0.05 * number)
+        time.sleep(0.08 * number)
 """
 
 

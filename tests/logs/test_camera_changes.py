@@ -197,13 +197,14 @@ def test_depth_of_another_size_is_left_out_and_counted(tmp_path: Path) -> None:
     assert "/cam/depth has 160 x 60 px where the image has 160 x 120" in log.account.sentences[0]
 
 
-def test_levels_of_sixteen_bits_are_one_where_the_first_image_is_damaged(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["png", "tiff", "pgm"])
+def test_levels_of_sixteen_bits_are_one_where_the_first_image_is_damaged(kind: str, tmp_path: Path) -> None:
     messages = []
     for i, gain in enumerate((1, 5, 10, 20)):
-        file = b"no image" * 200 if not i else cv2.imencode(".png", gain * SCENE.astype(np.uint16))[1].tobytes()
+        file = b"no image" * 200 if not i else cv2.imencode(f".{kind}", gain * SCENE.astype(np.uint16))[1].tobytes()
         stamp = START_NS + i * PERIOD_NS
         message = store(2).types["sensor_msgs/msg/CompressedImage"](
-            header=header(2, stamp, "cam"), format="mono16; png", data=np.frombuffer(file, np.uint8)
+            header=header(2, stamp, "cam"), format=f"mono16; {kind}", data=np.frombuffer(file, np.uint8)
         )
         messages.append(Written("/cam/image", "sensor_msgs/msg/CompressedImage", stamp, message))
     log = logs.open(written(tmp_path / "drive", messages))

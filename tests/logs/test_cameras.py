@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from tests.logs.drives import store
+from vplog.logs.cameras import camera_of
+from vplog.logs.formats.container import Notes
 from vplog.logs.messages.records import CalibrationMessage
 from vplog.logs.messages.ros import decode_ros
 
@@ -63,3 +65,38 @@ def test_a_window_and_binned_pixels(ros: int) -> None:
 
 def test_an_uncalibrated_window_stays_uncalibrated() -> None:
     assert not decoded(2, (100, 40, 800, 600), (2, 2), np.zeros((3, 3))).matrix.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "coefficients", "model", "count"),
+    [
+        ("plumb_bob", [0.1, 0.2, 0.01, 0.02, 0.3], "plumb_bob", 5),
+        ("plumb_bob", [0.1, 0.2, 0.01, 0.02, 0.3, 0.1, 0.2, 0.3], "rational_polynomial", 8),
+        ("plumb_bob", [0.1, 0.2, 0.01, 0.02, 0.0, 0.0, 0.0], "plumb_bob", 4),
+        ("rational_polynomial", [0.1, 0.2, 0.01, 0.02, 0.3], "plumb_bob", 5),
+        ("rational_polynomial", [0.1] * 14, "rational_polynomial", 14),
+        ("", [0.1, 0.2, 0.01, 0.02], "plumb_bob", 4),
+        ("Brown Conrady", [0.1, 0.2, 0.01, 0.02, 0.3], "plumb_bob", 5),
+        ("equidistant", [0.1, 0.2, 0.01, 0.02], "equidistant", 4),
+        ("equidistant", [0.1, 0.2, 0.01, 0.02, 0.0], "equidistant", 4),
+        ("kannala_brandt4", [0.1, 0.2, 0.01, 0.02], "equidistant", 4),
+        ("fisheye", [0.1, 0.2, 0.01, 0.02], "equidistant", 4),
+        ("fov", [0.0, 0.0], "none", 0),
+    ],
+)
+def test_lenses_are_known_by_the_names_and_counts_of_drivers(
+    name: str, coefficients: list[float], model: str, count: int
+) -> None:
+    calibration = CalibrationMessage(0, "", 1280, 960, name, np.array(coefficients), K, np.zeros((3, 4)))
+    camera = camera_of("/cam", calibration, (1280, 960), Notes())
+    assert camera.matrix is not None
+    assert camera.distortion_model == model
+    np.testing.assert_array_equal(camera.distortion, coefficients[:count])
+
+
+@pytest.mark.parametrize(("name", "count"), [("fov", 1), ("equidistant", 5), ("plumb_bob", 6), ("equidistant", 3)])
+def test_other_lenses_are_said(name: str, count: int) -> None:
+    notes = Notes()
+    calibration = CalibrationMessage(0, "", 1280, 960, name, np.full(count, 0.1), K, np.zeros((3, 4)))
+    assert camera_of("/cam", calibration, (1280, 960), notes).matrix is None
+    assert "which is none of plumb_bob, rational_polynomial, equidistant" in notes.lines[0]

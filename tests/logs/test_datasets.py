@@ -116,6 +116,30 @@ def test_rows_of_kitti_belong_to_the_numbers_of_images(tmp_path: Path) -> None:
     check_frames(logs.open(tmp_path, TopicChoice(right="")), stamps[[1, 2, 4, 5]], images(0)[[1, 2, 4, 5]])
 
 
+def test_images_of_kitti_that_are_none_are_counted(tmp_path: Path) -> None:
+    kitti(tmp_path)
+    for row in (1, 4):
+        (tmp_path / "sequences" / "07" / "image_0" / f"{row:06d}.png").write_bytes(b"")
+    log = logs.open(tmp_path, TopicChoice(right=""))
+    assert len(log.stamps()) == COUNT - 2
+    assert [(loss.reason, loss.messages) for loss in log.account.losses] == [("empty_image", 2)]  # type: ignore[attr-defined]
+
+
+def test_rows_of_kittis_truth_without_a_pose_are_left_out_and_a_wrong_count_is_said(tmp_path: Path) -> None:
+    stamps, file = kitti(tmp_path), tmp_path / "poses" / "07.txt"
+    lines = file.read_text().splitlines()
+    text(file, "nan " + lines[0].split(" ", 1)[1], *lines[1:])
+    check_truth(logs.open(tmp_path), stamps[1:], poses()[1:])
+    assert not logs.open(tmp_path).info().warnings
+    text(file, *lines[:-1])
+    log = logs.open(tmp_path)
+    check_truth(log, stamps[:-1], poses()[:-1])
+    assert any(f"07.txt has {COUNT - 1} poses, times.txt {COUNT} rows" in line for line in log.info().warnings)
+    text(file, *(" ".join(["0"] * 12) for _ in lines))
+    with pytest.raises(LogError, match="holds no pose"):
+        logs.open(tmp_path)
+
+
 def test_of_several_sequences_one_is_to_be_given(tmp_path: Path) -> None:
     kitti(tmp_path)
     (tmp_path / "sequences" / "07").rename(tmp_path / "sequences" / "06")
@@ -192,6 +216,10 @@ def test_tum_rgbd_has_depth_in_5000_of_a_metre(tmp_path: Path) -> None:
 def test_a_list_of_images_leads_nowhere_else(tmp_path: Path) -> None:
     text(tmp_path / "rgb.txt", "1305031102.175304 ../../etc/passwd")
     with pytest.raises(LogError, match="outside"):
+        logs.open(tmp_path)
+    text(tmp_path / "rgb.txt", "1305031102.175304 rgb/1.png", "1305031102.275304 rgb/2.png")
+    write_images(tmp_path / "rgb", ["1.PNG", "2.PNG"], images()[:2])
+    with pytest.raises(LogError, match=r"names rgb/1\.png and others, none of which is in"):
         logs.open(tmp_path)
 
 

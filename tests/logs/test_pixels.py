@@ -196,8 +196,15 @@ def by_levels(images: list[np.ndarray]) -> list[np.ndarray]:
     return [np.clip(image, 0, 255).astype(np.uint8) for image in scaled]
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
-@pytest.mark.parametrize("form", FORMATS, ids=lambda form: form.name)
+@pytest.mark.parametrize(
+    ("form", "encoding"),
+    [
+        pytest.param(form, encoding, id=f"{form.name}-{encoding}")
+        for number, form in enumerate(FORMATS)
+        for at, encoding in enumerate(ENCODINGS)
+        if (number + at) % 3 == 0  # every encoding in each family, some in each format
+    ],
+)
 def test_pixels_are_those_of_the_reference_readers(form: Format, encoding: str, tmp_path: Path) -> None:
     rng = np.random.default_rng([FORMATS.index(form), ENCODINGS.index(encoding)])
     options = dict(form.options)
@@ -207,7 +214,7 @@ def test_pixels_are_those_of_the_reference_readers(form: Format, encoding: str, 
     path = form.write(tmp_path / "drive", messages, options)
     for topic in topics:
         expected = by_levels([pixels_of(found) for found in recorded(path, form.family, topic)])
-        for threads in (1, 2, 4):
+        for threads in (1, 4):
             with limited(threads):
                 log: Any = logs.open(path, TopicChoice(image=topic))
                 log.odometry()

@@ -7,6 +7,7 @@ import pytest
 
 from vplog.geometry import se3
 from vplog.loops import pose_refinement
+from vplog.loops.pose_refinement import Matches
 
 
 def landmarks(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -17,14 +18,18 @@ def of_rays(sigma: float, count: int) -> np.ndarray:
     return np.tile(sigma**2 * np.eye(2), (count, 1, 1))
 
 
+def image_only(points: np.ndarray, covariance: np.ndarray, seen: np.ndarray) -> Matches:
+    """Landmarks whose depth the query did not measure, each ray with a standard deviation of 1e-3."""
+    unknown = np.full(len(points), np.nan)
+    return Matches(points, covariance, seen, of_rays(1e-3, len(points)), unknown, unknown)
+
+
 def predict(match_from_query: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(x, y, rho) in the query, and the derivatives by pose and landmark."""
     back = se3.inverse(match_from_query)
     here, by_pose, by_point = np.empty((len(points), 3)), np.empty((len(points), 3, 6)), np.empty((len(points), 3, 3))
     for row, point in enumerate(points):
-        assert pose_refinement._predict(
-            back[:3, :3].copy(), back[:3, 3].copy(), point, here[row], by_point[row], by_pose[row]
-        )
+        assert pose_refinement._predict(back, point, here[row], by_point[row], by_pose[row])
     return here, by_pose, by_point
 
 
@@ -54,7 +59,7 @@ def test_the_pose_is_found_and_its_covariance_is_that_of_its_errors(deep: bool) 
         rho = exact[:, 2] + rng.normal(0, rho_sigma, 40) if deep else np.full(40, np.nan)
         start = true @ se3.exp(rng.normal(0, 0.02, 6))
         found, hessian, excess = pose_refinement.fit(
-            start, points, np.zeros((40, 3, 3)), seen, rho, np.full(40, rho_sigma**2), of_rays(sigma, 40)
+            start, Matches(points, np.zeros((40, 3, 3)), seen, of_rays(sigma, 40), rho, np.full(40, rho_sigma**2))
         )
         error = se3.log(se3.between(true, found))
         errors.append(error @ hessian @ error / 6)
@@ -66,17 +71,15 @@ def test_a_landmark_explained_by_its_own_uncertainty_agrees() -> None:
     points, seen = np.array([[0.1, 0.0, 0.5]]), np.array([[0.11, 0.0]])
     for variance, near in ((0.0, False), (1e-4, True)):
         covariance = np.diag([variance, variance, 0.0])[None]
-        squared, alone = pose_refinement.agreement(np.eye(4), points, covariance, seen, of_rays(1e-3, 1))
+        squared, alone = pose_refinement.agreement(np.eye(4), image_only(points, covariance, seen))
         assert (squared[0] < 9.21) == near
         assert alone[0] == pytest.approx(10.0**2)
     behind = se3.pose(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
-    assert np.isnan(pose_refinement.agreement(behind, points, np.zeros((1, 3, 3)), seen, of_rays(1e-3, 1))[0]).all()
+    assert np.isnan(pose_refinement.agreement(behind, image_only(points, np.zeros((1, 3, 3)), seen))[0]).all()
 
 
 def test_landmarks_on_one_line_through_the_camera_leave_the_pose_where_it_was() -> None:
     points = np.column_stack([np.zeros((8, 2)), np.linspace(0.1, 0.5, 8)])
-    found, hessian, _ = pose_refinement.fit(
-        np.eye(4), points, np.zeros((8, 3, 3)), np.zeros((8, 2)), np.full(8, np.nan), np.ones(8), of_rays(1e-3, 8)
-    )
+    found, hessian, _ = pose_refinement.fit(np.eye(4), image_only(points, np.zeros((8, 3, 3)), np.zeros((8, 2))))
     np.testing.assert_array_equal(found, np.eye(4))
     assert np.linalg.cond(hessian) > 1e12

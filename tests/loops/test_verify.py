@@ -13,6 +13,7 @@ from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.loops.landmarks import LandmarkSettings
 from vplog.loops.verify import VerifySettings
+from vplog.loops.verify_epipolar import EpipolarSettings, epipolar_inliers
 from vplog.loops.verify_metric import MetricSettings
 
 EXACT = VerifySettings(landmarks=LandmarkSettings(pixel_sigma=NOISE_PX, depth_share=0.0))
@@ -286,3 +287,18 @@ def test_an_unknown_lens_stops_before_the_work() -> None:
     lens, frames, _, _ = drive(False)
     with pytest.raises(LogError, match="distortion model"):
         verify(proposals([(LAP, 0)]), frames, replace(lens, distortion_model="fov"), lambda _: 1 / 0, EXACT)  # type: ignore[arg-type]
+
+
+def test_matches_of_one_plane_agree_and_never_end_a_run() -> None:
+    """OpenCV's USAC raises for some of them: the facade of a house, with a few wrong matches."""
+    rng = np.random.default_rng(0)
+    for _ in range(150):
+        count, wrong = int(rng.integers(12, 60)), int(rng.integers(0, 4))
+        match = rng.uniform([180, 5], [360, 170], (count, 2))
+        a, b, d = rng.normal(0, 0.05, 3)
+        plane = np.array([[0.6 + a, b, -90], [d, 0.6, rng.uniform(0, 40)], [*rng.normal(0, 3e-4, 2), 1]])
+        seen = np.c_[match, np.ones(count)] @ plane.T
+        query = seen[:, :2] / seen[:, 2:]
+        query[:wrong] = rng.uniform(0, 380, (wrong, 2))
+        agrees, _ = epipolar_inliers(query.astype(np.float32), match.astype(np.float32), 384, 216, EpipolarSettings())
+        assert agrees[wrong:].mean() > 0.9

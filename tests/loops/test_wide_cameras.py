@@ -40,18 +40,13 @@ def verified(camera: Camera, half_view_deg: float, seed: int) -> tuple[Pose, flo
     rho = 1.0 / points[:, 2] + random.normal(0, np.sqrt(NOISE.depth_sigma**2 + (NOISE.depth_share / points[:, 2]) ** 2))
     landmarks = from_depth(here, 1.0 / rho, camera, NOISE)
     rows = np.flatnonzero(landmarks.known & np.isfinite(there).all(1))
-    unknown = np.full(len(rows), np.nan), np.ones(len(rows))
+    unknown = np.full(len(rows), np.nan, np.float32)
     share = undistort.project(camera, seen)[rows] / 1000
-    pose = verify_metric.solve(landmarks, rows, there[rows], unknown, share, camera, NOISE, ALONE)
+    matches = verify_metric.observe(landmarks, rows, there[rows], unknown, camera, NOISE)
+    pose = verify_metric.solve(matches, share, camera, landmarks.from_depth, NOISE.pixel_sigma, ALONE)
     assert pose.match_from_query is not None
     assert pose.covariance is not None
-    distance, _ = pose_refinement.agreement(
-        pose.match_from_query,
-        np.column_stack([landmarks.rays, landmarks.rho])[rows],
-        landmarks.covariance[rows],
-        there[rows],
-        undistort.noise_of_rays(camera, there[rows], NOISE.pixel_sigma),
-    )
+    distance, _ = pose_refinement.agreement(pose.match_from_query, matches)
     error = se3.log(se3.between(truth, pose.match_from_query))
     off_axis = np.degrees(np.arctan(np.hypot(*there[rows].T)))
     return pose, float(error @ np.linalg.solve(pose.covariance, error)), off_axis, distance < verify_metric._CHI2_2

@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,14 +20,13 @@ from vplog.maps.storage import layout, map_store
 from vplog.results import run_record, tables
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vplog.data import Floats
     from vplog.maps.storage.map_store import Store
 
 LIBRARY, OTHER_LIBRARY = "a" * 64, "b" * 64
 PLACES = COUNT
 """Of every drive."""
+_FOLDER = TemporaryDirectory(prefix="runs-")
 KIND = pa.struct([("references", pa.list_(pa.uint16(), 3)), ("boxes", pa.list_(pa.uint8(), 6))])
 
 
@@ -32,6 +34,19 @@ def write_run(
     folder: Path, drive: str, seed: int = 0, library: str = LIBRARY, world_from_enu: Floats | None = None
 ) -> Path:
     """Every file of a run says `seed` in its own way. On earth where it says how it lies there."""
+    if world_from_enu is not None:
+        return _written(folder, drive, seed, library, world_from_enu)
+    shutil.copytree(_made(drive, seed, library), folder, copy_function=shutil.copyfile)
+    return folder
+
+
+@cache
+def _made(drive: str, seed: int, library: str) -> Path:
+    """Such a run, written once by each process of the tests."""
+    return _written(Path(mkdtemp(dir=_FOLDER.name)) / "run", drive, seed, library, None)
+
+
+def _written(folder: Path, drive: str, seed: int, library: str, world_from_enu: Floats | None) -> Path:
     run, rng, about = make_run(seed), np.random.default_rng(seed), tables.TableMetadata({"seed": seed}, library)
     folder.mkdir(parents=True)
     keyframes = replace(run.keyframes, drive=drive)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.sparse import csr_array
 
 from tests.places.pictures import SMALL, noisy, nothing, reference
 from vplog.data import Keyframes, Reference
@@ -27,12 +28,6 @@ if TYPE_CHECKING:
 def state(references: list[Reference]) -> PaperBobbState:
     """With the words of `WordSettings`, as runs measure coverage by them."""
     return SMALL.model_copy(update={"l1_range": WordSettings().l1_range}).learn(references, Execution(2))
-
-
-def _sparse(matrix: np.ndarray) -> cov.Explanations:
-    rows, columns = np.nonzero(matrix)
-    start = np.searchsorted(rows, np.arange(len(matrix) + 1))
-    return cov.Explanations(start, columns.astype(np.int32), matrix[rows, columns].astype(np.float32), matrix.shape[1])
 
 
 def _value(matrix: np.ndarray, chosen: list[int]) -> float:
@@ -53,7 +48,7 @@ def matrices(draw: st.DrawFn) -> np.ndarray:
 @given(matrices(), st.integers(1, 4))
 @settings(deadline=None, max_examples=40)
 def test_greedy_takes_what_adds_most_and_is_near_the_best_choice(matrix: np.ndarray, size: int) -> None:
-    chosen = cov.greedy_cover(_sparse(matrix), min(size, matrix.shape[1])).tolist()
+    chosen = cov.greedy_cover(csr_array(matrix), min(size, matrix.shape[1])).tolist()
     assert len(set(chosen)) == len(chosen)
     for n, candidate in enumerate(chosen):
         gains = [_value(matrix, [*chosen[:n], c]) for c in range(matrix.shape[1])]
@@ -84,12 +79,12 @@ def _choose(descriptors: list[Bytes], threads: int = 1, **options: object) -> li
 def test_who_explains_whom() -> None:
     descriptors = _walk(places=5, frames=4, seed=0)
     found = cov.explanations(descriptors, np.arange(0, 20, 2), Execution(2))
-    for frame, (begin, end) in enumerate(pairwise(found.start.tolist())):
-        who = 2 * found.candidate[begin:end]
+    for frame, (begin, end) in enumerate(pairwise(np.asarray(found.indptr).tolist())):
+        who = 2 * found.indices[begin:end]
         same_place = {row for row in range(0, 20, 2) if row // 4 == frame // 4 and row != frame}
         assert set(who.tolist()) == same_place, "those of its place, and never itself"
-        assert np.all(found.share[begin:end] > 0.9)
-        assert np.all(found.share[begin:end] <= 1.0)
+        assert np.all(found.data[begin:end] > 0.9)
+        assert np.all(found.data[begin:end] <= 1.0)
 
 
 def test_every_place_gets_a_reference_before_any_gets_two() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.places.pictures import SMALL, noisy, nothing, reference, texture
-from vplog.errors import LibraryError, SettingsError
+from vplog.errors import LibraryError, NewerError, SettingsError
 from vplog.execution.execution import Execution
 from vplog.places import library as lib
 from vplog.places import library_files
@@ -145,8 +146,21 @@ def test_damaged_records(saved: Path, text: str) -> None:
 @pytest.mark.parametrize("change", [{"seed": 9}, {"references": 50}, {"grid": 300}, {"partitions": 0}, {"new": 1}])
 def test_changed_settings_are_noticed(saved: Path, change: dict[str, int]) -> None:
     record = json.loads((saved / "library.json").read_text())
+    del record["record_sha256"]  # as of an older vplog
+    (saved / "library.json").write_text(json.dumps(record))
+    PaperBobbSettings().load(saved, Execution())
     (saved / "library.json").write_text(json.dumps({**record, "settings": {**record["settings"], **change}}))
     _refused(saved)
+
+
+def test_a_flipped_bit_of_the_record_is_noticed(saved: Path) -> None:
+    whole, known = (saved / "library.json").read_bytes(), library_files.read_library_record(saved)
+    for bit in range(0, 8 * len(whole.rstrip()), 7):
+        data = bytearray(whole)
+        data[bit // 8] ^= 1 << bit % 8
+        (saved / "library.json").write_bytes(data)
+        with suppress(LibraryError, NewerError):
+            assert known.items() <= library_files.read_library_record(saved).items(), bit
 
 
 def _replace(path: Path, column: str, values: pa.Array) -> None:

@@ -148,7 +148,7 @@ def test_threads_and_blocks_change_nothing() -> None:
     stops = np.minimum(np.arange(700) // 5, 90)
 
     def result(threads: int) -> list[tuple[bytes, bytes]]:
-        rows = sequence_rows(lambda q: scores[q, : stops[q]], stops, SequenceSettings(), threads)
+        rows = sequence_rows(lambda q: scores[q, : stops[q]], stops, SequenceSettings(), Execution(threads))
         return [(score.tobytes(), support.tobytes()) for score, support in rows]
 
     one, three = result(1), result(3)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from vplog.errors import ResultError
+from vplog.errors import ResultError, SettingsError
 from vplog.pipeline import pipeline_schema
 from vplog.results import messages
 from vplog.results.contracts import table_schemas, write_schemas
@@ -15,7 +15,9 @@ SCHEMAS = Path(__file__).parents[2] / "schemas"
 
 
 def test_contracts_in_the_repository_are_those_of_the_code(tmp_path: Path) -> None:
-    for path in write_schemas(tmp_path, pipeline_schema()):
+    written = write_schemas(tmp_path, pipeline_schema())
+    assert {path.name for path in written} == {path.name for path in SCHEMAS.iterdir()}
+    for path in written:
         assert (SCHEMAS / path.name).read_text() == path.read_text(), f"run `vplog schemas`: {path.name} has changed"
 
 
@@ -68,3 +70,10 @@ def test_what_is_no_schema_is_not_replaced(name: str, tmp_path: Path) -> None:
     with pytest.raises(ResultError, match="is no schema, and is not replaced"):
         write_schemas(tmp_path, pipeline_schema())
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {name: '{"format": 1}'}
+
+
+def test_a_folder_of_other_things_gets_no_schemas(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"a log is hashed with all that is in its folder")
+    with pytest.raises(SettingsError, match="a folder with other things in it, not schemas"):
+        write_schemas(tmp_path, pipeline_schema())
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]

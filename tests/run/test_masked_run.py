@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
+from tests.joined import rewritten
 from tests.logs.drives import store
 from vplog.demo import SMALL
+from vplog.demo.record import IMAGE, TYPES
 from vplog.results.run_record import read_run_json
 from vplog.results.tables import read_keyframes
 from vplog.run.feature_extraction import stored_features
@@ -19,6 +19,8 @@ from vplog.run.feature_extraction import stored_features
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
+
+    from mcap.records import Message
 
     from tests.conftest import Said
     from vplog.demo.record import Drive
@@ -36,23 +38,17 @@ def bonnet(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
     texture = ((texture - texture.min()) / np.ptp(texture) * 255).astype(np.uint8)
     used = np.arange(SMALL.height)[:, None] < HORIZON * SMALL.height + np.zeros(SMALL.width)
     cv2.imwrite(str(folder / "mask.png"), used * np.uint8(255))
-    with drive.log.open("rb") as stream, (folder / "drive.mcap").open("wb") as file:
-        writer, channels = Writer(file), dict[int, int]()
-        writer.start(profile="ros2")
-        for schema, channel, message in make_reader(stream).iter_messages():
-            assert schema is not None
-            data = message.data
-            if schema.name == "sensor_msgs/msg/CompressedImage":
-                image = store(2).deserialize_cdr(data, schema.name)
-                pixels = np.asarray(cv2.imdecode(np.asarray(image.data), cv2.IMREAD_GRAYSCALE))
-                pixels[~used] = texture[~used]
-                image.data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 92])[1].ravel()
-                data = store(2).serialize_cdr(image, schema.name)
-            if channel.id not in channels:
-                known = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)
-            writer.add_message(channels[channel.id], message.log_time, bytes(data), message.publish_time)
-        writer.finish()
+
+    def seen(topic: str, message: Message) -> bytes:
+        if topic != IMAGE:
+            return message.data
+        image: Any = store(2).deserialize_cdr(message.data, TYPES[IMAGE])
+        pixels = np.asarray(cv2.imdecode(np.asarray(image.data), cv2.IMREAD_GRAYSCALE))
+        pixels[~used] = texture[~used]
+        image.data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 92])[1].ravel()
+        return bytes(store(2).serialize_cdr(image, TYPES[IMAGE]))
+
+    rewritten(drive.log, folder / "drive.mcap", seen)
     return folder
 
 

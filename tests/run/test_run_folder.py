@@ -285,16 +285,35 @@ def test_logs_and_results_are_not_replaced_by_a_single_file(
 ) -> None:
     out = shutil.copytree(finished, tmp_path / "run")
     logs = {"a.mcap": drive.log.read_bytes(), "a.bag": b"#ROSBAG V2.0\n", "a.db3": b"SQLite format 3\0"}
-    for name, data in logs.items():
+    pictures = {
+        "a.jpg": b"\xff\xd8\xff\xe1", "a.g2o": b"\x89PNG\r\n\x1a\n", "a.tif": b"MM\0*", "a.mp4": b"\0\0\0\x18ftypisom",
+        "a.avi": b"RIFF1234AVI ", "a.mkv": b"\x1a\x45\xdf\xa3",
+    }  # fmt: skip
+    records = {"map/map.json": b"{}", "map/joint.json": b"{}", "map/edges/drive=a/edges.parquet": b"PAR1"}
+    (tmp_path / "map" / "runs").mkdir(parents=True)
+    (tmp_path / "map" / "edges" / "drive=a").mkdir(parents=True)
+    for name, data in (logs | pictures | records).items():
         (tmp_path / name).write_bytes(data)
     results = [out / name for name in ("run.json", "closures.parquet", "result.mcap", "library/library.json")]
     before = tree(tmp_path)
     words = command.replace("RUN", str(out)).replace("LOG", str(drive.log)).split()
-    for path in [*results, *(tmp_path / name for name in logs)]:
+    for path in [*results, *(tmp_path / name for name in logs | pictures | records)]:
         said = verb(*words, path)
         assert said.code == 2
         assert f"{path} is a " in said.err.splitlines()[-1]
     assert tree(tmp_path) == before
+
+
+def test_a_folder_is_no_file_to_write_and_is_refused_before_any_work(
+    finished: Path, tmp_path: Path, verb: Callable[..., Said]
+) -> None:
+    for words in (["optimize", finished / "graph.g2o"], ["report", finished], ["map", "export", finished]):
+        said = verb(*words, "-o", tmp_path)
+        assert said.code == 2
+        assert f"argument -o/--output: {tmp_path} is a folder: name a file." in said.err
+    assert (
+        f"{tmp_path} is a folder, and tum a file." in verb("export", finished, "--format", "tum", "-o", tmp_path).error
+    )
 
 
 def test_nothing_that_writes_a_file_replaces_a_log(finished: Path, drive: Drive, tmp_path: Path) -> None:

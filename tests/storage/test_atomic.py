@@ -16,7 +16,8 @@ from vplog.geometry.tum import write_tum
 from vplog.results import tables
 from vplog.results.g2o import write_g2o
 from vplog.results.mcap import write_mcap
-from vplog.results.run_record import canonical_json, read_run_json, write_run_json
+from vplog.results.run_record import read_run_json, write_run_json
+from vplog.storage.json_records import canonical_json
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:

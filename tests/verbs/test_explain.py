@@ -14,12 +14,12 @@ import pytest
 
 from vplog.data import ACCEPTED, Camera, Features, Keyframes, Verdict
 from vplog.execution.execution import Execution
-from vplog.figures.closure_view import find_agreement, find_boxes
 from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.pipeline import Pipeline, load_pipeline, run
 from vplog.results import tables
 from vplog.results.run_record import read_run_json
+from vplog.run.figures.closure_view import find_agreement, find_boxes
 from vplog.verbs.explain_text import describe
 
 if TYPE_CHECKING:
@@ -292,19 +292,13 @@ def test_matches_that_the_pose_explains_are_told_from_others(shift_m: float) -> 
     wrong = np.arange(len(query)) % 3 == 0
     query[wrong] = rng.uniform([0, 0], [640, 480], (wrong.sum(), 2))
     descriptors = rng.integers(0, 256, (len(query), 128)).astype(np.uint8)
-    pose = se3.quaternion(match_from_query[:3, :3])
-    row = {
-        **dict(zip(("tx", "ty", "tz"), match_from_query[:3, 3].tolist(), strict=True)),
-        **dict(zip(("qx", "qy", "qz", "qw"), pose.tolist(), strict=True)),
-        "inliers": 9,
-    }
     ours, theirs = features(query, descriptors), features(match, descriptors)
     settings = Pipeline().verify
-    known = find_agreement(ours, theirs, row, CAMERA, settings)
+    known = find_agreement(ours, theirs, match_from_query, 9, CAMERA, settings)
     assert len(known.agrees) == len(query) > 100
     assert known.agrees[~wrong].mean() > 0.98
     assert known.agrees[wrong].mean() < 0.1
-    unknown = find_agreement(ours, theirs, {**row, "tx": None}, replace(CAMERA, matrix=None), settings)
+    unknown = find_agreement(ours, theirs, np.full((4, 4), np.nan), 9, replace(CAMERA, matrix=None), settings)
     if shift_m:  # without a shift there is no epipolar geometry, and any that a turn allows will do
         assert unknown.agrees[~wrong].mean() > 0.8
         assert unknown.agrees[wrong].mean() < 0.2
@@ -315,7 +309,7 @@ def test_matches_by_chance_agree_with_nothing(count: int) -> None:
     rng = np.random.default_rng(count)
     descriptors = rng.integers(0, 256, (count, 128)).astype(np.uint8)
     ours, theirs = (features(rng.uniform([0, 0], [640, 480], (count, 2)), descriptors) for _ in range(2))
-    found = find_agreement(ours, theirs, {"tx": None}, CAMERA, Pipeline().verify)
+    found = find_agreement(ours, theirs, np.full((4, 4), np.nan), 0, CAMERA, Pipeline().verify)
     assert len(found.agrees) == count
     assert not found.agrees.any()
     assert not found.model

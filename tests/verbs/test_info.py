@@ -19,8 +19,8 @@ from tests.logs.test_rectification import drive as write_pair
 from vplog import logs
 from vplog.cli import main, parser
 from vplog.logs import TopicChoice
-from vplog.results.run_record import plain
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
+from vplog.storage.json_records import plain
 from vplog.verbs.info import command, page, preflight, preflight_lines
 
 if TYPE_CHECKING:

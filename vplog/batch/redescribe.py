@@ -26,6 +26,7 @@ from vplog.places.library_files import read_library_record
 from vplog.results import run_record
 from vplog.run.provenance import stored_log
 from vplog.run.reference_library import build_library
+from vplog.storage.json_records import canonical_json
 from vplog.storage.remote_path import local_copy, located
 from vplog.storage.scratch import scratch
 
@@ -62,7 +63,7 @@ def redescribe_map(
         except LogError as error:
             missing[drive] = Drive(drive, log, "failed", error=str(error))
         else:
-            groups.setdefault(run_record.canonical_json(topics[drive] or {}), []).append(drive)
+            groups.setdefault(canonical_json(topics[drive] or {}), []).append(drive)
     with _made(library, Pipeline.read(head.settings, f"{root}/map.json"), execution) as (folder, pipeline):
         if read_library_record(folder)["hash"] == head.library:
             raise SettingsError(f"{root} is described with {library} already. Give another library.")

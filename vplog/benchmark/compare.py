@@ -33,7 +33,7 @@ from vplog.places.library_files import check_descriptors, load_references, refer
 from vplog.places.reference_choice import PAPER_SIZE, LibrarySettings, choose
 from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record
-from vplog.results.staging import staged
+from vplog.results.staging import check_contents, staged
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
@@ -295,8 +295,7 @@ def same_drive(a: Path, b: Path) -> bool:
 
 def _comparison_in(out: Path) -> list[str]:
     """The files of a comparison in a folder that a new one replaces. Raises SettingsError where there are others."""
-    if any(not file.name.startswith(".") for file in out.iterdir()) and not run_record.is_ours(out / "compare.json"):
-        raise SettingsError(f"{out} is a folder with other things in it, not a comparison. Choose another with -o.")
+    check_contents(out, "a comparison", run_record.is_ours(out / "compare.json"))
     return ["compare.json", "answers.csv", "scores-[0-9][0-9]-*.npz", *FIGURES]
 
 

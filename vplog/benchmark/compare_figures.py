@@ -12,7 +12,7 @@ from vplog.benchmark.answers import file_stem
 from vplog.data import Bytes, Float32s, Floats, Ints
 from vplog.evaluate.open_set import reliability_of_matches
 from vplog.evaluate.retrieval import Ranks, Reliability, average_precision, precision_recall, recall_at
-from vplog.figures.canvas import as_text, saved_figure
+from vplog.run.figures.canvas import as_text, saved_figure
 from vplog.storage.image_file import decode_image
 
 if TYPE_CHECKING:

@@ -55,7 +55,7 @@ class MethodResult:
 
 @dataclass(frozen=True, eq=False)
 class MethodInputs:
-    """What every method of a comparison gets."""
+    """Inputs of every method of a comparison."""
 
     references: Sequence[Reference]
     map_traversal: Traversal
@@ -204,7 +204,7 @@ def score_sequences(
     scores: Float32s, settings: SequenceSettings, stops: Ints, lines: Float32s, execution: Execution
 ) -> None:
     """Fill `lines` (Q, M) with the scores of sequences, NaN beyond each query's stop; a few rows at a time."""
-    found = sequence_rows(lambda query: scores[query, : stops[query]], stops, settings, execution.threads)
+    found = sequence_rows(lambda query: scores[query, : stops[query]], stops, settings, execution)
     for query, (row, _) in enumerate(execution.counted("sequences", found, len(stops))):
         lines[query, : len(row)] = row
         lines[query, len(row) :] = np.nan

@@ -22,8 +22,9 @@ import numpy as np
 
 from vplog.cache.input_hashes import hash_inputs, stat_signature
 from vplog.errors import ResultError
-from vplog.results.run_record import canonical_json, read_run_json, write_run_json
+from vplog.results.run_record import read_run_json, write_run_json
 from vplog.settings import Settings
+from vplog.storage.json_records import canonical_json
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:

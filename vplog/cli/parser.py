@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 
 STDOUT = Path("-")
+words: list[str] = []
+"""The words of the command line."""
 _ROLES = ("image", "depth", "right", "camera-info", "odometry", "gps", "imu", "mask")
 _MOST = 10**9
 """Largest count an option may have: far above any drive, and whole in every number type."""
@@ -97,7 +99,9 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """The shortest usage, then what is wrong in one line; exit 2."""
         usage, end = self._brief_usage or self._required_usage(), "" if message.endswith((".", "?", "!")) else "."
-        self.exit(2, f"{usage}{self.prog}: error: {without_secrets(message)}{end} All options: {self.prog} --help\n")
+        self.exit(
+            2, f"{usage}{self.prog}: error: {without_secrets(message, words)}{end} All options: {self.prog} --help\n"
+        )
 
     def _required_usage(self) -> str:
         usage = self._get_formatter()
@@ -147,7 +151,13 @@ local_file = _local("file")
 
 def output_file(text: str) -> Path:
     """A single local file that is written, and no input of anything."""
-    path = local_file(text)
+    path = _replaceable(local_file(text))
+    if path.is_dir():
+        raise argparse.ArgumentTypeError(f"{path} is a folder: name a file")
+    return path
+
+
+def _replaceable(path: Path) -> Path:
     if path.is_file():
         from vplog.run.run_folder import check_output
 
@@ -158,9 +168,9 @@ def output_file(text: str) -> Path:
     return path
 
 
-def output_file_or_stdout(text: str) -> Path:
-    """A single local file, or `-`, the standard output."""
-    return STDOUT if text == "-" else output_file(text)
+def output_or_stdout(text: str) -> Path:
+    """A single local file or a folder, or `-`, the standard output."""
+    return STDOUT if text == "-" else _replaceable(local(text))
 
 
 def _path(text: str) -> Path:

@@ -17,7 +17,7 @@ from vplog.cli.parser import (
     number,
     option,
     output_file,
-    output_file_or_stdout,
+    output_or_stdout,
     place,
     positive,
     topics_of,
@@ -111,6 +111,10 @@ def export(arguments: argparse.Namespace) -> None:
         from vplog.errors import SettingsError
 
         raise SettingsError(f"{arguments.format} is a folder, which stdout does not take. Name one with -o.")
+    if arguments.output.is_dir() and arguments.format not in _FOLDERS:
+        from vplog.errors import SettingsError
+
+        raise SettingsError(f"{arguments.output} is a folder, and {arguments.format} a file. Name one with -o.")
     with _file_or_stdout(arguments, arguments.format in _BINARY) as path, Progress(arguments) as progress:
         execution = Execution(arguments.threads, progress)
         found = export_run(arguments.run, arguments.format, path, arguments.log, execution)
@@ -179,7 +183,7 @@ def add_results(
     option(sub, "run", place, "RUN")
     sub.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
     text = "what to write; - writes a file to stdout"
-    option(sub, "-o --output", output_file_or_stdout, "FILE|FOLDER|-", text, required=True)
+    option(sub, "-o --output", output_or_stdout, "FILE|FOLDER|-", text, required=True)
     option(sub, "--log", place, "LOG", "log of the run, for the pictures of colmap and nerfstudio, where it has moved")
     sub = add("optimize", optimize)
     option(sub, "graph", local_file, "GRAPH.g2o")

@@ -63,7 +63,7 @@ class Drive(Scene):
 
 
 def make_drive(folder: Path, settings: DemoSettings | None = None, execution: Execution | None = None) -> Drive:
-    """Write `folder`/drive.mcap and `folder`/truth.tum and say what is in them.
+    """Write `folder`/drive.mcap and `folder`/truth.tum; the recorded drive.
 
     Frames are rendered on all cores where `execution` is None. Raises ResultError where the folder cannot be written.
     """

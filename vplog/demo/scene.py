@@ -29,7 +29,7 @@ _MOUNT_M = (0.3, 0.0, 1.5)
 _MOUNT_PITCH_RAD = 0.035
 """2 degrees down, so that nothing works that takes the camera for level."""
 NEAR_M = 0.2
-"""What is nearer than this to the camera plane is not drawn."""
+"""m; the near plane of the renderer."""
 MAX_SAMPLES = 6
 """Texture samples along the longer axis of a pixel's footprint: sharp to 80 degrees of slant, blurred beyond."""
 

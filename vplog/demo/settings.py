@@ -1,4 +1,4 @@
-"""What the demo drive looks like: one frozen object of settings, and a small variant for tests."""
+"""Settings of the demo drive, and a small variant for tests."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ class Textures(NamedTuple):
 
 
 class World(NamedTuple):
-    """What stands in the street. Texture 0 is the ground's; after it come the _POSTERS of the traffic."""
+    """Geometry and textures of the street. Texture 0 is the ground's; after it come the _POSTERS of the traffic."""
 
     textures: Textures
     quads: Quads

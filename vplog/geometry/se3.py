@@ -150,6 +150,16 @@ def rotation(q: Floats) -> Floats:
     )
 
 
+def vectors(poses: Floats) -> Floats:
+    """(..., 7) position and quaternion x y z w, w >= 0, of poses (..., 4, 4)."""
+    return np.concatenate([poses[..., :3, 3], quaternion(poses[..., :3, :3])], axis=-1)
+
+
+def from_vectors(values: Floats) -> Floats:
+    """Poses (..., 4, 4) of positions and quaternions (..., 7)."""
+    return pose(rotation(values[..., 3:]), values[..., :3])
+
+
 def _matrices(rows: list[list[Floats]]) -> Floats:
     """(..., R, C) of entries (...)."""
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

@@ -52,7 +52,7 @@ def read_tum(path: Path, failure: type[VplogError], option: str) -> tuple[Ints, 
         raise failure(f"{path} holds no pose. {_FORMAT}")
     stamp_ns, first = np.unique(np.array(stamps, np.int64), return_index=True)
     values = np.array(rows)[first]
-    return stamp_ns, se3.pose(se3.rotation(values[:, 3:]), values[:, :3])
+    return stamp_ns, se3.from_vectors(values)
 
 
 def _pose(fields: list[str], where: str, failure: type[VplogError]) -> tuple[int, list[float]]:
@@ -76,8 +76,7 @@ def _pose(fields: list[str], where: str, failure: type[VplogError]) -> tuple[int
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """`stamp tx ty tz qx qy qz qw` in s, m and 1; 9 decimals, the stamp's exact to the ns."""
-    poses = trajectory.world_from_body
-    values = np.concatenate([poses[:, :3, 3], se3.quaternion(poses[:, :3, :3])], axis=1)
+    values = se3.vectors(trajectory.world_from_body)
     with replacing(path) as stream:
         stream.write(b"# timestamp tx ty tz qx qy qz qw (world_from_body)\n")
         for stamp_ns, row in zip(trajectory.stamp_ns.tolist(), values.tolist(), strict=True):

@@ -1,4 +1,4 @@
-"""Localisation of pictures: the likeliest places, the pose by their landmarks, and what is said of each picture."""
+"""Localisation of pictures: the likeliest places, and the pose by their landmarks."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from vplog.geometry import se3
 from vplog.loops.localize import Localization, localize
 from vplog.masking import masked
 from vplog.results.geo import on_earth
+from vplog.results.tables import POSE_COLUMNS
 from vplog.stages import EncodedFrame, FrameState, Log, StoredState
 
 if TYPE_CHECKING:
@@ -57,9 +58,7 @@ class LocalizedPicture:
         pose, covariance = self.found.world_from_camera, self.found.covariance
         values: dict[str, Any] = {}
         if pose is not None and covariance is not None:
-            quaternion = se3.quaternion(pose[None, :3, :3])[0]
-            names = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
-            values = dict(zip(names, [*pose[:3, 3].tolist(), *quaternion.tolist()], strict=True))
+            values = dict(zip(POSE_COLUMNS, se3.vectors(pose).tolist(), strict=True))
             sigma_m, sigma_deg = sigmas(self.found)
             values |= {"covariance": covariance.tolist(), "sigma_m": sigma_m, "sigma_deg": sigma_deg}
             if self.earth_deg_m is not None:
@@ -93,10 +92,9 @@ def localize_log(
             yield found
 
 
-def localize_frame(places: Places, frame: Frame, execution: Execution, top: int = TOP) -> LocalizedPicture:
+def localize_frame(places: Places, frame: Frame, execution: Execution) -> LocalizedPicture:
     """One picture."""
-    picture = _describe(places, frame)
-    return next(_localized(places, [picture], execution, top, {}))
+    return next(_localized(places, [_describe(places, frame)], execution, TOP, {}))
 
 
 @dataclass(frozen=True, eq=False)

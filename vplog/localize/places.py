@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -29,15 +28,16 @@ from vplog.maps.search.sequences import best_lines
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings
 from vplog.maps.storage.layout import PICTURES, folder_name
+from vplog.pipeline import recorded_pipeline
 from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record, tables
 from vplog.results.landmark_table import LandmarkTable
 from vplog.run.landmarks import LANDMARKS, landmark_key, run_drive, write_drive_landmarks
 from vplog.run.provenance import library_at
 from vplog.stages import CodedState, PlaceState
+from vplog.storage.json_records import plain
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.scratch import scratch
-from vplog.verbs.report import recorded_pipeline
 
 if TYPE_CHECKING:
     from vplog.loops.candidate import Drive
@@ -67,22 +67,19 @@ class Landmarked(NamedTuple):
         return KeyframeLandmarks(self.world_from_body[row] @ camera.body_from_camera, features, landmarks)
 
 
+@dataclass(eq=False)
 class PlacesOfDrive:
     """One drive, which is read when a picture may be in it: a map has thousands."""
 
-    def __init__(self, name: str, frame: str, load: Callable[[], Landmarked]) -> None:
-        """`frame` names that of its poses, which drives that closures join share: the first of them."""
-        self.name, self.frame, self._load = name, frame, load
-        self._loaded: Landmarked | None = None
-        self._lock = threading.Lock()
+    name: str
+    frame: str
+    """Frame of its poses: the first of the drives that closures join with it."""
+    load: Callable[[], Landmarked]
 
-    @property
+    @cached_property
     def loaded(self) -> Landmarked:
         """Its keyframes, with landmarks that are made where they are not stored. Raises VplogError."""
-        with self._lock:
-            if self._loaded is None:
-                self._loaded = self._load()
-            return self._loaded
+        return self.load()
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +201,7 @@ def _map_landmarks(
     @contextmanager
     def drive() -> Iterator[Drive]:
         camera = known_camera(store, member, pipeline)
-        camera = camera or CameraTrust(run_record.plain(dict(vars(opened_log(member).camera()))), 0.0)
+        camera = camera or CameraTrust(plain(dict(vars(opened_log(member).camera()))), 0.0)
         with opened_drive(member, camera, member.pipeline.verify, execution) as (found, fetch):
             fetch(np.arange(len(found.keyframes.stamp_ns)))
             yield found

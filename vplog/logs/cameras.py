@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -15,18 +16,17 @@ if TYPE_CHECKING:
     from vplog.logs.messages.records import CalibrationMessage
     from vplog.logs.tf_odometry import FrameTree
 
-_MODELS = {
-    "plumb_bob": "plumb_bob",
-    "brown_conrady": "plumb_bob",  # RealSense's name of the same polynomial
-    "radtan": "plumb_bob",  # Kalibr's
-    "rational_polynomial": "rational_polynomial",
-    "equidistant": "equidistant",
-    "kannala_brandt": "equidistant",  # Foxglove's
-    "fisheye": "equidistant",
+_LENSES = {
+    "plumb_bob": ("plumbbob", "radtan", "radialtangential", "brownconrady", "rationalpolynomial", ""),
+    "equidistant": ("equidistant", "equid", "kannalabrandt", "fisheye", "opencvfisheye"),
 }
-"""Names that drivers write, and vplog's."""
-_COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
-"""Coefficients that OpenCV takes for each model."""
+"""Names that drivers (RealSense: brown_conrady, kannala_brandt4) and calibration tools (Kalibr: radtan, equid4) write,
+letters alone, by vplog's: OpenCV's polynomial, which is plumb_bob where it has no denominator, and its fisheye."""
+_COUNTS = {
+    "plumb_bob": dict.fromkeys((4, 5), "plumb_bob") | dict.fromkeys((8, 12, 14), "rational_polynomial"),
+    "equidistant": {4: "equidistant"},
+}
+"""Numbers of coefficients that OpenCV takes of each lens, and the model that they make."""
 _BODY = "base_link"
 """The body's frame where the odometry names none: ROS REP 105."""
 _AHEAD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -56,7 +56,8 @@ def camera_of(name: str, calibration: CalibrationMessage | None, size: tuple[int
     if known is None:
         notes.add(
             f"The calibration of {name} has {len(distortion)} coefficients of the distortion model {model[:40]!r}, "
-            f"which is none of {', '.join(_COUNTS)}, so the camera is uncalibrated. Give one with --calibration."
+            "which is none of plumb_bob, rational_polynomial, equidistant, so the camera is uncalibrated. "
+            "Give one with --calibration."
         )
         return unknown
     camera = replace(unknown, distortion_model=known[0], distortion=known[1])
@@ -92,18 +93,23 @@ def is_rectified(topic: str) -> bool:
     return "image_rect" in topic
 
 
+def lens_of(name: str) -> str | None:
+    """`plumb_bob` (OpenCV's polynomial, whatever its length) or `equidistant`; None where the name is not known."""
+    letters = re.sub(r"[^a-z]", "", name.lower())
+    return next((lens for lens, names in _LENSES.items() if letters in names), None)
+
+
 def _model(name: str, coefficients: Floats) -> tuple[str, Floats] | None:
-    """Model and coefficients in vplog's names; None where the model is not known."""
+    """Model and coefficients in vplog's names; None where the model is not known. As in OpenCV their number tells which
+    polynomial it is; zeros behind the last (RealSense's fisheye has five) are left out."""
     if not np.isfinite(coefficients).all():
         return None
     if not coefficients.any():
         return "none", np.zeros(0)
-    model = _MODELS.get(name.lower())
-    if model is None and not name:  # drivers that leave the name out mean OpenCV's polynomial
-        model = "plumb_bob" if len(coefficients) < 8 else "rational_polynomial"
-    if model is None or len(coefficients) not in _COUNTS[model]:
-        return None
-    return model, coefficients
+    given, used = len(coefficients), int(np.flatnonzero(coefficients)[-1]) + 1
+    counts = _COUNTS.get(lens_of(name) or "", {})
+    count = given if given in counts else min((n for n in counts if used <= n < given), default=0)
+    return (counts[count], coefficients[:count]) if count else None
 
 
 def _fit(camera: Camera, matrix: Floats, calibration: CalibrationMessage, notes: Notes) -> Camera:
@@ -127,7 +133,8 @@ def body_from_camera(tree: FrameTree, body: str, frame: str, notes: Notes, ahead
     is the image's frame_id."""
     if not body and _BODY in tree:
         body = _BODY
-        notes.add(f"The odometry names no body frame; {_BODY} of the static transforms is taken.")
+        if not ahead:
+            notes.add(f"The odometry names no body frame; {_BODY} of the static transforms is taken.")
     found = tree.between(body, frame) if body and frame else None
     if found is not None:
         return found

@@ -16,7 +16,7 @@ from vplog.logs.cameras import camera_from_image
 from vplog.logs.masks import resized_mask
 from vplog.logs.messages import pixels, video
 from vplog.logs.messages.decode import decode
-from vplog.logs.messages.pixels import depth_m, drive_levels, spread
+from vplog.logs.messages.pixels import depth_m, levels_of, spread
 from vplog.logs.messages.records import BadMessageError, ImageMessage
 from vplog.logs.messages.video import VideoStream
 from vplog.masking import filled
@@ -38,7 +38,8 @@ if TYPE_CHECKING:
 _HALF = 127
 """Of a mask of 0 and 255 that was resampled."""
 _TRIED = 10
-"""Images tried for the size of all; a drive whose first second is damaged is not usable."""
+"""Images tried for the size of all, the first ones and as many spread over the drive: a video whose first key frame is
+damaged has none before the next."""
 
 
 def image_in(channel: Channel, data: Octets) -> ImageMessage:
@@ -241,7 +242,7 @@ class ImageReader:
     def __init__(self, container: Container, image: Channel | None, codec: str, content: Content, notes: Notes) -> None:
         """`codec` is FFmpeg's decoder where the topic of the images is a video, else empty."""
         self._container, self._image = container, image
-        self._video = None if image is None or not codec else self._stream(image, codec, content.stream)
+        self._video = None if image is None or not codec else self._stream(image, codec, content)
         self.content = content if self._video is None else self._from_first_key(self._video, content, notes)
         """What was read, without the images before a video's first key frame."""
 
@@ -268,7 +269,7 @@ class ImageReader:
     def _levels(self) -> Levels | None:
         """Black and white of 16 bits for the whole drive, by images spread over it: SIFT compares views by contrast."""
         places = self.content.places
-        return None if self._image is None else drive_levels(self._sampled(self._image, places[:: spread(len(places))]))
+        return None if self._image is None else levels_of(self._sampled(self._image, places[:: spread(len(places))]))
 
     def _sampled(self, channel: Channel, places: list[Place]) -> Iterator[ImageMessage]:
         for place in places:
@@ -279,17 +280,18 @@ class ImageReader:
         """Frame, and width and height of the first image that decodes. Raises LogError where none of the first few
         does, and where it is a video that needs PyAV."""
         stream, reason = self._video if channel == self._image else None, ""
-        for i, place in enumerate([place for place in places if place is not None][:_TRIED]):
+        found = [(row, place) for row, place in enumerate(places) if place is not None]
+        for row, place in [*found[:_TRIED], *found[_TRIED :: max(len(found) // _TRIED, 1)]]:
             try:
                 message = image_in(channel, self._container.read(place))
                 if stream is not None:
-                    frame = stream.frame(int(self.content.stream_rows[i]))
+                    frame = stream.frame(int(self.content.stream_rows[row]))
                     return message.frame, (frame.width, frame.height)
                 image = pixels.grey(message)
                 return message.frame, (image.shape[1], image.shape[0])
             except BadMessageError as error:
                 reason = str(error)
-        raise LogError(f"No image of {channel.topic} in {log} decodes: {reason}. Choose another --image-topic.")
+        raise LogError(f"No image of {channel.topic} in {log} decodes: {reason}. Choose another with --image-topic.")
 
     def first_depth(self, channel: Channel) -> Float32s | None:
         """The first depth image that decodes; None where no image has one. Raises LogError where none does."""
@@ -304,10 +306,15 @@ class ImageReader:
             raise failures[0]
         return None
 
-    def _stream(self, image: Channel, codec: str, places: list[Place]) -> VideoStream:
-        def payload(row: int) -> bytes:
+    def _stream(self, image: Channel, codec: str, content: Content) -> VideoStream:
+        places, images = content.stream, {*content.stream_rows.tolist()}
+
+        def payload(row: int) -> bytes | None:
+            message = self._container.read(places[row])
+            if row and row not in images and message == self._container.read(places[row - 1]):
+                return None  # recorded twice: a decoder must not have it twice
             with suppress(BadMessageError):
-                return bytes(image_in(image, self._container.read(places[row])).data)
+                return bytes(image_in(image, message).data)
             return b""
 
         return VideoStream(codec, image.topic, payload, len(places))

@@ -14,7 +14,7 @@ from vplog.features.matching import MatchSettings, first_matches, match_features
 from vplog.geometry import se3
 from vplog.loops import undistort, verify_epipolar, verify_metric
 from vplog.loops.calibration import CalibrationSettings, motion_covariance
-from vplog.loops.landmarks import Landmarks, LandmarkSettings, inverse_depth, landmarks_of
+from vplog.loops.landmarks import Landmarks, LandmarkSettings, landmarks_of
 from vplog.loops.verify_epipolar import EpipolarSettings
 from vplog.loops.verify_metric import MetricSettings, Pose
 from vplog.settings import Settings
@@ -165,10 +165,10 @@ def _check_metric(
         still = not landmarks.from_depth and landmarks.tracked >= settings.min_matches > landmarks.known.sum()
         verdict = Verdict.DEGENERATE_MOTION if still else Verdict.TOO_FEW_LANDMARKS
         return Row(matches, count, Pose(verdict, 0, 0.0))
-    depth_m = own.depth_m[mine[usable]].astype(np.float64)
-    image_share = own.points[mine[usable]] / [own.width, own.height]
-    observed = rays[usable], inverse_depth(depth_m, settings.landmarks), image_share
-    pose = verify_metric.solve(landmarks, found[usable], *observed, camera, settings.landmarks, metric, start)
+    depth_m, share = own.depth_m[mine[usable]], own.points[mine[usable]] / [own.width, own.height]
+    noise = settings.landmarks
+    matched = verify_metric.observe(landmarks, found[usable], rays[usable], depth_m, camera, noise)
+    pose = verify_metric.solve(matched, share, camera, landmarks.from_depth, noise.pixel_sigma, metric, start)
     if pose.verdict is not Verdict.ACCEPTED:
         return Row(matches, count, pose)
     scale = ("stereo" if stereo else "depth") if landmarks.from_depth else "odometry"

@@ -96,11 +96,18 @@ def from_depth(rays: Floats, depth_m: Floats, camera: Camera, settings: Landmark
     """Landmarks of rays (M, 2) of the camera with measured depths (M,) in m, NaN unknown."""
     rho, variance = inverse_depth(depth_m, settings)
     rho = np.where(np.isfinite(rays).all(axis=1), rho, np.nan)
-    covariance = np.zeros((len(rays), 3, 3))
-    covariance[:, :2, :2] = undistort.noise_of_rays(camera, rays, settings.pixel_sigma)
-    covariance[:, 2, 2] = variance
     known = rho > settings.certainty * np.sqrt(variance)
-    return Landmarks(rho, rays, covariance, known, int(np.isfinite(rho).sum()), from_depth=True)
+    return Landmarks(
+        rho, rays, with_rho(rays, variance, camera, settings.pixel_sigma), known, int(np.isfinite(rho).sum()), True
+    )  # fmt: skip
+
+
+def with_rho(rays: Floats, variance: Floats, camera: Camera, pixel_sigma: float) -> Floats:
+    """(M, 3, 3) covariance of rays (M, 2) and inverse depths of this variance (M,), independent of each other."""
+    covariance = np.zeros((len(rays), 3, 3))
+    covariance[:, :2, :2] = undistort.noise_of_rays(camera, rays, pixel_sigma)
+    covariance[:, 2, 2] = variance
+    return covariance
 
 
 def for_stereo(settings: LandmarkSettings, focal_px: float, baseline_m: float) -> LandmarkSettings:
@@ -163,17 +170,17 @@ def _adjust(
     points: Floats,
     views: Floats,
     own: tuple[Floats, Floats],
-    seen: tuple[Floats, Floats],
+    others: tuple[Floats, Floats],
     visible: np.ndarray,
     start: Floats,
     prior: Floats,
 ) -> tuple[Floats, Floats, Floats]:
     """One Gauss-Newton step over landmarks and views: both, moved, and the landmarks' covariance (M, 3, 3).
 
-    `own` are the keyframe's rays (M, 2) with their information (M, 2, 2), `seen` those of the views (V, M, 2) with what
-    whitens them (V, M, 2, 2).
+    `own` are the keyframe's rays (M, 2) with their information (M, 2, 2), `others` those of the views
+    (V, M, 2) with what whitens them (V, M, 2, 2).
     """
-    (rays, information), (observed, whiten) = own, seen
+    (rays, information), (observed, whiten) = own, others
     visible = visible & np.isfinite(_errors(points, observed, views, whiten))
     residual, by_point, by_view = _linearise(points, observed, views)
     whiten = np.where(visible[..., None, None], whiten, 0.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,11 +14,15 @@ from vplog.features.matching import match_features
 from vplog.geometry import se3
 from vplog.loops import pose_refinement, undistort, verify_metric
 from vplog.loops.calibration import motion_covariance
-from vplog.loops.landmarks import Landmarks, inverse_depth
+from vplog.loops.landmarks import Landmarks, with_rho
+from vplog.loops.pose_refinement import Matches
 from vplog.loops.verify_metric import Pose
 
 if TYPE_CHECKING:
     from vplog.loops.verify import VerifySettings
+
+    _Agreeing = tuple[Floats, Floats, Ints]
+    """Landmarks (A, 3), their covariance (A, 3, 3), and the picture's features (A,) that match them."""
 
 _CHI2_2 = 9.210
 """Mahalanobis^2 of a 2D error that 1 % of right matches exceed: chi-square, 2 degrees of freedom, 99 %."""
@@ -89,21 +93,20 @@ class _Query:
         """The pose by landmarks `rows` (K,) that features `mine` (K,) match. A place's width limits closures, whose
         errors grow with the distance; a picture has what is nearest, and its covariance."""
         own, settings = self.features.rows(mine), self.settings
-        rho = inverse_depth(own.depth_m.astype(np.float64), settings.landmarks)
+        noise = settings.landmarks
         metric = settings.metric.model_copy(update={"max_distance_m": np.inf})
         share = own.points / [own.width, own.height]
+        matches = verify_metric.observe(landmarks, rows, self.rays[mine], own.depth_m, self.camera, noise)
         return verify_metric.solve(
-            landmarks, rows, self.rays[mine], rho, share, self.camera, settings.landmarks, metric, start
-        )
+            matches, share, self.camera, landmarks.from_depth, noise.pixel_sigma, metric, start
+        )  # fmt: skip
 
 
 def landmarks_from(features: Features, sigma: Floats, camera: Camera, pixel_sigma: float, measured: bool) -> Landmarks:
     """The landmarks of a keyframe's features (L,), all with depths, whose inverses have standard deviations `sigma`
     (L,) in 1/m; `measured` by a sensor, or by odometry's metres."""
     rays, rho = undistort.rays(camera, features.points), 1.0 / features.depth_m.astype(np.float64)
-    covariance = np.zeros((len(rays), 3, 3))
-    covariance[:, :2, :2] = undistort.noise_of_rays(camera, rays, pixel_sigma)
-    covariance[:, 2, 2] = sigma**2
+    covariance = with_rho(rays, sigma**2, camera, pixel_sigma)
     known = np.isfinite(rays).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)) & (rho > 0) & (sigma > 0)
     return Landmarks(rho, rays, covariance, known, len(rho), measured)
 
@@ -181,10 +184,10 @@ def _is_rival(fit: _Fit, best: _Fit, places: Sequence[KeyframeLandmarks], settin
 def _refined(query: _Query, fits: Sequence[_Fit], best: _Fit, places: Sequence[KeyframeLandmarks]) -> Localization:
     """The best fit, improved by the landmarks of all places that agree with it."""
     start, anchor = best.pose.match_from_query, places[best.place].world_from_camera
-    if start is None or best.pose.covariance is None:
+    if start is None:
         raise ValueError("only a pose is refined")
     agreeing = [_agreeing(query, fit, places[fit.place], anchor, start) for fit in fits if len(fit.mine)]
-    points, covariance, mine = (np.concatenate([getattr(one, name) for one in agreeing]) for name in _Agreeing._fields)
+    points, covariance, mine = map(np.concatenate, zip(*agreeing, strict=True))
     # a feature counts once, by the landmark whose depth is surest: its pixel has one error, however many match it
     order = np.lexsort((covariance[:, 2, 2] / points[:, 2] ** 2, mine))
     chosen = order[np.unique(mine[order], return_index=True)[1]]
@@ -192,7 +195,8 @@ def _refined(query: _Query, fits: Sequence[_Fit], best: _Fit, places: Sequence[K
         points[chosen, 2], points[chosen, :2], covariance[chosen], np.ones(len(chosen), bool), len(chosen),
         places[best.place].landmarks.from_depth,
     )  # fmt: skip
-    pose, used = query.solve(merged, np.arange(len(chosen)), mine[chosen], start), sum(map(_counts, agreeing))
+    pose = query.solve(merged, np.arange(len(chosen)), mine[chosen], start)
+    used = sum(len(rows) > 0 for _, _, rows in agreeing)
     if pose.match_from_query is None or pose.covariance is None or pose.inliers < best.pose.inliers:
         pose, used = best.pose, 1  # other places drew it away
     found, own = pose.match_from_query, pose.covariance
@@ -202,28 +206,15 @@ def _refined(query: _Query, fits: Sequence[_Fit], best: _Fit, places: Sequence[K
     return Localization(Verdict.ACCEPTED, best.place, len(best.mine), pose.inliers, used, anchor @ found, own)
 
 
-class _Agreeing(NamedTuple):
-    """Landmarks of one place that agree with a pose."""
-
-    points: Floats
-    """(A, 3) in the camera of the best place."""
-    covariance: Floats
-    mine: Ints
-    """(A,) the picture's features that match them."""
-
-
-def _counts(agreeing: _Agreeing) -> bool:
-    return len(agreeing.mine) > 0
-
-
 def _agreeing(query: _Query, fit: _Fit, place: KeyframeLandmarks, anchor: Floats, pose: Floats) -> _Agreeing:
-    """The landmarks of a place that agree with a pose in the camera `anchor` (4, 4)."""
+    """The landmarks of a place that agree with a pose in the camera `anchor` (4, 4), in that camera."""
     rays = query.rays[fit.mine]
     points, covariance = _moved(se3.between(anchor, place.world_from_camera), place.landmarks, fit.rows)
     by_pixel = undistort.noise_of_rays(query.camera, rays, query.settings.landmarks.pixel_sigma)
-    squared, _ = pose_refinement.agreement(pose, points, covariance, rays, by_pixel)
+    unknown = np.full(len(rays), np.nan)
+    squared, _ = pose_refinement.agreement(pose, Matches(points, covariance, rays, by_pixel, unknown, unknown))
     agrees = squared < _CHI2_2
-    return _Agreeing(points[agrees], covariance[agrees], fit.mine[agrees])
+    return points[agrees], covariance[agrees], fit.mine[agrees]
 
 
 def _moved(b_from_a: Floats, landmarks: Landmarks, rows: Ints) -> tuple[Floats, Floats]:

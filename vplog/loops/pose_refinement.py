@@ -7,9 +7,14 @@ query as another such triple; poses move as match_from_query exp(d), d rotation 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numba
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from vplog.data import Bools, Floats
+from vplog.geometry import se3
 
 _HUBER = 1.5
 """Sigmas beyond which an error counts linearly: 96 % as efficient as least squares on Gaussian errors (Huber 1981)."""
@@ -19,16 +24,68 @@ _CONVERGED = 1e-3
 """Squared length of a step in sigmas of the pose: a thirtieth of a sigma decides nothing that follows."""
 
 
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """K landmarks (x, y, rho) of the match's camera, each observed by the query."""
+
+    points: Floats
+    """(K, 3)."""
+    covariance: Floats
+    """(K, 3, 3)."""
+    rays: Floats
+    """(K, 2) normalised image coordinates in the query."""
+    noise: Floats
+    """(K, 2, 2) covariance of the rays."""
+    rho: Floats
+    """(K,) inverse depth in 1/m that the query measured, NaN where it did not."""
+    variance: Floats
+    """(K,) of rho."""
+
+    def rows(self, rows: Bools) -> Matches:
+        """Some of the matches."""
+        return Matches(**{name: values[rows] for name, values in vars(self).items()})
+
+    @property
+    def cloud(self) -> Floats:
+        """(K, 3) m in the match's camera."""
+        return np.column_stack([self.points[:, :2], np.ones(len(self.points))]) / self.points[:, 2:]
+
+
+def agreement(match_from_query: Floats, matches: Matches) -> tuple[Floats, Floats]:
+    """Squared Mahalanobis distances (K,) of the image errors of matches: with the landmarks' covariance, and without
+    it. NaN behind the query."""
+    return _agreement(
+        se3.inverse(match_from_query), matches.points, matches.covariance, matches.rays, matches.noise
+    )  # fmt: skip
+
+
+def fit(match_from_query: Floats, matches: Matches) -> tuple[Floats, Floats, float]:
+    """Gauss-Newton over all matches: the pose, its Hessian (6, 6), the residual variance over its expectation."""
+    hessian, excess = np.eye(6), 1.0
+    freedom = max(2.0 * len(matches.points) + np.isfinite(matches.rho).sum() - 6.0, 1.0)
+    for _ in range(_STEPS):
+        hessian, gradient, cost = _normal_equations(
+            se3.inverse(match_from_query), matches.points, matches.covariance, matches.rays, matches.noise,
+            matches.rho, matches.variance,
+        )  # fmt: skip
+        excess = cost / freedom
+        try:
+            step = -np.asarray(cho_solve(cho_factor(hessian, check_finite=False), gradient), np.float64)
+        except np.linalg.LinAlgError:  # no one pose is best
+            break
+        match_from_query = match_from_query @ se3.exp(step)
+        if -step @ gradient < _CONVERGED:
+            break
+    return match_from_query, hessian, excess
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def agreement(match_from_query, points, covariance, rays, noise):
-    """Squared Mahalanobis distances (K,) of the image errors of landmarks (K, 3), observed at (K, 2) with covariance
-    `noise` (K, 2, 2): with the landmarks' `covariance` (K, 3, 3), and without it. NaN behind the query."""
+def _agreement(query_from_match, points, covariance, rays, noise):
     K = points.shape[0]
     squared, alone = np.full(K, np.nan), np.full(K, np.nan)
-    rotation, shift = _inverse(match_from_query)
     predicted, by_point, by_pose = np.empty(3), np.empty((3, 3)), np.empty((3, 6))
     for k in range(K):
-        if not _predict(rotation, shift, points[k], predicted, by_point, by_pose):
+        if not _predict(query_from_match, points[k], predicted, by_point, by_pose):
             continue
         a, b, c = noise[k, 0, 0], noise[k, 0, 1], noise[k, 1, 1]
         x, y = predicted[0] - rays[k, 0], predicted[1] - rays[k, 1]
@@ -43,43 +100,20 @@ def agreement(match_from_query, points, covariance, rays, noise):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def fit(match_from_query, points, covariance, rays, rho, variance, noise):
-    """Gauss-Newton over all matches: the pose, its Hessian (6, 6), the residual variance over its expectation.
-
-    Landmarks (K, 3) with covariance (K, 3, 3) were observed at (K, 2) with covariance `noise` (K, 2, 2), and where the
-    query measured them too at inverse depths `rho` (K,) with `variance` (K,), NaN elsewhere.
-    """
-    K = points.shape[0]
-    pose, hessian, excess = match_from_query.copy(), np.eye(6), 1.0
+def _normal_equations(query_from_match, points, covariance, rays, noise, rho, variance):
+    """Hessian (6, 6), gradient (6,) and robust cost of all matches in front of the query."""
+    hessian, gradient, cost = np.zeros((6, 6)), np.zeros(6), 0.0
     predicted, by_point, by_pose = np.empty(3), np.empty((3, 3)), np.empty((3, 6))
     weight, residual = np.empty((3, 3)), np.empty(3)
-    gradient, step = np.empty(6), np.empty(6)
-    for _ in range(_STEPS):
-        rotation, shift = _inverse(pose)
-        hessian[:] = 0.0
-        gradient[:] = 0.0
-        cost, freedom = 0.0, 0.0
-        for k in range(K):
-            size = 3 if np.isfinite(rho[k]) else 2
-            freedom += size
-            if not _predict(rotation, shift, points[k], predicted, by_point, by_pose):
-                continue  # a step took it behind the query
-            residual[0], residual[1], residual[2] = predicted[0] - rays[k, 0], predicted[1] - rays[k, 1], 0.0
-            if size == 3:
-                residual[2] = predicted[2] - rho[k]
-            _weigh(by_point, covariance[k], noise[k], variance[k], size, weight)
-            cost += _add(residual, weight, by_pose, size, gradient, hessian)
-        excess = cost / max(freedom - 6.0, 1.0)
-        if not _solve(hessian, gradient, step):
-            break  # no one pose is best
-        length = 0.0
-        for p in range(6):
-            step[p] = -step[p]
-            length -= step[p] * gradient[p]
-        pose = _retract(pose, step)
-        if length < _CONVERGED:
-            break
-    return pose, hessian, excess
+    for k in range(points.shape[0]):
+        if not _predict(query_from_match, points[k], predicted, by_point, by_pose):
+            continue  # a step took it behind the query
+        size = 3 if np.isfinite(rho[k]) else 2
+        residual[0], residual[1] = predicted[0] - rays[k, 0], predicted[1] - rays[k, 1]
+        residual[2] = predicted[2] - rho[k] if size == 3 else 0.0
+        _weigh(by_point, covariance[k], noise[k], variance[k], size, weight)
+        cost += _add(residual, weight, by_pose, size, gradient, hessian)
+    return hessian, gradient, cost
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -122,26 +156,16 @@ def _add(residual, weight, by_pose, size, gradient, hessian):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _inverse(pose):
-    """Rotation (3, 3) and translation (3,) the other way round."""
-    rotation, shift = np.empty((3, 3)), np.zeros(3)
-    for i in range(3):
-        for j in range(3):
-            rotation[i, j] = pose[j, i]
-            shift[i] -= pose[j, i] * pose[j, 3]
-    return rotation, shift
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _predict(rotation, shift, point, predicted, by_point, by_pose):
+def _predict(T, point, predicted, by_point, by_pose):
     """Write the query's observation of a landmark (x, y, rho), and its derivatives by landmark (3, 3) and pose (3, 6).
+    T is query_from_match (4, 4).
 
     False where that is behind it.
     """
     x, y, rho = point[0], point[1], point[2]
-    s0 = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] + rho * shift[0]
-    s1 = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] + rho * shift[1]
-    s2 = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] + rho * shift[2]
+    s0 = T[0, 0] * x + T[0, 1] * y + T[0, 2] + rho * T[0, 3]
+    s1 = T[1, 0] * x + T[1, 1] * y + T[1, 2] + rho * T[1, 3]
+    s2 = T[2, 0] * x + T[2, 1] * y + T[2, 2] + rho * T[2, 3]
     if not s2 > 0.0:
         return False
     depth = 1.0 / s2
@@ -151,8 +175,8 @@ def _predict(rotation, shift, point, predicted, by_point, by_pose):
         along = 1.0 if i < 2 else 0.0
         last = -predicted[i] * depth
         for j in range(2):
-            by_point[i, j] = along * depth * rotation[min(i, 1), j] + last * rotation[2, j]
-        by_point[i, 2] = along * depth * shift[min(i, 1)] + last * shift[2]
+            by_point[i, j] = along * depth * T[min(i, 1), j] + last * T[2, j]
+        by_point[i, 2] = along * depth * T[min(i, 1), 3] + last * T[2, 3]
         first = depth if i == 0 else 0.0
         second = depth if i == 1 else 0.0
         # s moves by skew(s) d_rotation - rho d_translation
@@ -184,63 +208,3 @@ def _invert(matrix, size, result):
     result[0, 1] = result[1, 0] = xy / determinant
     result[0, 2] = result[2, 0] = xz / determinant
     result[1, 2] = result[2, 1] = (b * c - a * e) / determinant
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _solve(hessian, gradient, step):
-    """Write the solution of hessian (6, 6) step = gradient by Cholesky's factors; False where it is singular."""
-    lower = np.zeros((6, 6))
-    for i in range(6):
-        for j in range(i + 1):
-            s = hessian[i, j]
-            for k in range(j):
-                s -= lower[i, k] * lower[j, k]
-            if i > j:
-                lower[i, j] = s / lower[j, j]
-            elif s > 1e-14 * hessian[i, i]:  # beyond the rounding of the sum
-                lower[i, i] = math.sqrt(s)
-            else:
-                return False
-    for i in range(6):
-        s = gradient[i]
-        for k in range(i):
-            s -= lower[i, k] * step[k]
-        step[i] = s / lower[i, i]
-    for i in range(5, -1, -1):
-        s = step[i]
-        for k in range(i + 1, 6):
-            s -= lower[k, i] * step[k]
-        step[i] = s / lower[i, i]
-    return True
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _retract(pose, step):
-    """pose exp(step): Rodrigues' formula and the left Jacobian."""
-    x, y, z = step[0], step[1], step[2]
-    angle = math.sqrt(x * x + y * y + z * z)
-    if angle < 1e-5:  # the quotients lose their digits
-        a, b, c = 1.0 - angle * angle / 6.0, 0.5 - angle * angle / 24.0, 1.0 / 6.0 - angle * angle / 120.0
-    else:
-        sinc = math.sin(0.5 * angle) / (0.5 * angle)
-        a, b, c = math.sin(angle) / angle, 0.5 * sinc * sinc, (angle - math.sin(angle)) / angle**3
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turn, along = np.eye(3), np.eye(3)
-    for i in range(3):
-        for j in range(3):
-            s = 0.0
-            for k in range(3):
-                s += skew[i, k] * skew[k, j]
-            turn[i, j] += a * skew[i, j] + b * s
-            along[i, j] += b * skew[i, j] + c * s
-    result = np.eye(4)
-    for i in range(3):
-        result[i, 3] = pose[i, 3]
-        for j in range(3):
-            s, t = 0.0, 0.0
-            for k in range(3):
-                s += pose[i, k] * turn[k, j]
-                t += along[j, k] * step[3 + k]
-            result[i, j] = s
-            result[i, 3] += pose[i, j] * t
-    return result

@@ -110,9 +110,9 @@ def _structure(points: Floats, image: Ints, track: Ints, px: Float32s, error_px:
     """Points with two observations of known error or more."""
     good = np.isfinite(error_px)
     good &= np.bincount(track[good], minlength=len(points))[track] > 1
-    kept, track = np.unique(track[good], return_inverse=True)
-    mean = np.bincount(track, error_px[good], len(kept)) / np.maximum(np.bincount(track, minlength=len(kept)), 1)
-    return Structure(points[kept], mean, track, image[good], px[good])
+    used, track = np.unique(track[good], return_inverse=True)
+    mean = np.bincount(track, error_px[good], len(used)) / np.maximum(np.bincount(track, minlength=len(used)), 1)
+    return Structure(points[used], mean, track, image[good], px[good])
 
 
 def _linear(world_from_camera: Floats, rays: Floats, track: Ints) -> tuple[Floats, Bools]:
@@ -136,13 +136,13 @@ def _residuals(
 ) -> tuple[Floats, Floats, Bools]:
     """Errors (O, 2) in px, their derivatives (O, 2, 3) by the point, and which points lie before their camera."""
     rotation = camera_from_world[:, :3, :3]
-    seen = (rotation @ points[track][..., None])[..., 0] + camera_from_world[:, :3, 3]
-    front = seen[:, 2] > 0
-    depth = np.where(front, seen[:, 2], 1.0)[:, None]
-    image = seen[:, :2] / depth
-    by_seen = np.concatenate([np.tile(np.eye(2), (len(seen), 1, 1)), -image[..., None]], axis=2) / depth[..., None]
+    in_camera = (rotation @ points[track][..., None])[..., 0] + camera_from_world[:, :3, 3]
+    front = in_camera[:, 2] > 0
+    depth = np.where(front, in_camera[:, 2], 1.0)[:, None]
+    image = in_camera[:, :2] / depth
+    by_camera = np.concatenate([np.tile(np.eye(2), (len(image), 1, 1)), -image[..., None]], axis=2) / depth[..., None]
     error = (px_from_ray @ (image - rays)[..., None])[..., 0]
-    jacobian = px_from_ray @ by_seen @ rotation
+    jacobian = px_from_ray @ by_camera @ rotation
     jacobian[~front] = 0.0
     return error, jacobian, front
 

@@ -35,7 +35,8 @@ def rays(camera: Camera, points: np.ndarray) -> Floats:
             error = pixels[:, 0] - _project_rays(camera, result)
             if not (np.abs(error) > _CONVERGED_PX).any():
                 break
-            result += _newton_step(camera, result, error)
+            step = (_ray_from_px(camera, result) @ error[..., None])[..., 0]
+            result += np.where(np.isfinite(step).all(axis=1, keepdims=True), step, 0.0)
         error = pixels[:, 0] - _project_rays(camera, result)
     result[~(np.abs(error).max(axis=1) < _ROUND_TRIP_PX)] = np.nan
     return result
@@ -76,22 +77,17 @@ def px_from_ray(camera: Camera, at: Floats) -> Floats:
 def noise_of_rays(camera: Camera, at: Floats, pixel_sigma: float) -> Floats:
     """(M, 2, 2) covariance of rays (M, 2) seen with standard deviation `pixel_sigma` px along each axis: beyond 70
     degrees of a fisheye a ray is ten times less sure than at its centre. NaN where the lens bends it no further out."""
+    J_inv = _ray_from_px(camera, at)
+    return pixel_sigma**2 * J_inv @ np.swapaxes(J_inv, 1, 2)
+
+
+def _ray_from_px(camera: Camera, at: Floats) -> Floats:
+    """(M, 2, 2) inverse of `px_from_ray`; NaN where the model is singular."""
     J = px_from_ray(camera, at)
     determinant = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         J_inv = np.stack([J[:, 1, 1], -J[:, 0, 1], -J[:, 1, 0], J[:, 0, 0]], axis=1) / determinant[:, None]
-    J_inv = np.where(np.isfinite(J_inv).all(1, keepdims=True), J_inv, np.nan).reshape(-1, 2, 2)
-    return pixel_sigma**2 * J_inv @ np.swapaxes(J_inv, 1, 2)
-
-
-def _newton_step(camera: Camera, at: Floats, error: Floats) -> Floats:
-    """(M, 2) the step of rays `at` that removes `error` in px to first order; zero where the model is singular."""
-    J = px_from_ray(camera, at)
-    determinant = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
-    step_x = (error[:, 0] * J[:, 1, 1] - error[:, 1] * J[:, 0, 1]) / determinant
-    step_y = (J[:, 0, 0] * error[:, 1] - J[:, 1, 0] * error[:, 0]) / determinant
-    steps = np.column_stack([step_x, step_y])
-    return np.where(np.isfinite(steps).all(axis=1, keepdims=True), steps, 0.0)
+    return np.where(np.isfinite(J_inv).all(1, keepdims=True), J_inv, np.nan).reshape(-1, 2, 2)
 
 
 def _project_rays(camera: Camera, at: Floats) -> Floats:

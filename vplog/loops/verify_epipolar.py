@@ -48,7 +48,11 @@ def epipolar_inliers(
     """(K,) which matches agree with the epipolar geometry of most, and whether so many may do so by chance."""
     mask = None
     if len(query) > _SAMPLE:
-        _, mask = cv2.findFundamentalMat(match, query, cv2.USAC_MAGSAC, settings.max_error_px, 0.99, settings.rounds)
+        bounds = settings.max_error_px, 0.99, settings.rounds
+        try:
+            _, mask = cv2.findFundamentalMat(match, query, cv2.USAC_MAGSAC, *bounds)
+        except cv2.error:  # USAC's check for one plane (DEGENSAC) raises where it finds no model beside the plane's
+            _, mask = cv2.findFundamentalMat(match, query, cv2.FM_RANSAC, *bounds)
     inlier = np.zeros(len(query), bool) if mask is None else np.asarray(mask).ravel().astype(bool)
     # a line crosses the image over its diagonal at most: Moisan & Stival 2004, eq. 9
     share = 2.0 * settings.max_error_px * np.hypot(width, height) / (width * height)

@@ -6,7 +6,6 @@ has no wheel for Linux on ARM.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import lgamma, log, log10
 from typing import TYPE_CHECKING
@@ -15,9 +14,11 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from vplog.data import Camera, Floats, Verdict
+from vplog.data import Bools, Camera, Float32s, Floats, Ints, Verdict
 from vplog.geometry import se3
 from vplog.loops import pose_refinement, undistort
+from vplog.loops.landmarks import inverse_depth
+from vplog.loops.pose_refinement import Matches
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -83,46 +84,53 @@ class Pose:
     """(6, 6) rotation first, in the query's frame."""
 
 
+def observe(
+    landmarks: Landmarks, rows: Ints, rays: Floats, depth_m: Float32s, camera: Camera, settings: LandmarkSettings
+) -> Matches:
+    """Known landmarks `rows` (K,) matched to rays (K, 2) of a camera, with measured depths (K,) in m, NaN unknown."""
+    return Matches(
+        np.column_stack([landmarks.rays[rows], landmarks.rho[rows]]),
+        landmarks.covariance[rows],
+        rays,
+        undistort.noise_of_rays(camera, rays, settings.pixel_sigma),
+        *inverse_depth(depth_m.astype(np.float64), settings),
+    )
+
+
 def solve(
-    landmarks: Landmarks,
-    rows: np.ndarray,
-    observed: Floats,
-    observed_rho: tuple[Floats, Floats],
+    matches: Matches,
     image_share: Floats,
     camera: Camera,
-    noise: LandmarkSettings,
+    from_depth: bool,
+    pixel_sigma: float,
     settings: MetricSettings,
     start: Floats | None = None,
 ) -> Pose:
     """The pose of the query's camera in the match's camera.
 
-    Known landmarks `rows` (K,) were matched to query rays `observed` (K, 2), whose inverse depths `observed_rho` are
-    (K,) in 1/m and their variance (K,), NaN where unknown. `image_share` (K, 2) are the query's pixels as shares of
-    its size. The pose `start`, where given and enough matches agree with it, is improved instead of sampling one.
+    `image_share` (K, 2) are the query's pixels as shares of its size, `pixel_sigma` is their noise; `from_depth`, the
+    landmarks have their scale of a sensor. The pose `start`, where given and enough matches agree with it, is improved
+    instead of sampling one.
     """
     focal_px, area_px = undistort.focal_px(camera), float(camera.width * camera.height)
-    points = np.column_stack([landmarks.rays[rows], landmarks.rho[rows]])
-    bearing = np.column_stack([points[:, :2], np.ones(len(points))])
-    by_pixel = undistort.noise_of_rays(camera, observed, noise.pixel_sigma)
-    cloud = bearing / points[:, 2:]
+    points, cloud = matches.points, matches.cloud
     # as long in rays as for most matches: what is nearer to the centre of a wide view is sorted out next
-    near = settings.ransac_px / noise.pixel_sigma * float(np.median(np.linalg.det(by_pixel))) ** 0.25
-    inlier = np.zeros(len(rows), bool)
+    near = settings.ransac_px / pixel_sigma * float(np.median(np.linalg.det(matches.noise))) ** 0.25
+    inlier = np.zeros(len(points), bool)
     if start is not None:
-        inlier = inliers(se3.inverse(start), cloud, observed, near)
+        inlier = inliers(se3.inverse(start), cloud, matches.rays, near)
     if start is None or inlier.sum() < settings.min_inliers:
-        found = find_pose(cloud, observed, near, settings.ransac_rounds)
+        found = find_pose(cloud, matches.rays, near, settings.ransac_rounds)
         if found is None:
             return Pose(Verdict.TOO_FEW_INLIERS, 0, 0.0)
         start, inlier = se3.inverse(found[0]), found[1]
-    matches = points, landmarks.covariance[rows], observed, *observed_rho, by_pixel
-    match_from_query, hessian, excess, inlier = refit(start, inlier, matches, settings.max_error_px / noise.pixel_sigma)
+    match_from_query, hessian, excess, inlier = refit(start, inlier, matches, settings.max_error_px / pixel_sigma)
     count = int(inlier.sum())
     radius = settings.max_error_px
-    alarms = log10_false_alarms(len(rows), count, _SAMPLE, _MODELS, np.pi * radius**2 / area_px)
+    alarms = log10_false_alarms(len(points), count, _SAMPLE, _MODELS, np.pi * radius**2 / area_px)
     if (
         not np.isfinite(match_from_query).all()
-        or count < max(settings.min_inliers, settings.min_share * len(rows))
+        or count < max(settings.min_inliers, settings.min_share * len(points))
         or alarms > settings.log10_false_alarms
     ):
         return Pose(Verdict.TOO_FEW_INLIERS, count, 0.0)
@@ -141,24 +149,23 @@ def solve(
     shared = settings.systematic_px / focal_px
     pose_covariance[:3, :3] += shared**2 * np.eye(3)
     pose_covariance[3:, 3:] += (shared * depth_m) ** 2 * np.eye(3)
-    if not landmarks.from_depth:  # a wrong scale of the landmarks stretches the translation alone, along itself
+    if not from_depth:  # a wrong scale of the landmarks stretches the translation alone, along itself
         along = match_from_query[:3, :3].T @ moved * settings.scale_share
         pose_covariance[3:, 3:] += np.outer(along, along)
     return Pose(Verdict.ACCEPTED, count, spread, match_from_query, pose_covariance)
 
 
 def refit(
-    match_from_query: Floats, inlier: np.ndarray, matches: Sequence[Floats], most_sigmas: float
-) -> tuple[Floats, Floats, float, np.ndarray]:
-    """The pose refitted to its inliers (K,) bool, its Hessian, the residual variance over its expectation, and its
-    inliers, which lie within `most_sigmas` of the pixels' noise. `matches` are those of `pose_refinement.fit`."""
-    points, covariance, observed, _, _, by_pixel = matches
+    match_from_query: Floats, inlier: Bools, matches: Matches, most_sigmas: float
+) -> tuple[Floats, Floats, float, Bools]:
+    """The pose refitted to its inliers (K,), its Hessian, the residual variance over its expectation, and its inliers,
+    which lie within `most_sigmas` of the pixels' noise."""
     hessian, excess = np.eye(6), 1.0
     for _ in range(_ROUNDS):  # refit to the inliers, select inliers by the refit pose; converges in two or three
         if inlier.sum() < _SAMPLE + 1:
             break
-        match_from_query, hessian, excess = pose_refinement.fit(match_from_query, *(one[inlier] for one in matches))
-        distance, alone = pose_refinement.agreement(match_from_query, points, covariance, observed, by_pixel)
+        match_from_query, hessian, excess = pose_refinement.fit(match_from_query, matches.rows(inlier))
+        distance, alone = pose_refinement.agreement(match_from_query, matches)
         before, inlier = inlier, (distance < _CHI2_2) & (alone < most_sigmas**2)
         if np.array_equal(inlier, before):
             break

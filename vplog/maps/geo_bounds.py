@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vplog.data import Floats
-from vplog.figures.run_figures import earth_of
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.geo import Earth, on_earth
+from vplog.run.figures.run_figures import earth_of
 
 Box = tuple[float, float, float, float]
 """South, west, north, east in degrees; west of more than east crosses the antimeridian."""

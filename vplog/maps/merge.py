@@ -20,6 +20,7 @@ from vplog.maps.storage.damage import DamagedDriveError, damaged_files
 from vplog.maps.storage.layout import folder_name
 from vplog.results import run_record
 from vplog.results.places_map import places_by_drive, read_places_header
+from vplog.storage.json_records import canonical_json
 from vplog.storage.remote_path import local_copy, original
 from vplog.storage.scratch import copy_folder
 
@@ -224,9 +225,9 @@ def _merge_places(
 def _content(record: dict[str, Any]) -> str:
     """The content of a drive's log and the topics used; without these, all that is known of it."""
     if record["inputs"]:
-        return run_record.canonical_json([record["inputs"], record.get("topics")])
+        return canonical_json([record["inputs"], record.get("topics")])
     own = ("earth", "key", "drive", "format", "files")
-    return run_record.canonical_json({name: value for name, value in record.items() if name not in own})
+    return canonical_json({name: value for name, value in record.items() if name not in own})
 
 
 def natural_order(drives: Iterable[str]) -> list[str]:

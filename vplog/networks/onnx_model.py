@@ -104,7 +104,7 @@ class NetworkSettings(Settings):
     model: str = ""
     """Path of the .onnx file; what it takes is in the .yaml of the same name beside it."""
     sha256: str = ""
-    """Of the file; empty to take it as it is."""
+    """Digest of the file; empty to take it as it is."""
     network: NetworkInput = NetworkInput()
     """Its input and outputs; left out, they are read from the YAML."""
 

@@ -8,10 +8,8 @@ to the letter; here votes have the closed form of `expected_votes.py`, and the o
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-import numba
 import numpy as np
 import pyarrow as pa
 from pydantic import Field, model_validator
@@ -21,7 +19,7 @@ from vplog.errors import LibraryError
 from vplog.places import expected_votes
 from vplog.places.code_search import BLOCK, CodeIndex, CodeLists, Place, build_lists
 from vplog.places.columns import from_column, to_column
-from vplog.places.library_files import ReferencesState, relearn
+from vplog.places.library_files import ReferencesState, RelearnedSettings
 from vplog.places.matches import Matcher, Matches, Once, WeighedMatchSettings, index_references
 from vplog.places.overlap import list_shared
 
@@ -37,7 +35,7 @@ _MAP_COLUMNS, _MAP_ROWS = 64, 36
 """Cells of a voting map that is drawn: finer than the patches it sums, 10 px of a 640 x 360 image."""
 
 
-class BobbSettings(WeighedMatchSettings):
+class BobbSettings(WeighedMatchSettings, RelearnedSettings):
     """Bag of bounding boxes, improved: J references of 2 + 1 + I bytes each."""
 
     kind: Literal["bobb"] = "bobb"
@@ -122,25 +120,16 @@ class BobbSettings(WeighedMatchSettings):
 
         return BobbState(self, matcher, Once(rarity))
 
-    def load(self, folder: Path, execution: Execution) -> BobbState:
-        """A library saved by `BobbState.save`, prepared. Raises LibraryError where it is damaged or gives another
-        hash."""
-        return relearn(BobbSettings, folder, execution, BobbSettings.prepare)
 
-
-@numba.njit(cache=True, nogil=True)
-def _sums(start, weight):
-    """(L,) total weight of each reference's matches, in the order they stand."""
-    result = np.zeros(start.shape[0] - 1)
-    for r in range(result.shape[0]):
-        for e in range(start[r], start[r + 1]):
-            result[r] += weight[e]
-    return result
+def _sums(matches: Matches) -> Floats:
+    """(L,) total weight of each reference's matches, added in the order they stand."""
+    count = np.diff(matches.start)
+    return np.asarray(np.bincount(np.repeat(np.arange(len(count)), count), matches.weight, len(count)), np.float64)
 
 
 def _explained(matches: Matches) -> Floats:
     """(L,) shares of an image's matches by reference."""
-    total = _sums(matches.start, matches.weight)
+    total = _sums(matches)
     return total / max(total.sum(), 1e-9)
 
 
@@ -202,7 +191,7 @@ class BobbState(ReferencesState):
         """
         s = self.settings
         rarity = self.rarity()
-        total = _sums(matches.start, matches.weight) * rarity
+        total = _sums(matches) * rarity
         found = []
         for reference in np.argsort(-total, kind="stable")[: s.candidates * s.references].tolist():
             if total[reference] <= 0.0:

@@ -85,7 +85,7 @@ class WordCounts:
 
 @dataclass(frozen=True, eq=False)
 class BovfState(ReferencesState):
-    """WordCounts with their weights. Shared freely between threads."""
+    """A vocabulary with the weight of each word. Shared freely between threads."""
 
     settings: BovfSettings
     references: list[Reference]
@@ -106,7 +106,7 @@ class BovfState(ReferencesState):
         return 8 * (_PLACE_BYTES + _WORD_BYTES * self._most_words)
 
     def describe(self, features: Features) -> WordCounts:
-        """WordCounts with their counts; those of all references weigh nothing and are left out."""
+        """Words and their counts; words that all references have weigh nothing and are left out."""
         found = self.vocabulary.quantise(features.descriptors[: self.settings.features])
         words, counts = np.unique(found, return_counts=True)
         counts = np.minimum(counts, _MAX_COUNT).astype(np.uint8)

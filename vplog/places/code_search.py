@@ -82,15 +82,19 @@ class CodeLists:
 
 def build_lists(references: Uint16s, weights: Bytes, boxes: Bytes, library_size: int, block: int) -> CodeLists:
     """Lists of `references` and `weights` (N, J), a reference beyond the library is none, and `boxes` (N, J, I)."""
-    count, _, windows = boxes.shape
-    start = _count_entries(references, library_size, block)
-    entries = int(start[-1, -1]) if start.size else 0
-    offset, weight = np.empty(entries, np.uint16), np.empty(entries, np.uint8)
-    share, coded = np.empty(entries, np.uint8), np.empty((entries, windows), np.uint8)
-    square = np.empty(count, np.uint32)
-    lists = CodeLists(start, offset, weight, share, coded, square, block)
-    _fill(references, weights, boxes, block, lists.parts)
-    return lists
+    count, per_place, windows = boxes.shape
+    flat = references.reshape(-1)
+    order = np.argsort(flat, kind="stable")
+    order = order[: np.searchsorted(flat[order], library_size)]
+    row = order // per_place
+    blocks = -(-count // block)
+    entries = np.bincount(flat[order].astype(np.int64) * blocks + row // block, minlength=library_size * blocks)
+    start = np.pad(entries.reshape(library_size, blocks), ((0, 0), (1, 0))).cumsum().reshape(library_size, blocks + 1)
+    square = np.maximum((weights.astype(np.uint32) ** 2).sum(axis=1, dtype=np.uint32), np.uint32(1))
+    weight = weights.reshape(-1)[order]
+    share = np.ceil(weight * np.float64(STEPS) / np.sqrt(square[row])).astype(np.uint8)
+    offset = (row % block).astype(np.uint16)
+    return CodeLists(start, offset, weight, share, np.take(boxes.reshape(-1, windows), order, 0), square, block)
 
 
 def check_lists(lists: CodeLists) -> None:
@@ -110,6 +114,7 @@ class CodeIndex:
     def __init__(self, lists: CodeLists, overlap: Bytes, pairing: Pairing) -> None:
         """`overlap` (256, 256) is the cells that two boxes share."""
         self._lists, self._overlap, self._windows = lists, overlap, lists.boxes.shape[1]
+        self._most = overlap.max(axis=1).astype(np.int64)
         self._comparison = (0,) * self._windows, _PAIRINGS[pairing], lists.block
         self._whole = int(overlap.max(initial=1)) * sum(_PAIRINGS[pairing]) * self._windows
         self._longest = int(np.diff(lists.start).max(initial=0))
@@ -162,66 +167,19 @@ class CodeIndex:
     def _end(self, stop: int | None) -> int:
         return len(self) if stop is None else max(min(stop, len(self)), 0)
 
-    def _query(self, descriptor: Place) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
-        """The query's references in the library (Q,), their weights (Q,), the (Q, 256, words x 8) cells that a box of
-        any number shares with the box of each of the query's windows, their words, and what sums are divided by beside
-        the length of the place's own weights."""
+    def _query(self, descriptor: Place) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, float]:
+        """The query's references in the library (Q,), their weights (Q,), its side of the bound for each (Q,), the
+        (Q, 256, words x 8) cells that a box of any number shares with the box of each of the query's windows, their
+        words, and what sums are divided by beside the length of the place's own weights."""
         weights = descriptor.weights.astype(np.int64)
         used = np.flatnonzero(descriptor.references < len(self._lists.start))
-        cells = _cells(self._overlap, descriptor.boxes[used], -(-self._windows // _LANES) * _LANES)
         scale = np.sqrt(max(int((weights**2).sum()), 1)) * self._whole
-        return descriptor.references[used].astype(np.int64), weights[used], cells, cells.view(np.uint64), scale
-
-
-@numba.njit(cache=True, nogil=True)
-def _count_entries(references, library_size, block):
-    """(L, B + 1) int64, `CodeLists.start`."""
-    N, J = references.shape
-    start = np.zeros((library_size, (N + block - 1) // block + 1), np.int64)
-    for row in range(N):
-        for j in range(J):
-            if references[row, j] < library_size:
-                start[references[row, j], row // block + 1] += 1
-    total = 0
-    for r in range(start.shape[0]):
-        for b in range(start.shape[1]):
-            total += start[r, b]
-            start[r, b] = total
-    return start
-
-
-@numba.njit(cache=True, nogil=True)
-def _fill(references, weights, boxes, block, lists):
-    """Write the lists, `CodeLists.parts`: by reference, then by row."""
-    start, offset, weight, share, coded, square = lists
-    N, J, windows = boxes.shape
-    at = start[:, 0].copy()
-    for row in range(N):
-        total = np.int64(0)
-        for j in range(J):
-            total += np.int64(weights[row, j]) * np.int64(weights[row, j])
-        square[row] = max(total, 1)
-        length = np.sqrt(np.float64(square[row]))
-        for j in range(J):
-            reference = references[row, j]
-            if reference < start.shape[0]:
-                e = at[reference]
-                at[reference] += 1
-                offset[e], weight[e] = row % block, weights[row, j]
-                share[e] = np.ceil(weights[row, j] * STEPS / length)
-                for i in range(windows):
-                    coded[e, i] = boxes[row, j, i]
-
-
-@numba.njit(cache=True, nogil=True)
-def _cells(overlap, boxes, lanes):
-    """(Q, 256, lanes) uint8: cells that each number of a box shares with the box of each window, 0 beyond them."""
-    result = np.zeros((boxes.shape[0], 256, lanes), np.uint8)
-    for j in range(boxes.shape[0]):
-        for number in range(256):
-            for i in range(boxes.shape[1]):
-                result[j, number, i] = overlap[boxes[j, i], number]
-    return result
+        weights, boxes = weights[used], descriptor.boxes[used]
+        cells = np.zeros((len(used), 256, -(-self._windows // _LANES) * _LANES), np.uint8)
+        cells[:, :, : self._windows] = self._overlap[boxes].transpose(0, 2, 1)
+        most = self._most[boxes].sum(axis=1) * sum(self._comparison[1])
+        reach = np.ceil(weights * most * STEPS / scale).astype(np.int32)
+        return descriptor.references[used].astype(np.int64), weights, reach, cells, cells.view(np.uint64), scale
 
 
 @intrinsic
@@ -277,7 +235,7 @@ def _entries(start, offset, b, reference, rows):
 @numba.njit(cache=True, nogil=True)
 def _score_all(query, comparison, lists, result):
     """Write the scores of the first rows into `result`; `comparison` is windows, pairing and rows of a block."""
-    references, weights, cells, words, scale = query
+    references, weights, _, cells, words, scale = query
     windows, pairing, block = comparison
     start, offset, weight, _, coded, square = lists
     stop = result.shape[0]
@@ -299,31 +257,17 @@ def _score_all(query, comparison, lists, result):
 
 
 @numba.njit(cache=True, nogil=True)
-def _reach(weights, cells, pairing, scale):
-    """(Q,) int32: the query's side of the bound, each reference's weight times the most cells its boxes can share."""
-    result = np.empty(cells.shape[0], np.int32)
-    for j in range(cells.shape[0]):
-        most = 0
-        for i in range(cells.shape[2]):
-            most += np.int64(cells[j, :, i].max())
-        result[j] = np.ceil(weights[j] * most * (pairing[0] + pairing[1]) * STEPS / scale)
-    return result
-
-
-@numba.njit(cache=True, nogil=True)
 def _find_best(query, comparison, lists, longest, extent, wanted, drives):
-    """(rows, scores) of the k best rows of blocks begin..end below `stop` that reach `floor`, in no order."""
-    references, weights, cells, words, scale = query
+    """(rows, scores) of the k best rows of blocks begin..end below `stop` that reach the wanted score, in no order."""
+    references, weights, reach, cells, words, scale = query
     windows, pairing, block = comparison
     start, offset, weight, share, coded, square = lists
     begin, end, stop = extent
-    k, floor = wanted
+    k, worst = wanted
     runs, counts = drives
     found = [(np.float32(0.0), np.int64(0)) for _ in range(0)]  # a heap: the worst first, of equals the latest row
-    reach = _reach(weights, cells, pairing, scale)
     bound, total = np.zeros(MOST_ROWS, np.int32), np.zeros(MOST_ROWS, np.int64)  # as for all scores
     touched, candidates = np.empty(MOST_ROWS, np.int64), np.empty(longest + 1, np.int64)
-    worst = floor
     least = _reached(worst)
     for b in range(begin, end if k > 0 else begin):
         rows = min(stop - b * block, block)

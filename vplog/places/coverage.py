@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
+from scipy.sparse import csr_array
 
-from vplog.data import Bytes, Features, Float32s, Floats, Int32s, Ints, Keyframes
+from vplog.data import Bytes, Features, Float32s, Ints, Keyframes
 from vplog.places.library import Library, Words, WordSettings, hnsw, l1_distance
 from vplog.places.reference_choice import LEAST_SIZE, PAPER_SIZE, LibrarySettings, evenly
 
@@ -60,20 +60,6 @@ POOR = 1 / 3
 .51 to 1.0 of the frames, of another light or site 0 to .11, by which R@1 falls from .67 to .35 and less."""
 
 
-@dataclass(frozen=True, eq=False)
-class Explanations:
-    """Shares of the features of F frames that each of C candidates explains: a sparse (F, C) matrix by rows."""
-
-    start: Ints
-    """(F + 1,)."""
-    candidate: Int32s
-    """Increasing within a frame; never the frame itself."""
-    share: Float32s
-    """Share of the frame's features that are found on the candidate, 0..1."""
-    candidates: int
-    """C."""
-
-
 def choose_by_coverage(
     count: int, descriptors_of: Callable[[int], Bytes], settings: LibrarySettings, execution: Execution
 ) -> Ints:
@@ -107,15 +93,16 @@ def _candidates(size: int | None) -> int:
     return max(_LEAST_CANDIDATES, _CANDIDATES_A_REFERENCE * (size or 0))
 
 
-def explanations(descriptors: Sequence[Bytes], candidates: Ints, execution: Execution) -> Explanations:
-    """The candidates, rows of `descriptors` (F of (M, 128) each), that explain each of the rows."""
+def explanations(descriptors: Sequence[Bytes], candidates: Ints, execution: Execution) -> csr_array:
+    """(F, C) float32: the share of the features (M, 128) of each frame that each candidate, a row of `descriptors`,
+    explains. Columns rise within a row, and no frame explains itself."""
     owners = np.repeat(np.arange(len(candidates)), [len(descriptors[row]) for row in candidates])
     pool = np.concatenate([descriptors[row] for row in candidates])
     number = np.full(len(descriptors), -1)
     number[candidates] = np.arange(len(candidates))
+    shape = len(descriptors), len(candidates)
     if len(pool) == 0:
-        nothing = np.zeros(0, np.int32), np.zeros(0, np.float32)
-        return Explanations(np.zeros(len(descriptors) + 1, np.int64), *nothing, len(candidates))
+        return csr_array(shape, dtype=np.float32)
     settings = WordSettings()
     index = hnsw(pool.astype(np.float32), settings.hnsw_links, settings.hnsw_ef_construction, settings.hnsw_ef_search)
 
@@ -132,42 +119,39 @@ def explanations(descriptors: Sequence[Bytes], candidates: Ints, execution: Exec
         who, times = np.unique(of[first & (of >= 0)], return_counts=True)
         return who, (times / len(found)).astype(np.float32)
 
-    rows = list(execution.map(explained_by, range(len(descriptors))))
-    start = np.concatenate([[0], np.cumsum([len(who) for who, _ in rows])])
-    return Explanations(
-        start,
-        np.concatenate([who for who, _ in rows]).astype(np.int32),
-        np.concatenate([share for _, share in rows]),
-        len(candidates),
-    )
+    candidate, share = zip(*execution.map(explained_by, range(len(descriptors))), strict=True)
+    start = np.concatenate([[0], np.cumsum([len(one) for one in candidate])])
+    return csr_array((np.concatenate(share), np.concatenate(candidate), start), shape=shape)
 
 
-def greedy_cover(found: Explanations, size: int) -> Ints:
+def greedy_cover(found: csr_array, size: int) -> Ints:
     """At most `size` candidates, the one that adds most first; fewer where none adds anything.
 
     Maximises the sum over the frames of the worth of their best reference, see `_worth`. Ties go to the first.
     """
     worth = _worth(found)
-    order = np.argsort(found.candidate, kind="stable")
-    by_start = np.searchsorted(found.candidate[order], np.arange(found.candidates + 1))
-    owner = np.repeat(np.arange(len(found.start) - 1), np.diff(found.start))
-    return _greedy(found.start, found.candidate, worth, by_start, owner[order], worth[order], size)
+    by_frame, by_candidate = ((one.indptr, one.indices, one.data) for one in (worth, worth.tocsc()))
+    return _greedy(by_frame, by_candidate, size)
 
 
-def _worth(found: Explanations) -> Floats:
+def _worth(found: csr_array) -> csr_array:
     """0..1, of each candidate to each frame: 1 where it explains half as much as the frame's best candidate does.
 
     Relative to the frame's best, so that a bare wall counts as much as a facade; capped, so that the frames of one
     place share a reference.
     """
-    owner = np.repeat(np.arange(len(found.start) - 1), np.diff(found.start))
-    best = np.zeros(len(found.start) - 1)
-    np.maximum.at(best, owner, found.share)
-    return np.minimum(found.share / (_ENOUGH * best[owner]), 1.0)
+    frame = found.tocoo().row
+    best = np.zeros(len(found.indptr) - 1)
+    np.maximum.at(best, frame, found.data)
+    worth = np.minimum(found.data / (_ENOUGH * best[frame]), 1.0)
+    return csr_array((worth, found.indices, found.indptr), shape=found.shape)
 
 
 @numba.njit(cache=True, nogil=True)
-def _greedy(start, candidate, worth, by_start, by_frame, by_worth, size):
+def _greedy(by_frame, by_candidate, size):
+    """Both orders of one sparse matrix, as start, index and value."""
+    start, candidate, worth = by_frame
+    by_start, frame, by_worth = by_candidate
     F, C = start.shape[0] - 1, by_start.shape[0] - 1
     best, gain = np.zeros(F), np.zeros(C)
     for c in range(C):
@@ -179,7 +163,7 @@ def _greedy(start, candidate, worth, by_start, by_frame, by_worth, size):
             return chosen[:n]
         chosen[n] = c
         for e in range(by_start[c], by_start[c + 1]):
-            f = by_frame[e]
+            f = frame[e]
             if by_worth[e] > best[f]:
                 for other in range(start[f], start[f + 1]):  # what others add to this frame is less now
                     gain[candidate[other]] -= max(worth[other] - best[f], 0.0) - max(worth[other] - by_worth[e], 0.0)
@@ -188,19 +172,10 @@ def _greedy(start, candidate, worth, by_start, by_frame, by_worth, size):
     return chosen
 
 
-def _needed_count(found: Explanations, chosen: Ints, least_gain: float) -> int:
+def _needed_count(found: csr_array, chosen: Ints, least_gain: float) -> int:
     """Number of the chosen that are needed: the last of them still adds `least_gain` of what is explained."""
-    turn = np.full(found.candidates, -1)
-    turn[chosen] = np.arange(len(chosen))
-    worth, turns = _worth(found), turn[found.candidate]
-    total = np.zeros(len(chosen))
-    for begin, end in pairwise(found.start.tolist()):
-        mine = turns[begin:end] >= 0
-        series = np.zeros(len(chosen))
-        series[turns[begin:end][mine]] = worth[begin:end][mine]
-        total += np.maximum.accumulate(series)
-    gain = np.diff(total, prepend=0.0)
-    poor = np.flatnonzero(gain < least_gain * total)
+    total = np.maximum.accumulate(_worth(found).toarray()[:, chosen], axis=1).sum(axis=0)
+    poor = np.flatnonzero(np.diff(total, prepend=0.0) < least_gain * total)
     return int(poor[0]) if len(poor) else len(chosen)
 
 

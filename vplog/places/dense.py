@@ -73,6 +73,10 @@ class VectorState(ReferencesState):
         """(N, D) places, one a row."""
         return np.array(descriptors, dtype).reshape(-1, self.arrow_type.list_size)
 
+    def index(self, descriptors: Sequence[NDArray]) -> VectorIndex:
+        """By the cosine of unit vectors."""
+        return VectorIndex(self.matrix(descriptors, np.float32), products)
+
     def to_arrow(self, descriptors: Sequence[NDArray]) -> pa.Array:
         dtype = self.arrow_type.value_type.to_pandas_dtype()
         return to_column(self.arrow_type, iter([self.matrix(descriptors, dtype)]))

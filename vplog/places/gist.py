@@ -98,11 +98,9 @@ def gabor_filters(side: int, scales: int, orientations: int) -> Float32s:
     frequency, angle = np.hypot(x, y), np.arctan2(y, x)
     falloff = _ANGULAR * (orientations / 32) ** 2
     filters = []
-    for scale in range(scales):
-        centre = _HIGHEST / _OCTAVE**scale
+    for centre in _HIGHEST / _OCTAVE ** np.arange(scales):
         radial = _RADIAL * (frequency / centre - 1) ** 2
         for orientation in range(orientations):
-            turn = angle + np.pi * orientation / orientations
-            turn = (turn + np.pi) % (2 * np.pi) - np.pi
+            turn = (angle + np.pi * orientation / orientations + np.pi) % (2 * np.pi) - np.pi
             filters.append(np.exp(-radial - 2 * np.pi * falloff * turn**2))
     return np.array(filters, np.float32)

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Literal
 import numba
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 from pydantic import Field
+from scipy.spatial.distance import cdist
 
-from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ranking, Reference, SharedReferences
+from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ints, Ranking, Reference, SharedReferences
 from vplog.places.bobb import BobbSettings, BobbState
 from vplog.places.code_search import CodeIndex, Place
 from vplog.places.columns import from_column, to_column
@@ -164,44 +164,30 @@ def _centres(values: Floats, words: int, rng: np.random.Generator) -> Floats:
     """(W, 66) whole steps by k-means of (F, 66); a word that no feature is nearest to stays where it is."""
     centres = values[np.sort(rng.choice(len(values), words, replace=len(values) < words))]
     for _ in range(_ITERATIONS):
-        total, count = _sum_by_word(values, centres)
-        centres = np.where(count[:, None] > 0, np.rint(total / np.maximum(count, 1)[:, None]), centres)
+        word = _nearest(values, centres)
+        count = np.bincount(word, minlength=words)[:, None]
+        total = _sum_by_word(values, word, words)
+        centres = np.where(count > 0, np.rint(total / np.maximum(count, 1)), centres)
     return centres
 
 
-@numba.njit(cache=True, nogil=True)
-def _nearest(value, centres):
-    best, least = 0, np.inf
-    for w in range(centres.shape[0]):
-        distance = 0.0
-        for d in range(value.shape[0]):
-            distance += (value[d] - centres[w, d]) ** 2
-        if distance < least:
-            best, least = w, distance
-    return best, least
+def _nearest(values: Floats, centres: Floats) -> Ints:
+    """(F,) the word of each value: whole numbers, whose squared distances are exact in any order of the sum."""
+    return cdist(values, centres, "sqeuclidean").argmin(axis=1)
 
 
-@numba.njit(cache=True, nogil=True)
-def _sum_by_word(values, centres):
-    total, count = np.zeros(centres.shape), np.zeros(centres.shape[0], np.int64)
-    for f in range(values.shape[0]):
-        word, _ = _nearest(values[f], centres)
-        total[word] += values[f]
-        count[word] += 1
-    return total, count
+def _sum_by_word(values: Floats, word: Ints, words: int) -> Floats:
+    """(W, 66) sums of whole numbers (F, 66), exact in any order."""
+    return np.array([values[word == w].sum(axis=0) for w in range(words)])
 
 
-@numba.njit(cache=True, nogil=True)
-def _sum_residuals(values, centres, steps):
-    """(W, 66): for each word, the sum of its features' directions from it, of unit length, in whole steps."""
-    result = np.zeros(centres.shape)
-    for f in range(values.shape[0]):
-        word, square = _nearest(values[f], centres)
-        if square > 0.0:
-            scale = steps / np.sqrt(square)
-            for d in range(values.shape[1]):
-                result[word, d] += np.rint((values[f, d] - centres[word, d]) * scale)
-    return result
+def _sum_residuals(values: Floats, centres: Floats, steps: int) -> Floats:
+    """(W, 66) for each word, the sum of its features' directions from it, of unit length, in whole steps."""
+    word = _nearest(values, centres)
+    residual = values - centres[word]
+    length = np.sqrt(np.square(residual).sum(axis=1, keepdims=True))
+    unit = np.rint(residual * (steps / np.maximum(length, 1.0)))  # whole numbers: a length below 1 is 0
+    return _sum_by_word(unit, word, len(centres))
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,8 +260,7 @@ class HybridIndex:
 
     def __init__(self, boxes: CodeIndex, signs: Bytes, share: float) -> None:
         """`signs` (N, length); `share` of the words in a score."""
-        self._boxes, self._share, self._bits = boxes, share, 8 * signs.shape[1]
-        self._signs = _words_of_64(signs)
+        self._boxes, self._signs, self._share = boxes, signs, share
 
     def __len__(self) -> int:
         return len(self._boxes)
@@ -283,8 +268,7 @@ class HybridIndex:
     def alike(self, descriptor: HybridPlace, stop: int | None = None) -> tuple[Float32s, Float32s]:
         """(stop,) BoBB's score, and agreement of the signs 0..1: 0 where half of them or fewer are equal."""
         boxes = self._boxes.scores(descriptor.boxes, stop)
-        query = _words_of_64(descriptor.signs[None])[0]
-        return boxes, _agreement(self._signs[: len(boxes)], query, self._bits)
+        return boxes, _agreement(self._signs[: len(boxes)], descriptor.signs)
 
     def scores(self, descriptor: HybridPlace, stop: int | None = None) -> Float32s:
         """(stop,) 0..1: both similarities in their shares; 1 is equal."""
@@ -295,30 +279,11 @@ class HybridIndex:
         return best_rows(self.scores(descriptor, stop), k)
 
 
-def _words_of_64(signs: Bytes) -> NDArray[np.uint64]:
-    """(N, ceil(length / 8)), with zeros behind."""
-    return np.ascontiguousarray(np.pad(signs, ((0, 0), (0, -signs.shape[1] % 8)))).view(np.uint64)
-
-
-@numba.njit(cache=True, nogil=True)
-def _agreement(signs, query, bits):
-    """(N,) float32: 1 - 2 x share of the bits that differ, 0 at least, and 0 for an image without features."""
-    result = np.zeros(signs.shape[0], np.float32)
-    if not np.any(query):
-        return result
-    for row in range(signs.shape[0]):
-        differ, some = np.uint64(0), np.uint64(0)
-        for word in range(signs.shape[1]):
-            x = signs[row, word] ^ query[word]
-            some |= signs[row, word]
-            # bits set in pairs, fours and eights, and the eights summed by a product
-            x -= (x >> np.uint64(1)) & np.uint64(0x5555555555555555)
-            x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
-            x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-            differ += (x * np.uint64(0x0101010101010101)) >> np.uint64(56)
-        if some:
-            result[row] = max(1.0 - 2.0 * np.float64(differ) / bits, 0.0)
-    return result
+def _agreement(signs: Bytes, query: Bytes) -> Float32s:
+    """(N,) 1 - 2 x share of the bits that differ of (N, length), 0 at least, and 0 for an image without features."""
+    differ = np.bitwise_count(signs ^ query).sum(axis=1, dtype=np.int64)
+    agreement = np.maximum(1.0 - 2.0 * differ / (8 * len(query)), 0.0)
+    return np.where(signs.any(axis=1) & query.any(), agreement, 0.0).astype(np.float32)
 
 
 def _balance(index: HybridIndex, places: Sequence[HybridPlace], share: float) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -22,6 +22,7 @@ from vplog.execution.execution import Execution
 from vplog.settings import Settings
 from vplog.storage.folders import check_regular
 from vplog.storage.image_file import BadImageError, decode_image
+from vplog.storage.json_records import has_checksum, with_checksum
 from vplog.storage.parquet_limits import check_columns, check_file, check_version, open_table, read_table, write_table
 from vplog.storage.scratch import put_in_place, sync_all
 
@@ -48,11 +49,22 @@ def check_descriptors(references: Sequence[Reference], features: Features) -> No
 class RelearnedSettings(Settings):
     """Settings of a recogniser that is saved as its references."""
 
+    def prepare(self, references: Iterable[Reference], execution: Execution) -> Any:
+        """The state of a saved library."""
+        return self.learn(references, execution)  # pyright: ignore[reportAttributeAccessIssue]
+
     def load(self, folder: Path, execution: Execution) -> Any:
-        """A library saved by its state, whose own settings count, but for where files are now. Raises LibraryError
-        where it is damaged or gives another hash."""
+        """The state of a library saved by `save_references`, whose own settings count, but for where files are now.
+        Raises LibraryError where it is damaged or gives another hash."""
+        record = read_library_record(folder)
+        own = type(self).read(record["settings"], f"{folder}/library.json")
         here = {name: place for name in self.LOCATIONS if (place := getattr(self, name))}
-        return relearn(type(self), folder, execution, lambda own, *rest: own.model_copy(update=here).learn(*rest))
+        state = own.model_copy(update=here).prepare(load_references(folder, execution), execution)
+        if state.hash != record["hash"]:
+            raise LibraryError(
+                f"{folder}: the content does not have the hash in library.json; build it again with `vplog library`."
+            )
+        return state
 
 
 class ReferencesState:
@@ -79,19 +91,6 @@ def keep_references(references: Iterable[Reference], features: int | None = None
     if not found:
         raise LibraryError("A library needs at least one reference image; none was given.")
     return found
-
-
-def relearn(settings: Any, folder: Path, execution: Execution, learn: Callable[..., Any] | None = None) -> Any:
-    """State of a folder written by `save_references`, whose own settings count; `settings` is their class, and `learn`
-    its method that makes the state. Raises LibraryError where the folder is damaged or gives another hash."""
-    record = read_library_record(folder)
-    own = settings.read(record["settings"], f"{folder}/library.json")
-    state = (learn or settings.learn)(own, load_references(folder, execution), execution)
-    if state.hash != record["hash"]:
-        raise LibraryError(
-            f"{folder}: the content does not have the hash in library.json; build it again with `vplog library`."
-        )
-    return state
 
 
 def references_hash(references: Sequence[Reference], settings: Settings) -> str:
@@ -151,7 +150,7 @@ def save_references(
             "settings": settings.model_dump(mode="json"),
         }
         part = folder / f".library.json.{os.getpid()}.part"
-        part.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        part.write_text(json.dumps(with_checksum(record), indent=2) + "\n", encoding="utf-8")
         sync_all(folder)
         put_in_place(part, folder / "library.json")
     except OSError as error:
@@ -183,6 +182,10 @@ def read_library_record(folder: Path) -> dict[str, Any]:
         ) from None
     if not isinstance(record, dict) or not {"hash", "settings"} <= record.keys():
         raise LibraryError(f"{folder}/library.json lacks its hash or settings; build it again with `vplog library`.")
+    if not has_checksum(record):
+        raise LibraryError(
+            f"{folder}/library.json is damaged: its checksum does not match. Copy it back, or build it again."
+        )
     check_version(folder / "library.json", record.get("format", _FORMAT), _FORMAT, record.get("vplog"))
     return record
 

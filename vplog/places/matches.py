@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from pydantic import Field
 
-from vplog.data import Features, Float32s, Int32s, Reference
+from vplog.data import Features, Float32s, Int32s, Ints, Reference
 from vplog.errors import LibraryError
 from vplog.places.library import hnsw
 from vplog.places.library_files import keep_references
@@ -179,17 +179,11 @@ def index_references(references: Iterable[Reference], settings: WeighedMatchSett
     return matcher
 
 
-@numba.njit(cache=True, nogil=True)
-def _itself(distance, entry, owner, L):
-    """The reference that most features of the image are found on without any difference, or -1."""
-    same = np.zeros(L, np.int32)
-    for f in range(distance.shape[0]):
-        for k in range(distance.shape[1]):
-            if entry[f, k] < 0 or distance[f, k] > 0.0:
-                break
-            same[owner[entry[f, k]]] += 1
-    most = np.argmax(same)
-    return int(most) if 2 * same[most] > distance.shape[0] else -1
+def _itself(distance: Float32s, entry: Ints, owner: Int32s, L: int) -> int:
+    """The reference that most features (F, K) of the image are found on without any difference, or -1."""
+    same = np.bincount(owner[entry[(entry >= 0) & (distance <= 0.0)]], minlength=L)
+    most = int(same.argmax())
+    return most if 2 * same[most] > len(distance) else -1
 
 
 @numba.njit(cache=True, nogil=True)

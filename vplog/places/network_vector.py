@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vplog.data import Bytes, Features, Frame, Reference
 from vplog.errors import LibraryError
 from vplog.networks.onnx_model import NetworkSettings
-from vplog.places.dense import VectorIndex, VectorState, products, unit
+from vplog.places.dense import VectorState, unit
 from vplog.places.library_files import RelearnedSettings, keep_references
 
 if TYPE_CHECKING:
@@ -70,6 +70,3 @@ class OnnxState(VectorState):
     def describe(self, features: Features) -> NDArray[np.float16]:
         """Raises LibraryError: features are no image."""
         raise LibraryError("A network looks at the image itself, and only its features are here. Give the log.")
-
-    def index(self, descriptors: Sequence[NDArray[np.float16]]) -> VectorIndex:
-        return VectorIndex(self.matrix(descriptors, np.float32), products)

@@ -45,7 +45,7 @@ class PluginSettings(Settings):
         return made.read({"kind": self.name, **self.settings}, f"plug-in {self.name}")
 
     def learn(self, references: Iterable[Reference], execution: Execution) -> PlaceState:
-        """What it learns from the references."""
+        """The state that its own settings learn from the references."""
         return self.recogniser().learn(references, execution)
 
     def load(self, folder: Path, execution: Execution) -> PlaceState:

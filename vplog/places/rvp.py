@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from vplog.data import Floats, Int32s
+from vplog.data import Float32s, Floats, Int32s, Ints
 
 
 class Pattern(NamedTuple):
@@ -49,31 +49,20 @@ def grid_cuts(length: int, cells: int) -> Int32s:
     return ((np.arange(cells + 1) * length + cells // 2) // cells).astype(np.int32)
 
 
-@numba.njit(cache=True, nogil=True)
-def patches_of(points, x_cuts, y_cuts):
-    """(K, F) uint16: the patch n * M + m each point falls in; points past an edge count to the pixel at the edge."""
-    K, F = x_cuts.shape[0], points.shape[0]
-    M, N = x_cuts.shape[1] - 1, y_cuts.shape[1] - 1
-    result = np.empty((K, F), np.uint16)
-    for k in range(K):
-        for f in range(F):
-            x = min(max(int(points[f, 0] + 0.5), 0), x_cuts[k, M] - 1)  # the pixel the point is in
-            y = min(max(int(points[f, 1] + 0.5), 0), y_cuts[k, N] - 1)
-            m = np.searchsorted(x_cuts[k], x, side="right") - 1
-            n = np.searchsorted(y_cuts[k], y, side="right") - 1
-            result[k, f] = n * M + m
-    return result
+def patches_of(points: Float32s, x_cuts: Int32s, y_cuts: Int32s) -> NDArray[np.uint16]:
+    """(K, F) the patch n * M + m each point falls in; points past an edge count to the pixel at the edge."""
+    pixel = (points.astype(np.float64) + 0.5).astype(np.int64)
+    columns, rows = (
+        (np.clip(pixel[:, axis], 0, cuts[0, -1] - 1)[:, None] >= cuts[:, None, 1:-1]).sum(axis=2)
+        for axis, cuts in enumerate((x_cuts, y_cuts))
+    )
+    return (rows * (x_cuts.shape[1] - 1) + columns).astype(np.uint16)
 
 
-@numba.njit(cache=True, nogil=True)
-def patch_totals(patches, words_per_feature, count):
-    """(K, count) int32: how many words the features of each patch have (the size of H_mnk)."""
-    K, F = patches.shape
-    result = np.zeros((K, count), np.int32)
-    for k in range(K):
-        for f in range(F):
-            result[k, patches[k, f]] += words_per_feature[f]
-    return result
+def patch_totals(patches: NDArray[np.uint16], words_per_feature: Ints, count: int) -> Int32s:
+    """(K, count) how many words the features of each patch have (the size of H_mnk)."""
+    totals = [np.bincount(patch, words_per_feature, count) for patch in patches]
+    return np.array(totals, np.int32)
 
 
 @numba.njit(cache=True, nogil=True)

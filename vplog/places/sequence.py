@@ -8,9 +8,7 @@ a return begins or ends.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Self
 
 import numba
@@ -18,14 +16,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from vplog.data import Float32s, Int32s, Ints, Ranking
+from vplog.execution.execution import Execution
 from vplog.places.dense import best_rows
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
     from vplog.stages import PlaceIndex
-
-    Mapping = Callable[[Callable[[int], Any], Iterable[int]], Iterator[Any]]
 
 _BLOCK = 64
 """Queries worked on at once: enough for every thread, and few enough that memory is that of a few rows."""
@@ -72,12 +68,15 @@ class SequenceSettings(Settings):
 
 
 def sequence_rows(
-    row_of_scores: Callable[[int], Float32s], stops: Ints, settings: SequenceSettings, threads: int = 1
+    row_of_scores: Callable[[int], Float32s],
+    stops: Ints,
+    settings: SequenceSettings,
+    execution: Execution = Execution(),
 ) -> Iterator[tuple[Float32s, Int32s]]:
     """For each query q in order: scores and support, both (stops[q],), of the rows it may match.
 
     `row_of_scores(q)` gives the (stops[q],) scores of one view, the more alike the larger, of any scale; it is called
-    from `threads` threads, once or twice for each q. What is not finite counts as the row's least finite score: one
+    from any thread, once or twice for each q. What is not finite counts as the row's least finite score: one
     blinded view is no veto. A cell at or above the stop of its own view is not there, whatever line it is on.
 
     A score is max over the ratios and over the window w, its past and its future half (each with the query) of
@@ -95,24 +94,23 @@ def sequence_rows(
     x = np.zeros((_BLOCK + 2 * half_window, width), np.float32)
     agrees = np.zeros(x.shape, np.bool_)
 
-    with _mapping(threads) as mapped:
-        row_means = _row_means(row_of_scores, stops, settings.length, mapped)
+    row_means = _row_means(row_of_scores, stops, settings.length, execution)
 
-        def fill(query: int) -> None:
-            row, stop = query - first + half_window, stops[query]
-            if stop:
-                x[row, :stop] = _centred(row_of_scores(query)) - row_means[:stop]
-                agrees[row, :stop] = _best_mask(x[row, :stop])
+    def fill(query: int) -> None:
+        row, stop = query - first + half_window, stops[query]
+        if stop:
+            x[row, :stop] = _centred(row_of_scores(query)) - row_means[:stop]
+            agrees[row, :stop] = _best_mask(x[row, :stop])
 
-        def match(query: int) -> tuple[Float32s, Int32s]:
-            return _match(x, agrees, stops, query, query - first + half_window, offsets)
+    def match(query: int) -> tuple[Float32s, Int32s]:
+        return _match(x, agrees, stops, query, query - first + half_window, offsets)
 
-        for first in range(0, count, _BLOCK):  # row half of the buffers is query `first`
-            if first:
-                x[: 2 * half_window], agrees[: 2 * half_window] = x[_BLOCK:].copy(), agrees[_BLOCK:].copy()
-            filled = first + half_window if first else 0
-            list(mapped(fill, range(filled, min(first + _BLOCK + half_window, count))))
-            yield from list(mapped(match, range(first, min(first + _BLOCK, count))))
+    for first in range(0, count, _BLOCK):  # row half of the buffers is query `first`
+        if first:
+            x[: 2 * half_window], agrees[: 2 * half_window] = x[_BLOCK:].copy(), agrees[_BLOCK:].copy()
+        filled = first + half_window if first else 0
+        list(execution.map(fill, range(filled, min(first + _BLOCK + half_window, count))))
+        yield from list(execution.map(match, range(first, min(first + _BLOCK, count))))
 
 
 def rank_places(
@@ -124,7 +122,7 @@ def rank_places(
     """
     if settings.length > 1:
         rows = sequence_rows(
-            lambda query: index.scores(descriptors[query], int(stops[query])), stops, settings, execution.threads
+            lambda query: index.scores(descriptors[query], int(stops[query])), stops, settings, execution
         )
         for score, support in rows:
             best = best_rows(np.maximum(score, 0.0), k)
@@ -134,17 +132,7 @@ def rank_places(
         yield ranking, np.zeros(len(ranking.rows), np.int32)
 
 
-@contextmanager
-def _mapping(threads: int) -> Iterator[Mapping]:
-    """`map` by so many threads; by this one where it is one, for handing over takes longer than a short row does."""
-    if threads <= 1:
-        yield map
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        yield pool.map
-
-
-def _row_means(row_of_scores: Callable[[int], Float32s], stops: Ints, length: int, mapped: Mapping) -> Float32s:
+def _row_means(row_of_scores: Callable[[int], Float32s], stops: Ints, length: int, execution: Execution) -> Float32s:
     """(W,) mean score of each row over views spread evenly over the drive.
 
     Shrunk towards 0 as by `length` more views, so that the only return to a row does not cancel itself.
@@ -154,7 +142,8 @@ def _row_means(row_of_scores: Callable[[int], Float32s], stops: Ints, length: in
     total, count = np.zeros(stops.max(initial=0)), np.zeros(stops.max(initial=0), np.int64)
     for first in range(0, len(queries), _BLOCK):
         block = queries[first : first + _BLOCK].tolist()
-        for row in mapped(lambda query: _centred(row_of_scores(query)), block):  # in order: a sum of its own bytes
+        # in order: a sum of its own bytes
+        for row in execution.map(lambda query: _centred(row_of_scores(query)), block):
             total[: len(row)] += row
             count[: len(row)] += 1
     return (total / (count + length)).astype(np.float32)

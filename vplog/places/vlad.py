@@ -6,7 +6,7 @@ Chum, Negative evidences and co-occurrences in image retrieval, ECCV 2012).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -17,7 +17,7 @@ from pydantic import Field
 
 from vplog.data import Features, Float32s, Reference
 from vplog.errors import LibraryError
-from vplog.places.dense import VectorIndex, VectorState, products, unit
+from vplog.places.dense import VectorState, products, unit
 from vplog.places.library_files import RelearnedSettings, keep_references
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary, root_sift, spread_rows
 
@@ -80,9 +80,6 @@ class VladState(VectorState):
         if self.whitening is None or not raw.any():
             return raw[: self.arrow_type.list_size].astype(np.float16)
         return self.whitening.apply(raw).astype(np.float16)
-
-    def index(self, descriptors: Sequence[NDArray[np.float16]]) -> VectorIndex:
-        return VectorIndex(self.matrix(descriptors, np.float32), products)
 
 
 def aggregate(features: Features, count: int, vocabulary: Vocabulary) -> Float32s:

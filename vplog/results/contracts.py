@@ -11,6 +11,7 @@ import pyarrow as pa
 from vplog.errors import ResultError
 from vplog.results import feature_table, landmark_table, localized_table, messages, places_map, tables
 from vplog.results.mcap import TOPICS
+from vplog.results.staging import check_contents
 from vplog.storage.parquet_limits import TABLE_VERSION, VERSION_ABOUT, VERSION_KEY
 from vplog.storage.scratch import replacing
 
@@ -91,6 +92,7 @@ def write_schemas(folder: Path, pipeline_schema: dict[str, Any]) -> list[Path]:
     }
     for name, schema in table_schemas().items():
         texts[f"{name}.json"] = json.dumps(_contract(name, schema), indent=2, ensure_ascii=False) + "\n"
+    check_contents(folder, "schemas", any((folder / name).exists() for name in texts))
     for name, text in texts.items():
         if (folder / name).exists() and not (folder / name).read_bytes().startswith(text[:_HEAD].encode()):
             raise ResultError(f"{folder / name} is no schema, and is not replaced. Choose another folder with -o.")

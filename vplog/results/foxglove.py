@@ -1,4 +1,4 @@
-"""Messages as Foxglove and rerun show them, each made from our arrays by a plain function."""
+"""Foxglove messages, each made from arrays by a plain function."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.timestamp_pb2 import Timestamp
 
 from vplog.data import Camera, Floats, Gps
-from vplog.geometry import se3
 
-Part = tuple[list[float], list[float]]
-"""Position in m and quaternion x y z w of one pose, as plain numbers."""
+PoseVector = list[float]
+"""Position in m and quaternion x y z w of one pose."""
 Rgba = tuple[float, float, float, float]
 
 MAP, BODY, CAMERA = "map", "base_link", "camera"
 """Frames: the root, the body, the camera fixed on it."""
 RERUN_ROOT = "tf#/"
 """The frame that rerun's 3D view begins with; what does not hang on it is not drawn (rerun.io, named transforms)."""
-AT_REST: Part = ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
+IDENTITY: PoseVector = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 GREY, GREEN, RED, FAINT_RED = (0.6, 0.6, 0.6, 1.0), (0.1, 0.8, 0.2, 1.0), (0.9, 0.1, 0.1, 1.0), (0.9, 0.1, 0.1, 0.25)
 BLUE, AMBER = (0.2, 0.5, 1.0, 1.0), (0.95, 0.7, 0.1, 1.0)
 _LINE_PX = 2.0
@@ -47,18 +47,17 @@ _DISTORTION = {"plumb_bob": "plumb_bob", "rational_polynomial": "rational_polyno
 """Our names of distortion models, as Foxglove's schema has them (equidistant in ROS is Kannala and Brandt's)."""
 
 
-def parts(poses: Floats) -> list[Part]:
-    """The parts of poses (R, 4, 4), all at once: row by row, numpy takes most of the time of a large file."""
-    return list(zip(poses[:, :3, 3].tolist(), se3.quaternion(poses[:, :3, :3]).tolist(), strict=True))
+def _time(stamp_ns: int) -> Timestamp:
+    message = Timestamp()
+    message.FromNanoseconds(stamp_ns)
+    return message
 
 
-def path(stamp_ns: int, poses: list[Part]) -> PosesInFrame:
-    message = PosesInFrame(frame_id=MAP)
-    message.timestamp.FromNanoseconds(stamp_ns)
-    for position, quaternion in poses:
-        pose = message.poses.add()
-        pose.position.x, pose.position.y, pose.position.z = position
-        pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = quaternion
+def path(stamp_ns: int, poses: list[PoseVector]) -> PosesInFrame:
+    """The poses of a path in the map."""
+    message = PosesInFrame(frame_id=MAP, timestamp=_time(stamp_ns))
+    for x, y, z, *q in poses:
+        message.poses.add(position={"x": x, "y": y, "z": z}, orientation=dict(zip("xyzw", q, strict=True)))
     return message
 
 
@@ -67,8 +66,8 @@ def points(stamp_ns: int, poses: Floats, color: Rgba) -> PointCloud:
     packed = np.zeros(len(poses), np.dtype([("position", "<f4", 3), ("color", "u1", 4)]))
     packed["position"] = poses[:, :3, 3]
     packed["color"] = np.round(255 * np.array(color))
-    message = PointCloud(frame_id=MAP, point_stride=packed.itemsize, data=packed.tobytes())
-    message.timestamp.FromNanoseconds(stamp_ns)
+    data = packed.tobytes()
+    message = PointCloud(timestamp=_time(stamp_ns), frame_id=MAP, point_stride=packed.itemsize, data=data)
     message.pose.position.SetInParent()  # rerun takes a position that is left out for one without a value
     message.pose.orientation.w = 1.0
     for at, name in enumerate("xyz"):
@@ -78,14 +77,13 @@ def points(stamp_ns: int, poses: Floats, color: Rgba) -> PointCloud:
     return message
 
 
-def transforms(stamp_ns: int, placed: Sequence[tuple[str, str, Part]]) -> FrameTransforms:
-    """Each frame in its parent: (parent, child, pose of the child)."""
+def transforms(stamp_ns: int, edges: Sequence[tuple[str, str, PoseVector]]) -> FrameTransforms:
+    """Edges of the transform tree: (parent, child, parent_from_child)."""
     message = FrameTransforms()
-    for parent, child, (position, quaternion) in placed:
-        one = message.transforms.add(parent_frame_id=parent, child_frame_id=child)
-        one.timestamp.FromNanoseconds(stamp_ns)
-        one.translation.x, one.translation.y, one.translation.z = position
-        one.rotation.x, one.rotation.y, one.rotation.z, one.rotation.w = quaternion
+    for parent, child, pose in edges:
+        one = message.transforms.add(parent_frame_id=parent, child_frame_id=child, timestamp=_time(stamp_ns))
+        one.translation.x, one.translation.y, one.translation.z = pose[:3]
+        one.rotation.x, one.rotation.y, one.rotation.z, one.rotation.w = pose[3:]
     return message
 
 
@@ -93,8 +91,7 @@ def lines(stamp_ns: int, named: Sequence[tuple[str, Floats, Rgba]]) -> SceneUpda
     """One entity for each name, with its line segments (S, 2, 3) in m."""
     message = SceneUpdate()
     for name, segments, color in named:
-        entity = message.entities.add(frame_id=MAP, id=name)
-        entity.timestamp.FromNanoseconds(stamp_ns)
+        entity = message.entities.add(timestamp=_time(stamp_ns), frame_id=MAP, id=name)
         entity.metadata.add(key="edges", value=str(len(segments)))
         drawn = entity.lines.add(type=LinePrimitive.LINE_LIST, thickness=_LINE_PX, scale_invariant=True)
         drawn.pose.orientation.w = 1.0
@@ -105,16 +102,14 @@ def lines(stamp_ns: int, named: Sequence[tuple[str, Floats, Rgba]]) -> SceneUpda
 
 
 def image(stamp_ns: int, frame_id: str, data: bytes) -> CompressedImage:
-    message = CompressedImage(frame_id=frame_id, data=data, format="jpeg")
-    message.timestamp.FromNanoseconds(stamp_ns)
-    return message
+    """A JPEG."""
+    return CompressedImage(timestamp=_time(stamp_ns), frame_id=frame_id, data=data, format="jpeg")
 
 
 def calibration(stamp_ns: int, camera: Camera, size: tuple[int, int]) -> CameraCalibration:
     """The calibration of images resized to `size` px; (0, 0) is the centre of the top-left pixel before and after."""
     width, height = size
-    message = CameraCalibration(frame_id=CAMERA, width=width, height=height)
-    message.timestamp.FromNanoseconds(stamp_ns)
+    message = CameraCalibration(timestamp=_time(stamp_ns), frame_id=CAMERA, width=width, height=height)
     if camera.matrix is None:
         return message
     by_x, by_y = width / camera.width, height / camera.height
@@ -140,8 +135,7 @@ def boxes(stamp_ns: int, corners: Floats, size: tuple[int, int], title: str) -> 
         # each a little smaller than the one before, so that lines that would lie on each other are all visible
         inset = 1.0 + number % len(_HUES)
         x0, y0, x1, y1 = (share * side for share, side in zip(one, (width, height) * 2, strict=True))
-        drawn = message.points.add(type=PointsAnnotation.LINE_LOOP, thickness=_LINE_PX)
-        drawn.timestamp.FromNanoseconds(stamp_ns)
+        drawn = message.points.add(timestamp=_time(stamp_ns), type=PointsAnnotation.LINE_LOOP, thickness=_LINE_PX)
         drawn.outline_color.CopyFrom(_color(_HUES[number % len(_HUES)]))
         left, right, top, bottom = x0 + inset, x1 - inset, y0 + inset, y1 - inset
         for x, y in ((left, top), (right, top), (right, bottom), (left, bottom)):
@@ -153,8 +147,7 @@ def boxes(stamp_ns: int, corners: Floats, size: tuple[int, int], title: str) -> 
 
 
 def _label(message: ImageAnnotations, stamp_ns: int, at: tuple[float, float], text: str, color: Rgba) -> None:
-    label = message.texts.add(text=text, font_size=_FONT_PX)
-    label.timestamp.FromNanoseconds(stamp_ns)
+    label = message.texts.add(timestamp=_time(stamp_ns), text=text, font_size=_FONT_PX)
     label.position.x, label.position.y = at
     label.text_color.CopyFrom(_color(color))
     label.background_color.CopyFrom(_color((0.0, 0.0, 0.0, 0.6)))
@@ -163,12 +156,12 @@ def _label(message: ImageAnnotations, stamp_ns: int, at: tuple[float, float], te
 def fix(gps: Gps, row: int) -> LocationFix:
     """One satellite fix; its covariance is in m^2, east, north, up."""
     message = LocationFix(
+        timestamp=_time(int(gps.stamp_ns[row])),
         frame_id="gps",
         latitude=float(gps.latitude_deg[row]),
         longitude=float(gps.longitude_deg[row]),
         altitude=float(gps.altitude_m[row]),
     )
-    message.timestamp.FromNanoseconds(int(gps.stamp_ns[row]))
     if "color" in LocationFix.DESCRIPTOR.fields_by_name:  # of newer schemas; rerun wants a value where it is known
         message.color.CopyFrom(_color(BLUE))
     covariance = gps.covariance[row]

@@ -21,7 +21,7 @@ _MOST_BYTES = 1 << 30
 bytes of the text they come from."""
 _MOST_ID = 2**63 - 1
 _LEFT_OUT = re.compile(r"(VERTEX|EDGE|PARAMS|DATA|ROBOT|FLASER|RAWLASER|TRUEPOSE|LASER)[A-Z0-9_:]*$")
-"""What other elements of the format are called: landmarks, priors, sensor data. A pose graph is solved without them."""
+"""Tags of the format's other elements: landmarks, priors, sensor data. A pose graph is solved without them."""
 _QUATERNION_OFF = 0.1
 """How far a quaternion's length may be from 1: rounded to one digit passes, another quantity does not."""
 _FURTHEST_M = 1e8
@@ -29,7 +29,7 @@ _FURTHEST_M = 1e8
 
 
 class _Layout(NamedTuple):
-    """What a line of one dimension looks like, and where its information goes in our (6, 6), rotation first."""
+    """Tags and numbers of the lines of one dimension, and the place of its information in (6, 6), rotation first."""
 
     vertex: str
     edge: str
@@ -55,7 +55,7 @@ class GraphFile:
     held: int
     """Row of the pose that FIX holds; 0 where nothing is fixed."""
     warnings: list[str]
-    """What was left out or had to be supposed, one sentence each."""
+    """Elements left out and assumptions made, one sentence each."""
 
 
 @dataclass
@@ -67,7 +67,7 @@ class _Lines:
     numbers: list[str] = field(default_factory=list)
 
     def only(self, wanted: Bools) -> _Lines:
-        """Those wanted (L,), without the ids."""
+        """The lines chosen by a mask (L,), without their ids."""
         rows = np.flatnonzero(wanted).tolist()
         return _Lines([self.line[row] for row in rows], [], [self.numbers[row] for row in rows])
 
@@ -97,8 +97,9 @@ def read_g2o(path: Path) -> GraphFile:
         raise GraphError(f"{path} has no EDGE_SE2 or EDGE_SE3:QUAT line, so there is no pose graph in it to solve.")
 
     known, ends = _ids(path, vertices, 1)[:, 0], _ids(path, edges, 2)
-    again = _first(np.unique(known, return_index=True)[1], len(known))
-    if again is not None:
+    repeated = np.setdiff1d(np.arange(len(known)), np.unique(known, return_index=True)[1])
+    if len(repeated):
+        again = repeated[0]
         before = vertices.line[int(np.argmax(known == known[again]))]
         raise _at(path, vertices.line[again], f"vertex {known[again]} was already given in line {before}")
     ids = np.unique(np.concatenate([known, ends.ravel()]))
@@ -133,7 +134,7 @@ def read_g2o(path: Path) -> GraphFile:
 
 
 def _about_self_edges(edges: _Lines, ends: Ints, itself: Bools) -> list[str]:
-    """What to say of the edges (L, 2) that join a pose to `itself` (L,): they do not tell where it is."""
+    """A warning of the edges (L, 2) that join a pose to `itself` (L,), which constrain nothing."""
     if not itself.any():
         return []
     line, name = edges.line[int(np.argmax(itself))], ends[itself][0, 0]
@@ -196,12 +197,6 @@ def _ids(path: Path, lines: _Lines, named: int) -> Ints:
     ).reshape(-1, named)
 
 
-def _first(first_rows: Ints, count: int) -> int | None:
-    """The first of `count` rows that is not among these."""
-    missing = np.setdiff1d(np.arange(count), first_rows)
-    return int(missing[0]) if len(missing) else None
-
-
 def _numbers(path: Path, lines: _Lines, columns: int) -> Floats:
     """(L, columns) finite numbers."""
     if not lines.line:
@@ -241,7 +236,7 @@ def _poses(path: Path, lines: _Lines, numbers: Floats) -> Floats:
     off = np.flatnonzero(np.abs(length - 1) > _QUATERNION_OFF)
     if len(off):
         raise _at(path, lines.line[off[0]], f"the quaternion has length {length[off[0]]:.3g}, not 1")
-    return se3.pose(se3.rotation(numbers[:, 3:]), numbers[:, :3])
+    return se3.from_vectors(numbers)
 
 
 def _information(path: Path, lines: _Lines, upper: Floats, layout: _Layout) -> Floats:
@@ -333,5 +328,5 @@ def _rows(poses: Floats, dimension: int) -> list[str]:
     if dimension == 2:
         values = np.concatenate([poses[:, :2, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])[:, None]], axis=1)
     else:
-        values = np.concatenate([poses[:, :3, 3], se3.quaternion(poses[:, :3, :3])], axis=1)
+        values = se3.vectors(poses)
     return [" ".join(map(repr, row)) for row in values.tolist()]

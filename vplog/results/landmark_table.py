@@ -19,8 +19,8 @@ import pyarrow as pa
 from vplog.data import Bytes, Camera, Features, Floats
 from vplog.errors import ResultError
 from vplog.results.camera_record import camera_from
-from vplog.results.run_record import plain
 from vplog.results.tables import column
+from vplog.storage.json_records import plain
 from vplog.storage.parquet_limits import (
     VERSION_ABOUT,
     VERSION_KEY,

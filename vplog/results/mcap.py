@@ -21,16 +21,16 @@ from vplog.data import ACCEPTED, Camera, Closures, Floats, Gps, Ints, Keyframes,
 from vplog.geometry import se3
 from vplog.results import foxglove, geo
 from vplog.results.messages import descriptor_set, loop_closure_class
-from vplog.results.run_record import canonical_json
 from vplog.results.tables import TableMetadata, covariance_of
 from vplog.storage.image_file import image_size
+from vplog.storage.json_records import canonical_json
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
     from google.protobuf.message import Message
 
-    from vplog.results.foxglove import Part
+    from vplog.results.foxglove import PoseVector
     from vplog.results.geo import Earth
 
     Timed = tuple[int, str, Message]
@@ -150,7 +150,7 @@ def _solved(
 ) -> Iterator[Timed]:  # fmt: skip
     """Paths, graph, transforms and ledger."""
     loop_closure = loop_closure_class()
-    bodies, relative = foxglove.parts(world_from_body), foxglove.parts(closures.match_from_query)
+    bodies, relative = se3.vectors(world_from_body).tolist(), se3.vectors(closures.match_from_query).tolist()
     covariance = covariance_of(closures.information)
     rows = np.argsort(closures.query, kind="stable")
     first_row = np.searchsorted(closures.query[rows], np.arange(len(keyframes.stamp_ns) + 1))
@@ -158,15 +158,15 @@ def _solved(
         if node == 0:
             drifted = world_from_body[0] @ se3.inverse(keyframes.odom_from_body[0]) @ keyframes.odom_from_body
             yield stamp_ns, "/path/optimised", foxglove.path(stamp_ns, bodies)
-            yield stamp_ns, "/path/odometry", foxglove.path(stamp_ns, foxglove.parts(drifted))
+            yield stamp_ns, "/path/odometry", foxglove.path(stamp_ns, se3.vectors(drifted).tolist())
             # the same positions as points: rerun reads the paths, but draws point clouds
             yield stamp_ns, "/path/optimised_points", foxglove.points(stamp_ns, world_from_body, foxglove.GREEN)
             yield stamp_ns, "/path/odometry_points", foxglove.points(stamp_ns, drifted, foxglove.GREY)
             yield stamp_ns, "/graph", _graph(stamp_ns, world_from_body, graph, closures)
             yield stamp_ns, "/graph/rejected", _rejected(stamp_ns, world_from_body, closures)
-            fixed = [(foxglove.RERUN_ROOT, foxglove.MAP, foxglove.AT_REST)]
+            fixed = [(foxglove.RERUN_ROOT, foxglove.MAP, foxglove.IDENTITY)]
             if extras.camera is not None:
-                mount = foxglove.parts(extras.camera.body_from_camera[None])[0]
+                mount = se3.vectors(extras.camera.body_from_camera).tolist()
                 fixed.append((foxglove.BODY, foxglove.CAMERA, mount))
             yield stamp_ns, "/tf_static", foxglove.transforms(stamp_ns, fixed)
             if extras.earth is not None:
@@ -260,7 +260,7 @@ def _rejected(stamp_ns: int, world_from_body: Floats, closures: Closures) -> Sce
 
 
 def _loop_closure(
-    message: Any, row: int, closures: Closures, match_from_query: Part, covariance: Floats, stamp_ns: Ints
+    message: Any, row: int, closures: Closures, match_from_query: PoseVector, covariance: Floats, stamp_ns: Ints
 ) -> Message:
     message.timestamp.FromNanoseconds(int(stamp_ns[closures.query[row]]))
     message.match_timestamp.FromNanoseconds(int(stamp_ns[closures.match[row]]))
@@ -272,8 +272,7 @@ def _loop_closure(
     message.scale = closures.scale[row]
     numbers = {name: getattr(closures, name)[row] for name in ("score", "spread", "weight")}
     numbers |= {f"{name}_sigma": getattr(closures, name)[row] for name in ("residual_before", "residual_after")}
-    position, quaternion = match_from_query
-    numbers |= zip(("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw"), (*position, *quaternion), strict=True)
+    numbers |= zip(("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw"), match_from_query, strict=True)
     for name, value in numbers.items():
         setattr(message, name, float(value))
     for name, matrix in (("information", closures.information[row]), ("covariance", covariance)):

@@ -96,7 +96,7 @@ def read_camera_pose(path: Path) -> Floats | None:
             for one in FrameTransforms.FromString(message.data).transforms:
                 if one.child_frame_id == CAMERA:
                     q, t = one.rotation, one.translation
-                    return se3.pose(se3.rotation(np.array([q.x, q.y, q.z, q.w])), np.array([t.x, t.y, t.z]))
+                    return se3.from_vectors(np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w]))
     return None
 
 

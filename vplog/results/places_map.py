@@ -23,6 +23,7 @@ from vplog.data import Floats, Int32s, Ints
 from vplog.errors import ResultError
 from vplog.geometry import se3
 from vplog.results import geo, run_record, tables
+from vplog.storage.json_records import canonical_json
 from vplog.storage.parquet_limits import check_size, filled, open_table, read_schema, table_writer
 from vplog.storage.scratch import replacing
 
@@ -120,7 +121,7 @@ def write_places(
         raise ResultError("There is no place to write.")
     names = list(drives)
     kind, library = first.descriptors.type, first.header.get("vplog.library", "")
-    described = list(_parts(kind, ""))
+    described = _parts(kind)
     columns = [pa.field(name, _stored(part), False) for name, part in described]
     about = {
         **{key: first.header.get(key, "") for key in ("vplog.library", "vplog.version", "vplog.settings")},
@@ -164,9 +165,8 @@ def _arrays(part: DrivePlaces, names: Sequence[str]) -> list[pa.Array]:
     """The columns of a drive's places."""
     number = names.index(part.drive)
     drive = pa.DictionaryArray.from_arrays(pa.array([number] * len(part.keyframe), pa.int32()), pa.array(names))
-    quaternions = se3.quaternion(part.world_from_body[:, :3, :3])
-    where = np.ascontiguousarray(np.concatenate([part.world_from_body[:, :3, 3], quaternions], axis=1).T)
-    packed = [_packed(one) for one in _values(part.descriptors)]
+    where = np.ascontiguousarray(se3.vectors(part.world_from_body).T)
+    packed = [_packed(one.combine_chunks()) for one in _flattened(part.descriptors).columns]
     return [drive, pa.array(part.keyframe), pa.array(part.stamp_ns), *map(pa.array, where), *packed]
 
 
@@ -179,7 +179,7 @@ class PlacesHeader:
     descriptor: str
     """Names and types of its columns, as JSON."""
     drives: dict[str, dict[str, Any]]
-    """What is known of each drive, in order: `inputs`, `topics`, `earth`."""
+    """By drive, in order: its `inputs`, `topics` and `earth`, as far as known."""
 
 
 def read_places_header(path: Path) -> PlacesHeader:
@@ -187,7 +187,7 @@ def read_places_header(path: Path) -> PlacesHeader:
     with _reading(path):
         header = {key.decode(): value.decode() for key, value in (read_schema(path).metadata or {}).items()}
         settings, drives = (json.loads(header.get(f"vplog.{name}", "null")) for name in ("settings", "drives"))
-        run_record.canonical_json([settings, drives])  # not nested deeper than can be written again
+        canonical_json([settings, drives])  # not nested deeper than can be written again
     sound = isinstance(settings, dict) and isinstance(drives, dict)
     sound = sound and all(isinstance(known, dict) for known in drives.values())
     if header.get("vplog.table") != "map" or not sound:
@@ -211,7 +211,7 @@ def places_by_drive(path: Path) -> dict[str, int]:
 def read_drives(path: Path, kind: pa.DataType) -> Iterator[DrivePlaces]:
     """The places of a map drive by drive, one of them in memory at a time. Raises ResultError where it is damaged, of
     another recogniser, or where a drive comes twice."""
-    parts, about = list(_parts(kind, "")), read_places_header(path)
+    parts, about = _parts(kind), read_places_header(path)
     if about.descriptor != json.dumps([_described(*part) for part in parts]):
         raise ResultError(f"{path} is not a map of places of this recogniser.")
     schema = pa.schema([*PLACE, *(pa.field(name, _stored(part), False) for name, part in parts)])
@@ -287,20 +287,17 @@ def names_of(folders: Sequence[Path]) -> list[str]:
     return names
 
 
-def _parts(kind: pa.DataType, prefix: str) -> Any:
-    """Name and type of every part of a descriptor, those of a structure in a structure with a dot between."""
-    if not pa.types.is_struct(kind):
-        yield prefix or "descriptor", kind
-        return
-    for part in kind:
-        yield from _parts(part.type, f"{prefix}.{part.name}" if prefix else part.name)
+def _flattened(column: pa.Array) -> pa.Table:
+    """A column for every part of a descriptor, those of a structure in a structure with a dot between."""
+    table = pa.table({"descriptor": column})
+    while any(pa.types.is_struct(part.type) for part in table.schema):
+        table = table.flatten()
+    return table.rename_columns([name.removeprefix("descriptor.") for name in table.column_names])
 
 
-def _values(column: pa.Array) -> list[pa.Array]:
-    """The columns of the parts."""
-    if not pa.types.is_struct(column.type):
-        return [column]
-    return [value for at in range(column.type.num_fields) for value in _values(column.field(at))]
+def _parts(kind: pa.DataType) -> list[tuple[str, pa.DataType]]:
+    """Name and type of every part of a descriptor."""
+    return [(part.name, part.type) for part in _flattened(pa.array([], kind)).schema]
 
 
 def _joined(kind: pa.DataType, columns: Any) -> pa.Array:

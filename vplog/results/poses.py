@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from vplog.data import Trajectory
 from vplog.geometry import se3
 from vplog.geometry.tum import seconds
@@ -30,9 +28,7 @@ def write_kitti(path: Path, trajectory: Trajectory) -> Path:
 
 def write_euroc(path: Path, trajectory: Trajectory) -> None:
     """`timestamp [ns], position, quaternion w x y z` with commas, the first eight columns of EuRoC's ground truth."""
-    poses = trajectory.world_from_body
-    q = se3.quaternion(poses[:, :3, :3])[:, [3, 0, 1, 2]]
-    values = np.concatenate([poses[:, :3, 3], q], axis=1)
+    values = se3.vectors(trajectory.world_from_body)[:, [0, 1, 2, 6, 3, 4, 5]]
     names = "p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
     with replacing(path) as stream:
         stream.write(f"#timestamp [ns],{names}\n".encode())

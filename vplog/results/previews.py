@@ -1,4 +1,4 @@
-"""Small pictures of the keyframes, made as these stream by and kept on disk, so that memory does not grow."""
+"""Small JPEGs of the keyframes, and their settings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vplog.settings import Settings
 
 
 class PictureSettings(Settings):
-    """What result.mcap and report.html show of the camera's images."""
+    """Images of the camera in result.mcap and report.html."""
 
     megapixels: float = Field(default=0.15, ge=0, le=100)
     """A keyframe's picture in result.mcap: 0.15 is 450 x 335, some 20 kB. 0 leaves the images out: the stamps are

@@ -64,11 +64,10 @@ def _log(recording: Any, rr: Any, tracks: Tracks, closures: Closures) -> None:
     if tracks.earth is not None:
         where = on_earth(tracks.earth, tracks.after.world_from_body)[:, [1, 0]]
         recording.log("earth/optimised", rr.GeoLineStrings(lat_lon=[where], colors=[_BLUE]), static=True)
-    quaternions = se3.quaternion(tracks.world_from_body[:, :3, :3])
     recording.send_columns(
         "map/body",
         indexes=[rr.TimeColumn("stamp", timestamp=tracks.keyframes.stamp_ns.astype("datetime64[ns]"))],
-        columns=rr.Transform3D.columns(translation=ends, quaternion=quaternions),
+        columns=rr.Transform3D.columns(translation=ends, quaternion=se3.vectors(tracks.world_from_body)[:, 3:]),
     )
 
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import math
 import shlex
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 from vplog.errors import ResultError
 from vplog.results.staging import recover
 from vplog.storage.folders import check_regular
+from vplog.storage.json_records import has_checksum, plain, with_checksum
 from vplog.storage.parquet_limits import check_file, check_version
 from vplog.storage.scratch import replacing
 
@@ -21,9 +20,6 @@ CACHE = ".cache"
 """Folder of the stage results in a run folder, unless another place is named."""
 REQUEST = f"{CACHE}/run.json"
 """Request of a run that is not finished; run.json of its folder is that of the finished run before, if any."""
-CHECKSUM = "record_sha256"
-"""Field of a record: sha256 of `canonical_json` of all others. One without it is taken as it is: an older vplog or an
-editor wrote it."""
 _MOST_DEPTH = 100
 """Values within values, of which ours have ten; Python follows a few hundred."""
 
@@ -82,21 +78,6 @@ def _drop_retired(settings: Any) -> None:
         del verify["direction"]
 
 
-def with_checksum(record: dict[str, Any]) -> dict[str, Any]:
-    """A record as plain values, with its checksum in place of the one that it may have."""
-    record = {name: value for name, value in record.items() if name != CHECKSUM}
-    return {**plain(record), CHECKSUM: _sha256(record)}
-
-
-def has_checksum(record: dict[str, Any]) -> bool:
-    """Whether a record has the checksum in it, which is taken out, or none at all."""
-    return CHECKSUM not in record or record.pop(CHECKSUM) == _sha256(record)
-
-
-def _sha256(record: dict[str, Any]) -> str:
-    return hashlib.sha256(canonical_json(record).encode()).hexdigest()
-
-
 def _sound_json(text: str) -> Any:
     """The value of a JSON text, if it can be written again. Raises ValueError or RecursionError."""
     tree = json.loads(text)
@@ -141,23 +122,3 @@ def recorded(record: Any, path: Path, kind: type, *names: str) -> Any:
     if not isinstance(record, kind):
         raise ResultError(f"{path} lacks {'.'.join(names)}. Compute it again with `vplog run`.")
     return record
-
-
-def canonical_json(tree: Any) -> str:
-    """One text per value: sorted keys, no blanks. What a hash or a file header may hold."""
-    return json.dumps(plain(tree), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
-
-
-def plain(value: Any) -> Any:
-    """The value with numpy scalars, arrays and paths as JSON has them."""
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if hasattr(value, "tolist"):  # numpy scalars and arrays
-        return plain(value.tolist())
-    if isinstance(value, PurePath):
-        return str(value)
-    if isinstance(value, float) and not math.isfinite(value):
-        return None  # JSON has no NaN
-    return value

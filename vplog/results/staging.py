@@ -47,6 +47,12 @@ def staged(out: Path, begin: Callable[[], Sequence[str]]) -> Iterator[Path]:
         _move(out)
 
 
+def check_contents(out: Path, what: str, ours: bool) -> None:
+    """Raises SettingsError where a folder, which is there, has files to see and is not `ours`, a `what`."""
+    if not ours and any(not file.name.startswith(".") for file in out.iterdir()):
+        raise SettingsError(f"{out} is a folder with other things in it, not {what}. Choose another with -o.")
+
+
 def recover(out: Path) -> None:
     """Finish what a writer of `out`, or of the folder it is in, was killed at: committed results are moved into place.
 

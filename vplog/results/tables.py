@@ -22,7 +22,7 @@ import vplog
 from vplog.data import Closures, EdgeKind, Floats, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory, Verdict
 from vplog.errors import ResultError, nearest
 from vplog.geometry import se3
-from vplog.results.run_record import canonical_json
+from vplog.storage.json_records import canonical_json
 from vplog.storage.parquet_limits import (
     check_columns,
     filled,
@@ -62,6 +62,9 @@ class TableMetadata:
 def column(name: str, kind: pa.DataType, unit: str, description: str, nullable: bool = False) -> pa.Field:
     """A column of a table with its unit and description."""
     return pa.field(name, kind, nullable, metadata={"unit": unit, "description": description})
+
+
+POSE_COLUMNS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
 def pose_columns(prefix: str, text: str, nullable: bool = False) -> list[pa.Field]:
@@ -171,7 +174,7 @@ PLACED = pa.schema(
         column("support", pa.int32(), "1", "Other views of the window that agree; 0 where views stand alone."),
     ]
 )
-"""What a query of a map answers, in order of the views, then of rank."""
+"""Answers of a query of a map, by view, then by rank."""
 _SCHEMAS = {"keyframes": KEYFRAMES, "closures": CLOSURES, "joins": JOINS, "edges": EDGES, "trajectory": TRAJECTORY}
 
 
@@ -513,19 +516,15 @@ def _reading(path: Path) -> Iterator[None]:
         raise ResultError(f"{path} cannot be read: {why} Run `vplog run` again.") from None
 
 
-_POSE_COLUMNS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
-
-
 def _pose_values(prefix: str, poses: Floats) -> dict[str, Floats]:
-    names = [f"{prefix}{name}" for name in _POSE_COLUMNS]
-    values = np.concatenate([poses[:, :3, 3], se3.quaternion(poses[:, :3, :3])], axis=1)
-    return dict(zip(names, np.ascontiguousarray(values.T), strict=True))
+    names = [f"{prefix}{name}" for name in POSE_COLUMNS]
+    return dict(zip(names, np.ascontiguousarray(se3.vectors(poses).T), strict=True))
 
 
 def read_poses(table: pa.Table, prefix: str) -> Floats:
     """(R, 4, 4), all NaN where the row holds none."""
-    values = np.stack([_values(table, f"{prefix}{name}") for name in _POSE_COLUMNS], 1)
-    poses = se3.pose(se3.rotation(values[:, 3:]), values[:, :3])
+    values = np.stack([_values(table, f"{prefix}{name}") for name in POSE_COLUMNS], 1)
+    poses = se3.from_vectors(values)
     poses[~np.isfinite(poses).all((1, 2))] = np.nan
     return poses
 

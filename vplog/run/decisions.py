@@ -17,17 +17,15 @@ from vplog.errors import SettingsError
 from vplog.evaluate.truth_tables import read_lines
 from vplog.loops.candidate import lenient
 from vplog.loops.propose import Proposals
-from vplog.loops.verify import drive_of, verify_between
+from vplog.loops.verify import verify_between
 from vplog.run.keyframes import row_of
-from vplog.run.verification import calibrate, merged
+from vplog.run.verification import DriveFeatures, calibrated, for_verification, merged
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from vplog.cache.feature_shards import Extracted
     from vplog.cache.steps import Steps
-    from vplog.data import Camera, Closures, Keyframes
+    from vplog.data import Closures, Keyframes
     from vplog.execution.execution import Execution
-    from vplog.loops.verify import VerifySettings
 
 _log = logging.getLogger(__name__)
 _COLUMNS = ["query", "match", "decision", "who", "when", "reason"]
@@ -102,24 +100,16 @@ def read_decisions(path: Path, keyframes: Keyframes) -> Decisions:
 
 @step("decide", lambda *_: closures_codec(), items=lambda closures, decisions, *_: len(decisions.accepted))
 def decide(
-    closures: Closures,
-    decisions: Decisions,
-    keyframes: Keyframes,
-    camera: Camera,
-    features: Extracted,
-    settings: VerifySettings,
-    *,
-    steps: Steps,
-    execution: Execution,
+    closures: Closures, decisions: Decisions, drive: DriveFeatures, *, steps: Steps, execution: Execution
 ) -> Closures:
     """The ledger with the verdicts of decisions. Accepted pairs without a pose are verified with loose thresholds."""
     row_at = _rows(closures)
     posed = set(np.flatnonzero(np.isfinite(closures.match_from_query[:, 0, 0])).tolist())
     missing = [pair for pair in decisions.accepted if row_at.get(pair) not in posed]
     if missing:
-        drive = drive_of(keyframes, camera, features.__getitem__, lenient(settings))
-        share = 0.0 if camera.matrix is None else steps.part(calibrate, keyframes, camera, features, settings)
-        found = verify_between(_proposals(missing, closures, row_at), drive, drive, execution, share)
+        views = for_verification(replace(drive, settings=lenient(drive.settings)))
+        proposals, share = _proposals(missing, closures, row_at), calibrated(drive, steps)
+        found = verify_between(proposals, views, views, execution, share)
         closures = _with(closures, found, row_at)
         row_at = _rows(closures)
     verdict = list(closures.verdict)

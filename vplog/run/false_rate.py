@@ -1,4 +1,4 @@
-"""The share of false closures that is expected of a drive's ledger, and kept below what was asked for."""
+"""The false discovery rate of a drive's ledger, and the closures admitted by `false_rate.rate`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from vplog.cache.codecs import closures_codec
 from vplog.cache.steps import step
-from vplog.data import Bools, Camera, Closures, Ints, Keyframes, Odometry, Verdict
+from vplog.data import Bools, Closures, Ints, Keyframes, Odometry, Verdict
 from vplog.evaluate.body_truth import TruthAt
 from vplog.evaluate.closure_pose import pose_bounds, pose_errors
 from vplog.geometry import se3
@@ -26,10 +26,10 @@ from vplog.loops.false_rate import (
     with_p_false,
 )
 from vplog.loops.propose import ProposeSettings, candidate_stops
-from vplog.loops.verify import VerifySettings, drive_of, verify_between
+from vplog.loops.verify import verify_between
+from vplog.run.verification import DriveFeatures, for_verification
 
 if TYPE_CHECKING:
-    from vplog.cache.feature_shards import Extracted
     from vplog.execution.execution import Execution
 
 _log = logging.getLogger(__name__)
@@ -41,12 +41,9 @@ _FAR_M = 1e6
 def rate_closures(
     closures: Closures,
     odometry: Odometry,
-    keyframes: Keyframes,
-    camera: Camera,
-    features: Extracted,
+    drive: DriveFeatures,
     settings: FalseRateSettings,
     propose: ProposeSettings,
-    verify: VerifySettings,
     noise: NoiseSettings,
     *,
     execution: Execution,
@@ -54,30 +51,30 @@ def rate_closures(
     """The ledger with `p_false`, and with `rate` without what is likelier to be false."""
     if not len(closures):
         return closures
-    ruled_out = beyond_drift(closures, keyframes, odometry, noise, verify.metric.max_distance_m, settings.sigmas)
+    keyframes, reach_m, views = drive.keyframes, drive.settings.metric.max_distance_m, for_verification(drive)
+    ruled_out = beyond_drift(closures, keyframes, odometry, noise, reach_m, settings.sigmas)
     left = np.flatnonzero(~ruled_out)
     count = min(max(settings.null_pairs - int(ruled_out.sum()), 0), len(left))
-    drive = drive_of(keyframes, camera, features.__getitem__, verify)
     rows = left[np.linspace(0, len(left) - 1, count).astype(np.int64)]
-    mirror = mirrored_evidence(closures, rows, drive, execution)
+    mirror = mirrored_evidence(closures, rows, views, execution)
     piece = np.zeros(len(keyframes.stamp_ns))
     piece[broken_edges(odometry, keyframes.stamp_ns) + 1] = _FAR_M  # what lies behind a break is near nothing before
     positions = np.column_stack([keyframes.odom_from_body[:, :3, 3], np.cumsum(piece)])
     stops = candidate_stops(keyframes, propose)
     # a moving camera's landmarks come from these very neighbours, so that they tell little of other closures
     most = settings.certain_pairs if {"depth", "stereo"} & set(closures.scale) else 0
-    pairs = certain_pairs(positions, stops, verify.metric.max_distance_m, most)
-    certain = verify_between(pairs, drive, drive, execution, share=0.0)
-    closures = with_p_false(closures, ruled_out, mirror, *_by_odometry(certain, keyframes, camera, noise, settings))
-    return closures if settings.rate is None else _asked(closures, settings.rate, int(ruled_out.sum()), count)
+    pairs = certain_pairs(positions, stops, reach_m, most)
+    certain = verify_between(pairs, views, views, execution, share=0.0)
+    closures = with_p_false(closures, ruled_out, mirror, *_by_odometry(certain, drive, noise, settings))
+    return closures if settings.rate is None else _admitted(closures, settings.rate, int(ruled_out.sum()), count)
 
 
 def _by_odometry(
-    certain: Closures, keyframes: Keyframes, camera: Camera, noise: NoiseSettings, settings: FalseRateSettings
+    certain: Closures, drive: DriveFeatures, noise: NoiseSettings, settings: FalseRateSettings
 ) -> tuple[Ints, Bools]:
     """Evidence (K,) of the verified ones of certain pairs with a pose, and whether `vplog evaluate` would call it
     wrong with the odometry as the truth, which may drift meanwhile."""
-    poses = keyframes.odom_from_body
+    poses = drive.keyframes.odom_from_body
     step = np.zeros((len(poses), 2))  # rad and m
     between = se3.between(poses[:-1], poses[1:])
     step[1:] = np.column_stack([se3.angle(between), np.linalg.norm(between[:, :3, 3], axis=1)])
@@ -87,7 +84,7 @@ def _by_odometry(
     none = np.zeros_like(step)
     known = np.ones(len(poses), bool)
     query, match = TruthAt(poses, known, settings.sigmas * np.stack(drift, 1)), TruthAt(poses, known, none)
-    cameras = camera.body_from_camera, camera.body_from_camera
+    cameras = drive.camera.body_from_camera, drive.camera.body_from_camera
     posed, _, wrong, _ = pose_errors(certain, query, match, pose_bounds(poses[:, :3, 3]), cameras)
     rows = posed & certain.of(Verdict.ACCEPTED)
     return evidence(certain)[rows], wrong[rows]
@@ -106,7 +103,8 @@ def beyond_drift(
     return np.linalg.norm(apart, axis=1) - sigmas * sigma_m > reach_m
 
 
-def _asked(closures: Closures, rate: float, ruled_out: int, mirrored: int) -> Closures:
+def _admitted(closures: Closures, rate: float, ruled_out: int, mirrored: int) -> Closures:
+    """The ledger without what is likelier to be false than `rate`, with a warning where that is all."""
     verified = closures.of(Verdict.ACCEPTED)
     least = closures.p_false[verified].min(initial=1.0)
     if verified.any() and least > rate:

@@ -68,7 +68,7 @@ _SMALL_PX, _DARK, _FLAT = 160 * 160, 16.0, 40.0
 """Pictures are small below so many px, dark below this mean grey, and low in contrast where 98 % of grey levels lie
 closer: those of drives by day have 10^5 px, a mean of 80 to 130 and 150 to 250 levels, of a lit park at night 240."""
 _POOR_SHARE = 0.1
-"""Share of keyframes with few features from which that is said."""
+"""Share of keyframes with few features from which there is a warning."""
 
 
 class Extraction(Protocol):
@@ -244,7 +244,7 @@ def decoded(keyframes: Keyframes, found: Extracted, settings: FeatureSettings) -
 
 
 def poor_pictures(found: Extracted, least: int) -> str:
-    """What makes pictures too poor to recognise places by, in sentences; empty where few have less than `least`
+    """A warning of pictures too poor for place recognition; empty where few have less than `least`
     features and the usual one has light, contrast and size."""
     counts = np.array(found.counts)
     sample = [found[row] for row in np.linspace(0, len(counts) - 1, _LOOKED_AT).astype(int).tolist()]

@@ -19,12 +19,13 @@ from vplog.features.store import FeatureStore
 from vplog.loops.landmarks import landmarks_of
 from vplog.loops.undistort import project
 from vplog.loops.verify import VerifySettings, drive_of
-from vplog.results import run_record, tables
+from vplog.results import tables
 from vplog.results.landmark_table import write_landmarks
 from vplog.results.run_record import CACHE
 from vplog.run.feature_extraction import Extraction, stored_features
 from vplog.run.provenance import reopened
 from vplog.run.reextraction import ReextractedFeatures
+from vplog.storage.json_records import canonical_json
 from vplog.storage.scratch import scratch
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def landmark_key(folder: Path, record: dict[str, Any], settings: DriveSettings) 
         "features": settings.features.identity(), "stereo": settings.stereo.model_dump(mode="json"),
         "verify": settings.verify.model_dump(mode="json"), **code_of(__name__, type(settings.features).__module__),
     }  # fmt: skip
-    return hashlib.sha256(run_record.canonical_json(made_from).encode()).hexdigest()
+    return hashlib.sha256(canonical_json(made_from).encode()).hexdigest()
 
 
 def write_drive_landmarks(path: Path, drive: Drive, key: str, execution: Execution) -> None:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from vplog.cache.steps import Steps, step
 from vplog.data import Camera, Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Reference, Solution, Verdict
-from vplog.figures.run_figures import ClosureInputs, earth_of, mcap_extras, reference_use
 from vplog.geometry import tum
 from vplog.graph import consistency
 from vplog.graph.certificate import certify
@@ -18,6 +17,7 @@ from vplog.graph.refine import about_odometry
 from vplog.results import g2o, mcap, run_record, tables
 from vplog.run import provenance
 from vplog.run.back_end import Solved, about_gps, keyframe_covariances
+from vplog.run.figures.run_figures import ClosureInputs, earth_of, mcap_extras, reference_use
 from vplog.run.report import write_report
 from vplog.storage.image_file import decode_image
 

@@ -15,6 +15,7 @@ from vplog import logs
 from vplog.cache.input_hashes import bytes_of, files_of, stat_signature
 from vplog.errors import LogError, ResultError
 from vplog.results import run_record
+from vplog.storage.json_records import canonical_json
 from vplog.storage.remote_path import local_copy, located, original, reason
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def reopened(
 
 def stat_of(files: Sequence[Path]) -> dict[str, Any]:
     """Length of the files of a log, and a sha256 over their paths, lengths and times: unchanged means the same log."""
-    look = run_record.canonical_json(stat_signature(files)).encode()
+    look = canonical_json(stat_signature(files)).encode()
     return {"bytes": bytes_of(files), "sha256": hashlib.sha256(look).hexdigest()}
 
 

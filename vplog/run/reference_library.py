@@ -31,7 +31,7 @@ from vplog.places.library import build_library as index_words
 from vplog.places.library_files import check_descriptors, load_references, read_library_record, read_sources
 from vplog.places.plugin import PluginSettings
 from vplog.places.reference_choice import PAPER_SIZE, LibrarySettings, choose, evenly
-from vplog.results.staging import recover, staged
+from vplog.results.staging import check_contents, recover, staged
 from vplog.storage.folders import check_regular
 
 if TYPE_CHECKING:
@@ -164,8 +164,7 @@ def build_library(
 def _library_in(out: Path, opened: Sequence[Log] | None) -> list[str]:
     """The files of a library in a folder that a new one may replace: one of these logs, or any. Raises SettingsError
     where it may not."""
-    if any(not file.name.startswith(".") for file in out.iterdir()) and not (out / "library.json").is_file():
-        raise SettingsError(f"{out} is a folder with other things in it, not a library. Choose another with -o.")
+    check_contents(out, "a library", (out / "library.json").is_file())
     check_regular(out, "library.json")
     if out.absolute().name == "library" and (out.absolute().parent / "run.json").is_file():
         raise SettingsError(f"{out} is the library of the run in {out.absolute().parent}. Choose another with -o.")

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog.data import USED, Trajectory
-from vplog.figures.run_figures import earth_of
 from vplog.geometry import se3
 from vplog.graph.joint import spaced_apart
 from vplog.results import mcap_read, tables
 from vplog.results.previews import jpeg, shrink
 from vplog.results.report.page import Content, Tracks, false_closures, page
+from vplog.run.figures.run_figures import earth_of
 from vplog.storage.image_file import decode_image
 from vplog.storage.scratch import replacing
 
@@ -54,7 +54,7 @@ class Outcome:
     closures: int
     """Loop closures with more than half their weight."""
     places: int
-    """Those of them that are `join.spacing` keyframes from the next, of queries or of matches: the fewer."""
+    """Closures that are `join.spacing` keyframes from the next, of queries or of matches: the fewer."""
 
 
 def outcome_of(folder: Path, spacing: int) -> Outcome:

@@ -16,9 +16,9 @@ from vplog.errors import ResultError, SettingsError, was_interrupted
 from vplog.logs import TopicChoice
 from vplog.results import run_record
 from vplog.results.run_record import CACHE, REQUEST
-from vplog.results.staging import staged
+from vplog.results.staging import check_contents, staged
 from vplog.run import provenance
-from vplog.storage.folders import check_regular, check_replaceable
+from vplog.storage.folders import check_no_picture, check_regular, check_replaceable
 from vplog.storage.remote_path import located, stands_for
 
 _RUN_FILES = (
@@ -33,11 +33,19 @@ _RECORDS = ("run.json", "drive.json", "library.json")
 
 
 def check_output(path: Path) -> None:
-    """Raises ResultError where a file to write is a recorded log, or one that a run or a library was written as."""
+    """Raises ResultError where a file to write is a recorded log, a photograph or a video, or belongs to a run, a
+    library or a map."""
     check_replaceable(path)
+    if not path.is_file():
+        return
+    check_no_picture(path)
     written = [*_RECORDS, *(PurePath(name).name for name in _RUN_FILES if not name.endswith((".html", ".png")))]
-    if path.is_file() and any((path.parent / name).exists() for name in _RECORDS) and any(map(path.match, written)):
+    if any((path.parent / name).exists() for name in _RECORDS) and any(map(path.match, written)):
         raise ResultError(f"{path} is a file of the results in {path.parent}. Name another.")
+    for above in path.absolute().parents:
+        inside = above != path.absolute().parent or path.suffix == ".json"
+        if inside and (above / "map.json").is_file() and (above / "runs").is_dir():
+            raise ResultError(f"{path} is a file of the map {above}. Name another.")
 
 
 @dataclass(frozen=True)
@@ -126,9 +134,9 @@ def _results_in(out: Path, library: Path | None, drives: Collection[str], resuma
     A library that the new run is given stays, and the cache of each of its drives if it is `resumable`. Raises
     SettingsError where `out` holds other things than a run.
     """
-    record = _run_json(out) if any(not file.name.startswith(".") for file in out.iterdir()) else {}
-    if record is None:
-        raise SettingsError(f"{out} is a folder with other things in it, not a run. Choose another with -o.")
+    record = _run_json(out)
+    check_contents(out, "a run", record is not None)
+    record = record or {}
     given = library is not None and library.resolve() == (out / "library").resolve()
     earlier = [escape(name) for name in _drives_in(record)]
     caches = [f"{CACHE}/{escape(one.name)}" for one in (out / CACHE).glob("*/") if one.name not in drives]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from itertools import chain
 from typing import TYPE_CHECKING
 
@@ -17,56 +17,57 @@ from vplog.loops.verify import VerifySettings, calibration_share, drive_of, no_c
 if TYPE_CHECKING:
     from vplog.cache.feature_shards import Extracted
     from vplog.execution.execution import Execution
+    from vplog.loops.candidate import Drive
     from vplog.loops.propose import Proposals
 
 _PART_CANDIDATES = 1000
 """Candidates of a part: 5 to 10 s of one core, as a part of the keyframes."""
 
 
+@dataclass(frozen=True, eq=False)
+class DriveFeatures:
+    """The keyframes of a drive with their features, and the settings by which closures between them are verified."""
+
+    keyframes: Keyframes
+    camera: Camera
+    features: Extracted
+    settings: VerifySettings
+
+
+def for_verification(drive: DriveFeatures) -> Drive:
+    """Raises LogError for a calibrated camera with an unknown distortion model."""
+    return drive_of(drive.keyframes, drive.camera, drive.features.__getitem__, drive.settings)
+
+
 @step("verify", items=lambda proposals, *_: len(proposals.query))
-def verify(
-    proposals: Proposals,
-    keyframes: Keyframes,
-    camera: Camera,
-    features: Extracted,
-    settings: VerifySettings,
-    *,
-    steps: Steps,
-) -> Closures:
+def verify(proposals: Proposals, drive: DriveFeatures, *, steps: Steps) -> Closures:
     """The ledger of `loops.verify.verify_between`, whose row depends on its two frames and the calibration alone.
 
     A part has all candidates of some map frames, whose landmarks are made once all the same.
     """
-    drive = keyframes, camera, features, settings
     places = _parts(proposals.match)
     if not places:
         return no_closures()
-    share = 0.0 if camera.matrix is None else steps.part(calibrate, *drive)
-    return merged(steps.in_parts(verify_part, [(proposals.rows(rows), share, *drive) for rows in places]), places)
+    share = calibrated(drive, steps)
+    return merged(steps.in_parts(verify_part, [(proposals.rows(rows), share, drive) for rows in places]), places)
+
+
+def calibrated(drive: DriveFeatures, steps: Steps) -> float:
+    """Relative error of rotations by the calibration, 0 without one."""
+    return 0.0 if drive.camera.matrix is None else steps.part(calibrate, drive)
 
 
 @step("calibrate", lambda *_: json_codec(float, float))
-def calibrate(
-    keyframes: Keyframes, camera: Camera, features: Extracted, settings: VerifySettings, *, execution: Execution
-) -> float:
-    """Relative error of rotations by the calibration, see `calibration_share`."""
-    return calibration_share(drive_of(keyframes, camera, features.__getitem__, settings), execution)
+def calibrate(drive: DriveFeatures, *, execution: Execution) -> float:
+    """Relative error of rotations by the calibration, see `loops.verify.calibration_share`."""
+    return calibration_share(for_verification(drive), execution)
 
 
 @step("verify", lambda *_: closures_codec(), items=lambda proposals, *_: len(proposals.query))
-def verify_part(
-    proposals: Proposals,
-    share: float,
-    keyframes: Keyframes,
-    camera: Camera,
-    features: Extracted,
-    settings: VerifySettings,
-    *,
-    execution: Execution,
-) -> Closures:
+def verify_part(proposals: Proposals, share: float, drive: DriveFeatures, *, execution: Execution) -> Closures:
     """The ledger of some candidates."""
-    drive = drive_of(keyframes, camera, features.__getitem__, settings)
-    return verify_between(proposals, drive, drive, execution, share)
+    views = for_verification(drive)
+    return verify_between(proposals, views, views, execution, share)
 
 
 def _parts(match: np.ndarray) -> list[Ints]:

@@ -18,6 +18,11 @@ _KINDS = {
 }  # fmt: skip
 _LOGS = (b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd")
 """What recorded drives begin with, those that zstd packed too."""
+_PNG = b"\x89PNG\r\n\x1a\n"
+_PICTURES = (b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"GIF8", b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51", b"\x1a\x45\xdf\xa3")
+"""JPEG, TIFF, GIF, JPEG 2000 and Matroska."""
+_BOXES, _RIFF = (b"ftyp", b"moov", b"mdat"), (b"AVI ", b"WEBP")
+"""Second four bytes of an ISO base media file (MP4, QuickTime, AVIF, HEIC); third four of a RIFF file."""
 
 
 def regular_files(folder: Path) -> Iterator[str]:
@@ -54,6 +59,16 @@ def check_replaceable(path: Path) -> None:
             head = file.read(max(map(len, _LOGS)))
         if head.startswith(_LOGS):
             raise ResultError(f"{path} is a recorded log, which is not replaced. Name another file.")
+
+
+def check_no_picture(path: Path) -> None:
+    """Raises ResultError where a file to write is a photograph or a video, which may be a frame of a drive: PNG, which
+    vplog writes itself, by its other ending."""
+    with path.open("rb") as file:
+        head = file.read(12)
+    starts = head.startswith(_PICTURES) or head[4:8] in _BOXES or (head[:4] == b"RIFF" and head[8:] in _RIFF)
+    if starts or (head.startswith(_PNG) and path.suffix.lower() != ".png"):
+        raise ResultError(f"{path} is a picture or a video, which is not replaced. Name another file.")
 
 
 def check_regular(folder: Path, record: str = "") -> None:

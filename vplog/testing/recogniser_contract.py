@@ -1,4 +1,4 @@
-"""What every recogniser must do, whatever its descriptors are.
+"""Contract of every recogniser, whatever its descriptors are.
 
 from vplog.testing.recogniser_contract import RecogniserContract
 

@@ -12,14 +12,16 @@ from vplog import logs
 from vplog.data import Closures, Keyframes
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
-from vplog.figures.closure_view import SharedBoxes, find_agreement, find_boxes
+from vplog.geometry import se3
+from vplog.pipeline import recorded_pipeline
 from vplog.results import run_record, tables
+from vplog.run.figures.closure_view import SharedBoxes, find_agreement, find_boxes
 from vplog.run.keyframes import row_of
 from vplog.run.provenance import reopened
 from vplog.stages import BoxState, Log
 from vplog.verbs import explain_text
 from vplog.verbs.explain_figure import View, draw
-from vplog.verbs.report import frames_at, recorded_pipeline, recorded_places
+from vplog.verbs.report import frames_at, recorded_places
 
 if TYPE_CHECKING:
     from vplog.pipeline import Pipeline
@@ -91,7 +93,8 @@ def _view(
     """Both frames, read again from the log, with their matches and shared boxes."""
     stamps = np.array([row["match_stamp_ns"], row["query_stamp_ns"]], np.int64)
     match, query = frames_at(log, stamps, pipeline, f"is it the log of {folder}? Name it with --log.")
-    agreement = find_agreement(query[1], match[1], row, log.camera(), pipeline.verify)
+    pose = se3.from_vectors(np.array([row[name] for name in tables.POSE_COLUMNS], np.float64))
+    agreement = find_agreement(query[1], match[1], pose, row["inliers"], log.camera(), pipeline.verify)
     boxes, missing = _boxes(row, folder, record, pipeline)
     return View(number, row, explanation, query[0], match[0], agreement, boxes, missing)
 

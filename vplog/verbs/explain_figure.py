@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog.data import ACCEPTED, Bytes, Floats
-from vplog.figures.canvas import as_text, saved_figure
 from vplog.results.report.charts import subsampled
+from vplog.run.figures.canvas import as_text, saved_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from vplog.figures.closure_view import Agreement, SharedBoxes
+    from vplog.run.figures.closure_view import Agreement, SharedBoxes
     from vplog.verbs.explain_text import Explanation
 
 _COLOURS = ("#ff9d2e", "#4cc3ff", "#ff5fa8", "#b9e04a")

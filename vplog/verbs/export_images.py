@@ -13,16 +13,15 @@ import numpy as np
 import vplog
 from vplog import logs
 from vplog.data import Bytes, Features, Ints, Structure
-from vplog.errors import SettingsError
 from vplog.features.extraction import describe
 from vplog.features.store import FeatureStore
 from vplog.loops.structure import pairs_to_match, triangulate
+from vplog.pipeline import recorded_pipeline
 from vplog.results import colmap, run_record, tables
-from vplog.results.staging import staged
+from vplog.results.staging import check_contents, staged
 from vplog.run.provenance import reopened
 from vplog.storage.folders import check_regular, is_below
 from vplog.storage.scratch import files_in, scratch
-from vplog.verbs.report import recorded_pipeline
 
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution
@@ -100,8 +99,7 @@ def _export_in(out: Path) -> list[str]:
     """The files of an export in a folder, by its record, which a new one replaces: scenes of others have the same
     names. Raises SettingsError where it holds other things, and ResultError."""
     known = run_record.is_ours(out / _RECORD)
-    if not known and any(not file.name.startswith(".") for file in out.iterdir()):
-        raise SettingsError(f"{out} is a folder with other things in it, not an export. Choose another with -o.")
+    check_contents(out, "an export", known)
     check_regular(out, _RECORD)
     found = run_record.read_run_json(out / _RECORD).get("files") if known else []
     names = found if isinstance(found, list) else []

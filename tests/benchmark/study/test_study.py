@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vplog import logs
+from tests.pictures import day_and_dusk
 from vplog.benchmark.recogniser_specs import read_method
 from vplog.benchmark.study import study
 from vplog.benchmark.study.experiments import ABLATIONS, Ablation
@@ -41,16 +41,11 @@ QUICK = (
 
 @pytest.fixture(scope="module")
 def traversals(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Two folders of the same frames: as they are, and darker with other noise."""
-    log = logs.open(drive.log)
     folders = tmp_path_factory.mktemp("traversals") / "walk_day", tmp_path_factory.mktemp("traversals") / "walk_dusk"
-    rng = np.random.default_rng(0)
     for folder in folders:
         folder.mkdir()
-    for number, frame in enumerate(log.frames(log.stamps()[:FRAMES])):
-        day = frame.decode().image
-        dusk = np.clip(day * 0.8 + rng.normal(0, 2, day.shape), 0, 255).astype(np.uint8)
-        for folder, image in zip(folders, (day, dusk), strict=True):
+    for number, images in enumerate(day_and_dusk(drive.log, FRAMES)):
+        for folder, image in zip(folders, images, strict=True):
             cv2.imwrite(str(folder / f"{number}.png"), image)
     return folders
 

@@ -50,15 +50,18 @@ def pictures() -> list[np.ndarray]:
 
 
 @cache
-def packets(codec: str, b_frames: int = 0, x265: str = "") -> tuple[bytes, ...]:
-    """One payload a frame, in the order of decoding."""
+def packets(codec: str, b_frames: int = 0, params: str = "") -> tuple[bytes, ...]:
+    """One payload a frame, in the order of decoding; `params` are those of x264 or x265."""
     encoder = av.CodecContext.create(ENCODERS[codec], "w")
     encoder.width, encoder.height, encoder.pix_fmt = WIDTH, HEIGHT, "yuv420p"
     encoder.time_base, encoder.framerate = Fraction(1, 20), Fraction(20)
     encoder.gop_size, encoder.max_b_frames, encoder.thread_count = GROUP, b_frames, 1
     encoder.options = {
-        "h264": {"crf": "12", "tune": "fastdecode" if b_frames else "zerolatency", "bf": str(b_frames)},
-        "hevc": {"crf": "10", "x265-params": f"{x265}bframes={b_frames}:keyint={GROUP}:log-level=none:pools=1"},
+        "h264": {
+            "crf": "12", "tune": "fastdecode" if b_frames else "zerolatency", "bf": str(b_frames),
+            **({"x264-params": params} if params else {}),
+        },
+        "hevc": {"crf": "10", "x265-params": f"{params}bframes={b_frames}:keyint={GROUP}:log-level=none:pools=1"},
         "vp9": {"crf": "8", "b": "0", "lag-in-frames": "0", "deadline": "realtime"},
         "av1": {"crf": "16", "preset": "8", "svtav1-params": "scd=0" if b_frames else "pred-struct=1:scd=0"},
     }[codec]  # fmt: skip
@@ -69,8 +72,14 @@ def packets(codec: str, b_frames: int = 0, x265: str = "") -> tuple[bytes, ...]:
         found.extend(encoder.encode(frame))
     found.extend(encoder.encode(None))
     assert len(found) == COUNT
-    packets.pts = {**getattr(packets, "pts", {}), (codec, b_frames): [packet.pts for packet in found]}  # type: ignore[attr-defined]
+    packets.pts = {**getattr(packets, "pts", {}), (codec, b_frames, params): [packet.pts for packet in found]}  # type: ignore[attr-defined]
     return tuple(bytes(packet) for packet in found)
+
+
+def shown(codec: str, b_frames: int, params: str = "") -> list[int]:
+    """The picture that each of `packets` holds."""
+    packets(codec, b_frames, params)
+    return packets.pts[codec, b_frames, params]  # type: ignore[attr-defined]
 
 
 def close(found: np.ndarray | VideoFrame, number: int) -> bool:
@@ -95,17 +104,20 @@ def test_any_frames_in_any_order_are_those_asked_for(codec: str, rows: Any) -> N
 @pytest.mark.parametrize("codec", ["h264", "hevc", "av1"])
 def test_frames_that_come_out_later_than_their_packets(codec: str) -> None:
     payloads = packets(codec, 3)
-    order = packets.pts[codec, 3]  # type: ignore[attr-defined]
+    order = shown(codec, 3)
     assert codec == "av1" or order != sorted(order)  # the encoder did reorder; AV1 hides that within a packet
     video = stream(codec, payloads)
     for row, number in enumerate(order):
         assert close(video.frame(row), number)
 
 
+OPEN_265 = "open-gop=1:min-keyint=12:scenecut=0:no-scenecut=1:"
+
+
 def test_pictures_that_refer_back_over_a_key_frame() -> None:
     """Open groups of H.265: what is shown before a key frame and sent behind it needs the group before."""
-    payloads = packets("hevc", 3, "open-gop=1:min-keyint=12:scenecut=0:no-scenecut=1:")
-    order = packets.pts["hevc", 3]  # type: ignore[attr-defined]
+    payloads = packets("hevc", 3, OPEN_265)
+    order = shown("hevc", 3, OPEN_265)
     keys = [row for row, payload in enumerate(payloads) if packet_kind("hevc", payload) >= 3]
     behind = [row for row in range(keys[1], COUNT) if order[row] < order[max(key for key in keys if key <= row)]]
     assert behind, "the encoder did make open groups"
@@ -114,6 +126,40 @@ def test_pictures_that_refer_back_over_a_key_frame() -> None:
         assert close(video.frame(row), number)
     for row in behind:
         assert close(stream("hevc", payloads).frame(row), order[row])
+
+
+OPEN = f"open-gop=1:keyint={GROUP}:scenecut=0:b-adapt=0:ref=3"
+REFRESHED = f"intra-refresh=1:keyint={GROUP}:scenecut=0"
+
+
+@pytest.mark.parametrize(("params", "b_frames", "most"), [(OPEN, 3, GROUP + 3), (REFRESHED, 0, 2 * GROUP - 1)])
+def test_streams_of_h264_with_one_idr_picture_are_entered_at_recovery_points(
+    params: str, b_frames: int, most: int
+) -> None:
+    """Open groups, and gradual refresh: a cut or a missing packet costs a group, not all that follows."""
+    payloads = packets("h264", b_frames, params)
+    order = shown("h264", b_frames, params)
+    cut, missing = list(range(5, COUNT)), [row for row in range(COUNT) if row != GROUP + 4]
+    for rows in (range(COUNT), cut, missing):
+        video, lost = stream("h264", [payloads[row] for row in rows]), 0
+        for row in range(video.first_key() or 0, len(rows)):
+            try:
+                assert close(video.frame(row), order[rows[row]]), row
+            except BadMessageError:
+                lost += 1
+        assert lost <= (0 if len(rows) == COUNT else most)
+
+
+@pytest.mark.parametrize("codec", ENCODERS)
+def test_a_packet_that_was_recorded_twice_changes_no_picture(codec: str, tmp_path: Path) -> None:
+    found = messages("foxglove", packets(codec), codec=codec)
+    for number in (2 * GROUP, GROUP + 7, GROUP + 1):  # a key frame among them
+        found.insert(number, found[number])
+    log = logs.open(write_raw(tmp_path / "drive.mcap", found))
+    frames = list(log.frames(log.stamps()))
+    assert len(frames) == COUNT
+    for row, frame in enumerate(frames):
+        assert close(frame.decode().image, row)
 
 
 def test_only_stretches_with_frames_of_interest_are_decoded() -> None:
@@ -148,24 +194,25 @@ def test_damage_ends_at_the_next_key_frame() -> None:
     assert lost == [*range(GROUP + 3, 2 * GROUP), *range(2 * GROUP + 5, 3 * GROUP)]
 
 
-@pytest.mark.parametrize("codec", ["h264", "hevc"])
-@pytest.mark.parametrize("b_frames", [0, 3])
+@pytest.mark.parametrize(
+    ("codec", "b_frames"), [("h264", 0), ("h264", 3), ("hevc", 0), ("hevc", 3), ("vp9", 0), ("av1", 0)]
+)
 def test_a_missing_packet_gives_no_wrong_picture(codec: str, b_frames: int) -> None:
     payloads = packets(codec, b_frames)
-    order = packets.pts[codec, b_frames]  # type: ignore[attr-defined]
+    order = shown(codec, b_frames)
     for missing in (GROUP + 3, 2 * GROUP + 7):
         video = stream(codec, payloads[:missing] + payloads[missing + 1 :])
         left = order[:missing] + order[missing + 1 :]
-        shown = []
+        right = []
         for row, number in enumerate(left):
             try:
                 assert close(video.frame(row), number), (missing, number)
-                shown.append(number)
+                right.append(number)
             except BadMessageError:
                 continue
-        assert set(order[:missing]) <= set(shown)
+        assert set(order[:missing]) <= set(right)
         later = missing // GROUP * GROUP + GROUP + b_frames  # where the next key frame is, and what refers back over it
-        assert set(order[later:]) <= set(shown)
+        assert set(order[later:]) <= set(right)
 
 
 @pytest.mark.parametrize("profile", ["baseline", "main", "high", "high10"])
@@ -280,6 +327,32 @@ def test_frames_before_the_first_key_frame_are_left_out_and_counted(codec: str, 
     log = logs.open(write_raw(tmp_path / "none.mcap", group))
     with pytest.raises(LogError, match="No image of /video can be read"):
         log.stamps()
+
+
+@pytest.mark.parametrize("codec", ["h264", "vp9", "av1"])  # FFmpeg's H.265 does not tell
+def test_half_a_packet_is_no_picture(codec: str) -> None:
+    payloads = list(packets(codec))
+    for row in (GROUP + 3, 2 * GROUP):
+        payloads[row] = payloads[row][: len(payloads[row]) // 2]
+    video, lost = stream(codec, payloads), []
+    for row in range(COUNT):
+        try:
+            assert close(video.frame(row), row), row
+        except BadMessageError:
+            lost.append(row)
+    assert {*lost} <= {*range(GROUP + 3, 3 * GROUP)}
+    assert {GROUP + 3, 2 * GROUP} <= {*lost}
+
+
+@pytest.mark.parametrize("codec", ENCODERS)
+def test_a_damaged_first_group_costs_no_other(codec: str, tmp_path: Path) -> None:
+    payloads = list(packets(codec))
+    payloads[0] = payloads[0][: len(payloads[0]) * 3 // 4]
+    log = logs.open(write_raw(tmp_path / "drive.mcap", messages("foxglove", payloads, codec=codec)))
+    assert (log.camera().width, log.camera().height) == (WIDTH, HEIGHT)
+    sound = log.stamps()[log.stamps() >= START_NS + GROUP * PERIOD_NS]
+    for frame, row in zip(log.frames(sound), range(GROUP, COUNT), strict=True):
+        assert close(frame.decode().image, row)
 
 
 def test_undecodable_frames_say_why_and_the_rest_goes_on(tmp_path: Path) -> None:

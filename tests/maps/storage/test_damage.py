@@ -127,3 +127,12 @@ def test_what_is_no_file_is_no_part_of_an_index(tmp_path: Path, kind: str) -> No
     parts, warnings = update()
     assert sum(part.places for part in parts) == 40, "which are indexed in memory"
     assert any(part.path.name in warning for warning in warnings)
+
+
+@pytest.mark.parametrize("text", ["", "[", "[]", '{"a": 1}', '{"a": {"error": 1}}'])
+def test_a_damaged_record_of_failures_stops_no_verb(root: Path, verb: Verb, tmp_path: Path, text: str) -> None:
+    here = shutil.copytree(root, tmp_path / "map")
+    (here / "failures.json").write_text(text)
+    [problem] = [one for one in verb("map", "info", here, "--json").json["problems"] if "failures" in one]
+    assert problem.endswith("failures.json is damaged, so it is not known what failed. The next batch writes it again.")
+    assert verb("map", "remove", here, "ride").code == 0

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.figures.canvas import as_text, saved_figure
+from vplog.run.figures.canvas import as_text, saved_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,14 +46,10 @@ def draw_pairs(found: Found, folder: Path) -> None:
     methods, labels = _unique(rows, "method"), _pair_labels(rows)[:_MOST_BARS]
     with saved_figure(folder, "pairs", max(7.0, 1.3 + 1.6 * len(labels)), 7.6) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True)
-        wide = 0.82 / len(methods)
-        for number, method in enumerate(methods):
-            at = np.arange(len(labels)) + (number - (len(methods) - 1) / 2) * wide
-            mine = _at_pairs(rows, labels, method=method)
-            for axes, score in ((upper, "r_at_1"), (lower, "anr")):
-                _bars(axes, at, mine, score, 0.92 * wide, color=colour_of(method, methods), label=as_text(method))
-            marks = [f"{row['r_at_1']:.2f}".removeprefix("0") for row in mine]
-            _annotate(upper, at, mine, marks, 1, 6)
+        styles = {method: (colour_of(method, methods), as_text(method)) for method in methods}
+        _grouped_bars(
+            (upper, lower), rows, labels, "method", styles, lambda row: f"{row['r_at_1']:.2f}".removeprefix("0")
+        )
         upper.set(ylabel=_SHARE, ylim=(0, 1.06), xlim=(-0.55, len(labels) - 0.45))
         _rank_axis(lower, [row["anr"] for row in rows], from_zero=True)
         lower.set_xticks(range(len(labels)), [as_text(label) for label in labels])
@@ -109,18 +105,13 @@ def draw_library(found: Found, folder: Path) -> None:
     methods, drives = _unique(rows, "method"), _unique(rows, "library")
     drives.sort(key=[row["map"] for row in rows].index)
     labels = _pair_labels(rows)[:_MOST_BARS]
-    wide = 0.8 / len(drives)
+    styles = {drive: (_DRIVES[number % len(_DRIVES)], as_text(f"from {drive}")) for number, drive in enumerate(drives)}
+    marks = {"map": "M", "query": "Q"}
     with saved_figure(folder, "library", max(7.0, 1.3 + 1.35 * len(labels)), 1.2 + 2.9 * len(methods)) as figure:
         grid = figure.subplots(2 * len(methods), 1, sharex=True, squeeze=False)[:, 0]
         for pair_of_axes, method in zip(grid.reshape(-1, 2), methods, strict=True):
-            for axes, score in zip(pair_of_axes, ("r_at_1", "anr"), strict=True):
-                for number, drive in enumerate(drives):
-                    at = np.arange(len(labels)) + (number - (len(drives) - 1) / 2) * wide
-                    mine, colour = _at_pairs(rows, labels, method=method, library=drive), _DRIVES[number % len(_DRIVES)]
-                    _bars(axes, at, mine, score, 0.92 * wide, color=colour, label=as_text(f"from {drive}"))
-                    if score == "r_at_1":
-                        marks = [{"map": "M", "query": "Q"}.get(row["from"], "–") for row in mine]
-                        _annotate(axes, at, mine, marks, 2, 7)
+            some = [row for row in rows if row["method"] == method]
+            _grouped_bars(list(pair_of_axes), some, labels, "library", styles, lambda row: marks.get(row["from"], "–"))
             pair_of_axes[0].set(ylabel=f"{as_text(method)}\nR@1", ylim=(0, 1.0))
             _rank_axis(pair_of_axes[1], [row["anr"] for row in rows], from_zero=True)
             pair_of_axes[1].set_ylabel(f"{as_text(method)}\nANR in %")
@@ -247,7 +238,7 @@ CHARTS = {
     "bits": draw_bits,
     "ablations": draw_ablations,
 }
-"""What draws the experiment of that name."""
+"""Drawing function of each experiment."""
 
 
 def _unique(rows: list[Found], name: str) -> list[Any]:
@@ -258,23 +249,28 @@ def _pair_labels(rows: list[Found]) -> list[str]:
     return list(dict.fromkeys(pair_label(row) for row in rows))
 
 
-def _at_pairs(rows: list[Found], labels: list[str], **wanted: str) -> list[Found]:
-    """The row of each pair of drives that has these values."""
-    some = [row for row in rows if all(row[name] == value for name, value in wanted.items())]
-    return [next(row for row in some if pair_label(row) == label) for label in labels]
-
-
-def _bars(axes: Axes, at: Any, rows: list[Found], score: str, width: float, **style: Any) -> None:
-    """The mean over seeds of each row, with a line to the worst."""
-    mean = np.array([row[score] for row in rows])
-    axes.bar(at, mean, width, **style)
-    axes.vlines(at, mean, [row[f"{score}_worst"] for row in rows], color="black", linewidth=1.0)
-
-
-def _annotate(axes: Axes, at: Any, rows: list[Found], marks: list[str], above: int, size: float) -> None:
-    for x, row, mark in zip(at, rows, marks, strict=True):
-        axes.annotate(mark, (x, row["r_at_1"]), (0, above), textcoords="offset points", ha="center", fontsize=size,
-                      color="#333333")  # fmt: skip
+def _grouped_bars(
+    axes: Sequence[Axes],
+    rows: list[Found],
+    labels: list[str],
+    by: str,
+    styles: dict[str, tuple[str, str]],
+    mark: Callable[[Found], str],
+) -> None:
+    """R@1 and ANR on axes of their own: for each pair of drives a bar for every value of the column `by`, with its
+    colour and label in `styles`. Bars are means over seeds, with a line to the worst and a mark above R@1."""
+    wide = 0.82 / len(styles)
+    for number, (value, (colour, name)) in enumerate(styles.items()):
+        at = np.arange(len(labels)) + (number - (len(styles) - 1) / 2) * wide
+        found = {pair_label(row): row for row in rows if row[by] == value}
+        some = [found[label] for label in labels]
+        for one, score in zip(axes, ("r_at_1", "anr"), strict=True):
+            mean = np.array([row[score] for row in some])
+            one.bar(at, mean, 0.92 * wide, color=colour, label=name)
+            one.vlines(at, mean, [row[f"{score}_worst"] for row in some], color="black", linewidth=1.0)
+        for x, row in zip(at, some, strict=True):
+            axes[0].annotate(mark(row), (x, row["r_at_1"]), (0, 2), textcoords="offset points", ha="center",
+                             fontsize=6, color="#333333")  # fmt: skip
 
 
 def _rank_axis(axes: Axes, values: list[float], from_zero: bool = False) -> None:

@@ -20,7 +20,8 @@ from vplog.evaluate import retrieval
 from vplog.execution.execution import Execution
 from vplog.places.library_files import references_hash
 from vplog.places.reference_choice import LibrarySettings, choose
-from vplog.results.run_record import canonical_json, read_run_json, write_run_json
+from vplog.results.run_record import read_run_json, write_run_json
+from vplog.storage.json_records import canonical_json
 
 if TYPE_CHECKING:
     from vplog.benchmark.feature_cache import FeatureFolder

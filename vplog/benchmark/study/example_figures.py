@@ -12,7 +12,7 @@ import numpy as np
 from vplog.benchmark.study.charts import explain
 from vplog.benchmark.study.experiments import StudyOptions, box_methods
 from vplog.data import Boxes, Bytes, Floats
-from vplog.figures.canvas import as_text, saved_figure
+from vplog.run.figures.canvas import as_text, saved_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -187,12 +187,11 @@ def _draw_references(bench: Bench, state: BoxState, use: _ReferenceUse, out: Pat
                 _show(axes, state.references[reference].image)
                 corners = np.concatenate(use.boxes[reference]) if use.boxes[reference] else np.zeros((0, 4))
                 corners = corners[~np.isnan(corners).any(axis=-1)]
-                image = state.references[reference].image
-                _overlay(axes, image, _coverage(corners))
+                _overlay(axes, _coverage(corners))
                 kinds, often = np.unique(corners, axis=0, return_counts=True)
                 for box, times in zip(kinds, often, strict=True):
                     alpha = max(float(times) / int(often.max()), 0.06)
-                    _box(axes, image, box, colour, alpha=alpha, width=1.0)
+                    _box(axes, box, colour, alpha=alpha, width=1.0)
                 text = f"{word}: {count[reference]} of {images} images, {len(corners)} boxes"
                 axes.set_title(text, fontsize=8, color=colour)
         explain(
@@ -218,21 +217,19 @@ def _draw_example(
         sides = ((query, mine, "query"), (match, other, "true map frame"))
         for line, ((drive, row, _), boxes, role) in enumerate(sides):
             axes = grid[line, 0]
-            image = bench.images(drive, [row])[0]
-            _show(axes, image)
-            _windows(axes, image, state.windows(0))
+            _show(axes, bench.images(drive, [row])[0])
+            _windows(axes, state.windows(0))
             axes.set_title(
                 as_text(f"{role}: {bench.names[drive]}, frame {int(bench.traversal(drive).frames[row])}"), fontsize=8.5
             )
             features = bench.traversal(drive).store[row]
             for column, j in enumerate(chosen, start=1):
                 reference = int(mine.references[j])
-                picture = state.references[reference].image
-                _show(grid[line, column], picture)
-                _overlay(grid[line, column], picture, state.voting_map(features, reference))
+                _show(grid[line, column], state.references[reference].image)
+                _overlay(grid[line, column], state.voting_map(features, reference))
                 rank = np.flatnonzero(boxes.references == reference)
                 if len(rank):
-                    _coloured(grid[line, column], picture, boxes, int(rank[0]))
+                    _coloured(grid[line, column], boxes.corners[rank[0]])
                     text = f"reference {reference}, no. {int(rank[0]) + 1} of {role.split()[-1]}"
                 else:
                     itself = state.references[reference].stamp_ns == int(bench.traversal(drive).stamp_ns[row])
@@ -290,14 +287,13 @@ def _draw_sequence(
         axes.tick_params(axis="x", length=0)
         close_ups = shown[:3]
         for axes, reference in zip(np.atleast_1d(below.subplots(1, max(len(close_ups), 1))), close_ups, strict=False):
-            image = state.references[reference].image
-            _show(axes, image)
+            _show(axes, state.references[reference].image)
             drawn_at: dict[tuple[float, ...], int] = {}
             for boxes, colour in zip(run, colours, strict=True):
                 at = np.flatnonzero(boxes.references == reference)
                 corners = boxes.corners[int(at[0]), middle] if len(at) else np.full(4, np.nan)
                 if not np.isnan(corners).any():
-                    _box(axes, image, _inside(corners, drawn_at), colour, width=1.6)
+                    _box(axes, _inside(corners, drawn_at), colour, width=1.6)
             axes.set_title(f"reference {reference}: box of the middle window, frame by frame", fontsize=8.5)
         explain(
             figure,
@@ -310,20 +306,19 @@ def _draw_sequence(
 
 
 def _show(axes: Axes, image: Bytes) -> None:
-    axes.imshow(image, cmap="gray", vmin=0, vmax=255, interpolation="antialiased")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.set_xlim(-0.5, image.shape[1] - 0.5)
-    axes.set_ylim(image.shape[0] - 0.5, -0.5)
-
-
-def _overlay(axes: Axes, image: Bytes, votes: Floats) -> None:
+    """The image, in shares of its sides."""
     height, width = image.shape
     axes.imshow(
+        image, cmap="gray", vmin=0, vmax=255, interpolation="antialiased", extent=(0, 1, 1, 0), aspect=height / width
+    )
+    axes.set(xticks=[], yticks=[], xlim=(0, 1), ylim=(1, 0))
+
+
+def _overlay(axes: Axes, votes: Floats) -> None:
+    axes.imshow(
         votes, cmap="inferno", vmin=0, vmax=1, alpha=0.15 + 0.5 * np.sqrt(votes), interpolation="nearest",
-        extent=(-0.5, width - 0.5, height - 0.5, -0.5), aspect="auto",
+        extent=(0, 1, 1, 0), aspect=axes.get_aspect(),
     )  # fmt: skip
-    axes.set_aspect("equal")
 
 
 def _coverage(corners: Floats) -> Floats:
@@ -335,11 +330,10 @@ def _coverage(corners: Floats) -> Floats:
     return cover / max(float(cover.max(initial=0.0)), 1.0)
 
 
-def _box(axes: Axes, image: Bytes, corners: Floats, colour: Any, alpha: float = 1.0, width: float = 1.5) -> None:
+def _box(axes: Axes, corners: Floats, colour: Any, alpha: float = 1.0, width: float = 1.5) -> None:
     from matplotlib.patches import Rectangle
 
-    tall, wide = image.shape
-    x0, y0, x1, y1 = corners * np.array([wide, tall, wide, tall]) - 0.5
+    x0, y0, x1, y1 = corners
     axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=width, alpha=alpha))
 
 
@@ -349,21 +343,19 @@ def _window_colours(count: int) -> list[Any]:
     return [colormaps["hsv"](number / count) for number in range(count)]
 
 
-def _windows(axes: Axes, image: Bytes, windows: Floats) -> None:
+def _windows(axes: Axes, windows: Floats) -> None:
     """A tile of its colour at the middle of each window, which themselves overlap."""
     for window, colour in zip(windows, _window_colours(len(windows)), strict=True):
         middle, extent = (window[:2] + window[2:]) / 2, (window[2:] - window[:2]) / 6
-        _box(axes, image, np.concatenate([middle - extent, middle + extent]), colour, width=2.2)
+        _box(axes, np.concatenate([middle - extent, middle + extent]), colour, width=2.2)
 
 
-def _coloured(axes: Axes, image: Bytes, boxes: Boxes, rank: int) -> None:
-    """Boxes in the colours of their windows; those in one spot are drawn inside each other."""
+def _coloured(axes: Axes, corners: Floats) -> None:
+    """Boxes (I, 4) in the colours of their windows; those in one spot are drawn inside each other."""
     drawn_at: dict[tuple[float, ...], int] = {}
-    colours = _window_colours(boxes.corners.shape[1])
-    for corners, colour in zip(boxes.corners[rank], colours, strict=True):
-        if np.isnan(corners).any():
-            continue
-        _box(axes, image, _inside(corners, drawn_at), colour)
+    for box, colour in zip(corners, _window_colours(len(corners)), strict=True):
+        if not np.isnan(box).any():
+            _box(axes, _inside(box, drawn_at), colour)
 
 
 def _inside(corners: Floats, drawn_at: dict[tuple[float, ...], int]) -> Floats:

@@ -35,11 +35,11 @@ class Ablation:
     """One departure from the paper, undone by itself."""
 
     name: str
-    """What is there without it, in a few words."""
+    """Variant without it, in a few words."""
     assignments: tuple[str, ...]
     """Assignments of settings, as `--methods bobb:setting=value` takes them."""
     why: str
-    """What the idea is for, in one sentence."""
+    """Purpose of the idea, in one sentence."""
 
     @property
     def method(self) -> str:

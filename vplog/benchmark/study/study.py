@@ -32,9 +32,10 @@ from vplog.cache.input_hashes import hash_inputs
 from vplog.errors import ResultError, SettingsError, TruthError, nearest
 from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, open_truth
 from vplog.execution.execution import Execution, logged_warnings
-from vplog.results.run_record import canonical_json, plain, read_run_json, write_run_json
-from vplog.results.staging import staged
+from vplog.results.run_record import read_run_json, write_run_json
+from vplog.results.staging import check_contents, staged
 from vplog.storage.folders import check_regular
+from vplog.storage.json_records import canonical_json, plain
 from vplog.storage.urls import shown
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ _TWO_DRIVES = {
     "library": "which drive the library comes from",
     "conditions": "a change of condition between drives",
 }
-"""What these experiments need two drives for."""
+"""Subject of the experiments that need two drives."""
 _SCORES = ("vplog.benchmark.study.evaluation_store", "vplog.benchmark.recogniser_specs")
 """Modules that the scores of an evaluation depend on, with all that these import."""
 
@@ -91,8 +92,8 @@ def study(
             "min_gap": min_gap,
             "truth_hash": _truth_hash(truth),
         }
-        kept = options.cache.open() or scratch
-        folders = [FeatureFolder.of(kept, path, topics, pipeline.features) for path in drives]
+        cached = options.cache.open() or scratch
+        folders = [FeatureFolder.of(cached, path, topics, pipeline.features) for path in drives]
         bench = Bench(
             names, opened, hashes, recognisers, known, _covered(known, opened), pipeline, min_gap,
             {**common, "code": code_of(*_SCORES)}, out / "trials.json", scratch, folders, execution,
@@ -174,9 +175,7 @@ def _finished(folder: Path, inputs: str) -> dict[str, Any]:
 def _figures_in(out: Path) -> list[str]:
     """Results of an earlier study in `out`, which a new one replaces. Raises SettingsError where it holds other
     things."""
-    there = {file.name for file in out.iterdir() if not file.name.startswith(".")}
-    if there and not there & {"study.json", "trials.json"}:
-        raise SettingsError(f"{out} is a folder with other things in it, not a study. Choose another with -o.")
+    check_contents(out, "a study", any((out / name).exists() for name in ("study.json", "trials.json")))
     check_regular(out)
     return [escape(file) for _, one in _experiments(_read(out)) for file in one["figures"]]
 

@@ -20,18 +20,14 @@ from vplog.logs.calibrations.camera import (
     size_of,
     text_of,
 )
+from vplog.logs.cameras import lens_of
 from vplog.logs.messages.records import CalibrationMessage
 
 if TYPE_CHECKING:
     from vplog.data import Floats
 
-_MODELS = {
-    "radtan": "plumb_bob", "radtan4": "plumb_bob", "radtan5": "plumb_bob", "radial-tangential": "plumb_bob",
-    "radtan8": "rational_polynomial", "equidistant": "equidistant", "equid4": "equidistant", "none": "",
-}  # fmt: skip
-"""Kalibr's, EuRoC's and VSLAM-LAB's names of distortion models, and ROS's."""
-_FISHEYE = ("kannalabrandt8", "fisheye", "equidistant", "opencv_fisheye")
-"""Camera models of ORB-SLAM's settings whose k1 to k4 are those of a fisheye, in lower case."""
+_VSLAM_LAB = {"camera_model": "cam_model", "resolution": "image_dimension", "distortion_model": "distortion_type"}
+"""VSLAM-LAB's names of what Kalibr has, by Kalibr's."""
 _SECTION = re.compile(r"(Camera\d?)\.fx")
 
 
@@ -108,20 +104,19 @@ def _intrinsics(tree: dict) -> CalibrationMessage:
 
 
 def _model(name: Any) -> str:
-    if not isinstance(name, str) or name not in _MODELS:
-        raise BadCalibrationError(f"distortion_model {reprlib.repr(name)[:40]} is none of {', '.join(_MODELS)}")
-    return _MODELS[name]
+    lens = lens_of(name) if isinstance(name, str) else None
+    if lens is None and name != "none":
+        raise BadCalibrationError(
+            f"distortion_model {reprlib.repr(name)[:40]} is none of radtan, radtan8, equidistant, fisheye, none"
+        )
+    return lens or ""
 
 
 def _listed(part: dict) -> CalibratedCamera:
     """A camera of VSLAM-LAB's calibration.yaml."""
-    if part.get("cam_model", "pinhole") != "pinhole":
-        raise BadCalibrationError(f"cam_model {reprlib.repr(part['cam_model'])[:40]} is not supported; pinhole is")
-    focal, centre = (numbers_of(part.get(name), 2) for name in ("focal_length", "principal_point"))
-    width, height = numbers_of(part.get("image_dimension", [0, 0]), 2)
-    lens = numbers_of(part.get("distortion_coefficients", []), None)
-    model = _model(part.get("distortion_type", "none"))
-    calibration = pinhole(focal, centre, (size_of(width), size_of(height)), model, lens)
+    focal, centre = (numbers_of(part.get(name), 2).tolist() for name in ("focal_length", "principal_point"))
+    named = {kalibrs: part[own] for kalibrs, own in _VSLAM_LAB.items() if own in part}
+    calibration = _intrinsics(part | named | {"intrinsics": [*focal, *centre]})
     placed = rigid_of(part["T_BS"]) if "T_BS" in part else None
     per_m = float(numbers_of([part["depth_factor"]], 1)[0]) if "depth_factor" in part else None
     return CalibratedCamera(text_of(part.get("cam_name")), "", calibration, None, placed, per_m)
@@ -138,8 +133,8 @@ def _section(tree: dict, name: str) -> CalibrationMessage:
     def numbers(names: str) -> Floats:
         return numbers_of([tree.get(f"{name}.{one}", tree.get(f"Camera.{one}", 0.0)) for one in names.split()], None)
 
-    kind = text_of(tree.get("Camera.type", tree.get(f"{name}.model"))).lower()
-    model, lens = ("equidistant", "k1 k2 k3 k4") if kind in _FISHEYE else ("plumb_bob", "k1 k2 p1 p2 k3")
+    kind = text_of(tree.get("Camera.type", tree.get(f"{name}.model")))
+    model, lens = ("equidistant", "k1 k2 k3 k4") if lens_of(kind) == "equidistant" else ("plumb_bob", "k1 k2 p1 p2 k3")
     width, height = np.maximum(numbers("width height"), numbers("w h"))
     size = size_of(float(width)), size_of(float(height))
     return pinhole(numbers("fx fy"), numbers("cx cy"), size, model, numbers(lens))

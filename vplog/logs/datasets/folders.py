@@ -16,6 +16,9 @@ def below(path: Path) -> list[Path]:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """The images of a folder in natural order; none where there is no such folder."""
+    """The images of a folder in natural order, and files that are only named like them; none where there is no such
+    folder."""
     files = sorted(folder.iterdir(), key=lambda file: natural_order(file.name)) if folder.is_dir() else []
-    return [file for file in files if file.is_file() and is_image(file)]
+    files = [file for file in files if file.is_file() and not file.name.startswith(".")]
+    endings = {file.suffix for file in files if file.suffix and is_image(file)}
+    return [file for file in files if file.suffix in endings or is_image(file)]

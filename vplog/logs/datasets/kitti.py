@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 _CAMERAS = ("image_0", "image_1", "image_2", "image_3")
 """Grey left and right, colour left and right."""
-
-
 _FARTHEST_M, _ROTATED = 1e9, 0.1
 """m beyond which a number is damage, and the least that some entry of a rotation has: three make a unit row."""
 
@@ -47,19 +45,25 @@ def read(path: Path) -> DataSet:
         files = image_files(path / name)
         if rows := [int(file.stem) for file in files if file.stem.isdecimal()]:
             if max(rows) >= len(stamp_ns):
-                raise LogError(f"{path / name} has an image {max(rows)}, and times.txt {len(stamp_ns)} rows only.")
+                raise LogError(
+                    f"{path / name} has an image {max(rows)}, and times.txt {len(stamp_ns)} rows only. Copy it again."
+                )
             streams += camera_streams(name, stamp_ns[rows], files, cameras.get(name))
-    return DataSet("kitti", streams, _truth(path, stamp_ns))
+    return DataSet("kitti", streams, *_truth(path, stamp_ns))
 
 
-def _truth(path: Path, stamp_ns: Ints) -> Trajectory | None:
-    """poses/NN.txt beside the sequences: rows of world_from_camera (3, 4), one for each image."""
+def _truth(path: Path, stamp_ns: Ints) -> tuple[Trajectory | None, list[str]]:
+    """poses/NN.txt beside the sequences: rows of world_from_camera (3, 4), one for each image; those without a pose are
+    left out. And what is to be said of it."""
     file = path.parent.parent / "poses" / f"{path.resolve().name}.txt"
     if not file.is_file():
-        return None
-    rows = rows_of(file, 12)[: len(stamp_ns)]
-    values = numbers_of(file, rows, 0, 12).reshape(-1, 3, 4)
-    if not (np.abs(values) < _FARTHEST_M).all() or (np.abs(values[:, :, :3]).max((1, 2)) < _ROTATED).any():
-        raise LogError(f"{file} holds a row that is no pose. Copy the data set again.")
-    u, _, v = np.linalg.svd(values[:, :, :3])  # the nearest rotations: they have seven digits
-    return Trajectory(stamp_ns[: len(values)], se3.pose(u @ v, values[:, :, 3]))
+        return None, []
+    rows, remarks = rows_of(file, 12), []
+    if len(rows) != len(stamp_ns):
+        remarks = [f"{file.name} has {len(rows)} poses, times.txt {len(stamp_ns)} rows: they are of the first images."]
+    values = numbers_of(file, rows[: len(stamp_ns)], 0, 12).reshape(-1, 3, 4)
+    usable = (np.abs(values) < _FARTHEST_M).all((1, 2)) & (np.abs(values[:, :, :3]).max((1, 2)) > _ROTATED)
+    if not usable.any():
+        raise LogError(f"{file} holds no pose. Copy the data set again.")
+    u, _, v = np.linalg.svd(values[usable, :, :3])  # the nearest rotations: they have seven digits
+    return Trajectory(stamp_ns[: len(values)][usable], se3.pose(u @ v, values[usable, :, 3])), remarks

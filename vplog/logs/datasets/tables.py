@@ -47,7 +47,7 @@ def rows_of(path: Path, least: int) -> list[list[str]]:
         if short:
             raise LogError(f"{path}:{short} has too few columns; {least} are expected. Copy the data set again.")
         fields = [field.strip() for field in line.split(",")] if "," in line else line.split()
-        if not found and fields and re.match(r"[A-Za-z]", fields[0]):
+        if not found and fields and re.match(r"(?!nan|inf)[a-z]", fields[0], re.IGNORECASE):
             continue
         short = 0 if len(fields) >= least else number
         if not short:
@@ -101,4 +101,9 @@ def listed_images(path: Path, folder: Path, unit_ns: int, columns: tuple[int, in
     for name in names:
         if name.startswith("/") or ".." in name.split("/"):
             raise LogError(f"{path} names {name[:60]}, which is outside {folder}.")
-    return stamps_ns(path, [row[columns[0]] for row in rows], unit_ns), [folder / name for name in names]
+    files = [folder / name for name in names]
+    if not any(file.is_file() for file in files):
+        raise LogError(
+            f"{path} names {names[0][:60]} and others, none of which is in {folder}. Copy the data set again."
+        )
+    return stamps_ns(path, [row[columns[0]] for row in rows], unit_ns), files

@@ -1,8 +1,8 @@
 """Video in messages: H.264, H.265, VP9 and AV1, one frame a message, decoded from the key frame before it.
 
 Decoding runs forward only: for frames in order of time every packet is decoded at most once, and stretches between key
-frames without a frame of interest not at all. Behind a damaged or missing packet, which VP9 and AV1 do not show,
-nothing is decoded up to the next key frame.
+frames without a frame of interest not at all. Behind a damaged or missing packet nothing is decoded up to the next key
+frame.
 """
 
 from __future__ import annotations
@@ -35,14 +35,27 @@ _CODECS = {
 }
 """What a format's first word holds (`h264`, `libx264`, `hevc_nvenc`): FFmpeg's codec, and the name people know."""
 _NAMES = dict(_CODECS.values())
-_DECODERS = {"av1": "libdav1d"}
-"""FFmpeg's decoder where that of the codec's own name needs hardware: its `av1` is for graphics cards alone."""
+_DECODERS = {"av1": "libdav1d", "vp9": "libvpx-vp9"}
+"""FFmpeg's decoder where that of the codec's own name does not do: its `av1` is for graphics cards alone, and its `vp9`
+shows a wrong picture behind a damaged or missing packet."""
 MAX_PIXELS = 2**25
 """px of a video frame that is decoded: 8K (7680 x 4320); a decoder keeps up to 16 of them."""
 _DELAY = 64
 """Packets behind a frame that are given to the decoder before the frame counts as lost: H.264 and H.265 reorder 16."""
 _BROKEN = "a video packet between its key frame and it is damaged or missing"
 _START_CODE = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
+_SEI, _RECOVERY_POINT = 6, 6
+"""nal_unit_type of supplemental information, and its payloadType that names a picture from which decoding can start
+(ITU-T H.264, table 7-1 and D.2.8): open groups of pictures and gradual refresh have no other after the first."""
+_SEI_LIMIT = 256
+"""Bytes of supplemental information that are looked at."""
+_IDR = re.compile(rb"\x00\x00\x01[\x05\x25\x45\x65]")
+_REFERENCES = 16
+"""Pictures that H.264 keeps at most: so long behind a recovery point may packets release some that came before it,
+which FFmpeg takes for an error."""
+_DELIMITER, _SEQUENCE_HEADER = b"\x12\x00", 1
+"""The unit (OBU) that an AV1 packet may begin with, and the type of the one behind it at a key frame: AV1 bitstream
+5.3."""
 _UNREAD, _PLAIN, _PARAMETERS, _KEY, _WHOLE_KEY = range(5)
 """What a packet is: not read; needs those before it; parameter sets alone; a key frame without, or with them."""
 
@@ -56,8 +69,9 @@ def codec_of(encoding: str) -> str:
 class VideoStream:
     """The frames of one topic, by their row in the order of the file."""
 
-    def __init__(self, codec: str, topic: str, packet: Callable[[int], bytes], count: int) -> None:
-        """`packet` gives the payload of a row, empty where its message is damaged."""
+    def __init__(self, codec: str, topic: str, packet: Callable[[int], bytes | None], count: int) -> None:
+        """`packet` gives the payload of a row, empty where its message is damaged, None where it is the one before it
+        once more."""
         self._codec, self._topic, self._packet, self._count = codec, topic, packet, count
         self._kinds = bytearray(count)
         self._av: Any = None
@@ -67,6 +81,8 @@ class VideoStream:
         """The last row given out: frames behind it that came out since are ready."""
         self._next = 0
         """The first row that the decoder has not been given."""
+        self._settled = 0
+        """The first row whose errors are damage."""
         self._damaged = -1
         """The last row that did not decode: none decodes from there to the next key frame."""
         self._ready: dict[int, VideoFrame] = {}
@@ -97,8 +113,9 @@ class VideoStream:
                 raise BadMessageError(_BROKEN)
             self._restart(key)
         self._run(row)
-        if row not in self._ready and key and self._codec == "hevc":
-            # pictures behind a key frame that are shown before it may refer to what comes before it (RASL, H.265 3.114)
+        if row not in self._ready and key and self._codec in ("h264", "hevc"):
+            # pictures behind a key frame that are shown before it may refer to what comes before it (RASL, H.265
+            # 3.114), and so may those of a gradual refresh
             earlier = self._key_before(key - 1, 0)
             if earlier is not None and not earlier <= self._damaged <= row:
                 self._restart(earlier)
@@ -126,8 +143,10 @@ class VideoStream:
         # a wrong picture is no picture
         self._decoder.options = {"err_detect": "explode", "max_pixels": str(MAX_PIXELS)}
         self._decoder.thread_count = 1  # with more, what damage does is a matter of chance
-        self._next = key
+        self._next = self._settled = key
         self._numbers = FrameNumbers() if self._codec == "h264" else None
+        if self._numbers and not _IDR.search(self._packet(key) or b""):
+            self._settled += _REFERENCES
         if self._kind(key) == _KEY:  # its parameter sets came in a packet of their own
             before = (r for r in range(key - 1, -1, -1) if self._kind(r) in (_PARAMETERS, _WHOLE_KEY))
             if (row := next(before, None)) is not None:
@@ -135,6 +154,8 @@ class VideoStream:
 
     def _feed(self, number: int, row: int) -> None:
         data = self._packet(number)
+        if data is None:
+            return None
         follows = self._numbers is None or self._numbers.follows(data)
         if not data or not follows:  # FFmpeg takes an empty packet for the end
             return self._fail(number, row)
@@ -151,7 +172,8 @@ class VideoStream:
                 if frame.pts is not None and frame.pts >= row:
                     self._ready[frame.pts] = frame
         except self._av.error.FFmpegError:
-            return self._fail(number, row)
+            if number >= self._settled:
+                return self._fail(number, row)
         return None
 
     def _fail(self, number: int, row: int) -> None:
@@ -170,7 +192,7 @@ class VideoStream:
 
     def _kind(self, row: int) -> int:
         if self._kinds[row] == _UNREAD:
-            self._kinds[row] = packet_kind(self._codec, self._packet(row))
+            self._kinds[row] = packet_kind(self._codec, self._packet(row) or b"")
         return self._kinds[row]
 
 
@@ -178,39 +200,38 @@ def packet_kind(codec: str, data: bytes) -> int:
     """Whether decoding can start at a packet: by its first unit that holds a picture."""
     if codec == "vp9":  # uncompressed header, VP9 bitstream 6.2: marker 10, profile, show_existing_frame, frame_type
         return _WHOLE_KEY if data and data[0] >> 6 == 2 and not data[0] & 0b1100 else _PLAIN
-    if codec == "av1":  # a sequence header, OBU type 1, comes with every key frame: AV1 bitstream 7.5
-        return _WHOLE_KEY if 1 in _obu_types(data) else _PLAIN
-    parameters = False
+    if codec == "av1":  # a sequence header comes with every key frame, behind the delimiter: AV1 bitstream 7.5
+        first = data.removeprefix(_DELIMITER)[:1]
+        return _WHOLE_KEY if first and first[0] >> 3 & 0xF == _SEQUENCE_HEADER else _PLAIN
+    parameters = recovery = False
     for unit in _START_CODE.finditer(data):
         header = unit[1][0]
         kind = header & 0x1F if codec == "h264" else header >> 1 & 0x3F
+        if codec == "h264" and kind == _SEI:
+            recovery |= _RECOVERY_POINT in _payload_types(data[unit.end() : unit.end() + _SEI_LIMIT])
         if kind == (7 if codec == "h264" else 33):  # SPS: ITU-T H.264 table 7-1, H.265 table 7-1
             parameters = True
         if (1 <= kind <= 5) if codec == "h264" else kind <= 31:  # a slice
-            key = kind == 5 if codec == "h264" else 16 <= kind <= 21  # IDR; BLA, IDR, CRA
+            key = (kind == 5 or recovery) if codec == "h264" else 16 <= kind <= 21  # IDR; BLA, IDR, CRA
             return (_WHOLE_KEY if parameters else _KEY) if key else _PLAIN
     return _PARAMETERS if parameters else _PLAIN
 
 
-def _obu_types(data: bytes) -> set[int]:
-    """Types of the units of an AV1 packet (AV1 bitstream 5.3), up to the first without a size."""
+def _payload_types(data: bytes) -> set[int]:
+    """Types of the messages of supplemental information (ITU-T H.264, 7.3.2.3.1), up to the first that is cut off."""
     found, position = set(), 0
-    while position < len(data):
-        header = data[position]
-        found.add(header >> 3 & 0xF)
-        position += 2 if header & 4 else 1
-        if not header & 2:
-            break
-        size = 0
-        for i in range(8):  # leb128
+    while position < len(data) and data[position:] != b"\x80":  # not the trailing bits
+        numbers = []
+        for _ in range(2):  # type and size: each byte of 255 goes on
+            start = position
+            while data[position : position + 1] == b"\xff":
+                position += 1
             if position >= len(data):
                 return found
-            byte = data[position]
+            numbers.append(255 * (position - start) + data[position])
             position += 1
-            size |= (byte & 0x7F) << (7 * i)
-            if not byte & 0x80:
-                break
-        position += size
+        found.add(numbers[0])
+        position += numbers[1]
     return found
 
 

@@ -26,6 +26,7 @@ from vplog.results.feature_table import FeatureTable, write_features
 from vplog.run.feature_extraction import Extracted, stored_features
 from vplog.run.provenance import stored_log
 from vplog.run.reextraction import ReextractedFeatures
+from vplog.storage.json_records import plain
 from vplog.storage.remote_path import located
 from vplog.storage.scratch import scratch
 
@@ -138,7 +139,7 @@ class CameraTrust:
 def camera_trust(member: Member, verify: VerifySettings, execution: Execution) -> CameraTrust:
     """The camera of the log, its rotations compared with the odometry's. Raises LogError where the log is gone."""
     camera = opened_log(member).camera()
-    unknown = CameraTrust(run_record.plain(dict(vars(camera))), 0.0)
+    unknown = CameraTrust(plain(dict(vars(camera))), 0.0)
     if camera.matrix is None:
         return unknown
     with opened_drive(member, unknown, verify, execution) as (drive, fetch):

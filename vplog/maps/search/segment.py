@@ -26,7 +26,7 @@ from pydantic import BaseModel, Field, ValidationError
 from vplog.data import Bytes, Ints
 from vplog.errors import ResultError
 from vplog.places.code_search import MOST_ROWS, CodeLists, check_lists
-from vplog.results.run_record import canonical_json
+from vplog.storage.json_records import canonical_json
 from vplog.storage.parquet_limits import check_file
 from vplog.storage.scratch import replacing
 

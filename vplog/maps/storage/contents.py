@@ -216,12 +216,25 @@ class Store:
                 (self.root / "removed.json").unlink()
 
     def failures(self) -> dict[str, dict[str, Any]]:
-        """Log and error of each drive that failed when it was last tried, by ID."""
+        """Log and error of each drive that failed when it was last tried, by ID; none where the record is damaged."""
+        return self._failures()[0]
+
+    @property
+    def failures_damage(self) -> str:
+        """Why it is not known what failed; empty where it is."""
+        return self._failures()[1]
+
+    def _failures(self) -> tuple[dict[str, dict[str, Any]], str]:
         path = self.root / "failures.json"
-        found = run_record.read_run_json(path) if path.exists() else {}
+        try:
+            found = run_record.read_run_json(path) if path.exists() else {}
+        except NewerError:
+            raise
+        except ResultError:
+            found = {"": {}}
         if any(not isinstance(one, dict) or not isinstance(one.get("error"), str) for one in found.values()):
-            raise ResultError(f"{path} is damaged. Move it out of the map: the next batch tries what failed again.")
-        return found
+            return {}, f"{path} is damaged, so it is not known what failed. The next batch writes it again."
+        return found, ""
 
     def head(self) -> Head:
         """map.json. Raises ResultError where the folder is no map, or one of another version."""

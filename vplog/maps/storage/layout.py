@@ -17,6 +17,7 @@ from urllib.parse import quote
 from vplog.cache.code_hash import code_of
 from vplog.errors import NewerError, ResultError
 from vplog.results import run_record, tables
+from vplog.storage.json_records import canonical_json, plain
 
 FORMAT = run_record.FORMAT
 """Version of this layout. A reader refuses a newer one."""
@@ -73,7 +74,7 @@ def checked_record(record: dict[str, Any], folder: Path) -> dict[str, Any]:
 def write_changed(path: Path, record: dict[str, Any], checksum: bool = True) -> bool:
     """Write a record; False where the file holds it already, which is left as it is. Raises ResultError."""
     try:
-        if path.is_file() and run_record.read_run_json(path) == run_record.plain(record):
+        if path.is_file() and run_record.read_run_json(path) == plain(record):
             return False
     except NewerError:
         raise
@@ -108,10 +109,10 @@ def drive_names(names: list[str], logs: list[str], known: dict[str, dict[str, An
     for field, given in (("log", logs), ("inputs", inputs)):
         places: dict[str, list[str]] = {}
         for drive, record in known.items():
-            places.setdefault(run_record.canonical_json(record[field]), []).append(drive)
+            places.setdefault(canonical_json(record[field]), []).append(drive)
         for at, name in enumerate(names):
             own = re.compile(re.escape(name) + r"(-\d+)?")
-            found = places.get(run_record.canonical_json(given[at]), [])
+            found = places.get(canonical_json(given[at]), [])
             for drive in sorted(found, key=lambda drive: known[drive]["inputs"] != inputs[at]):
                 if at not in result and drive not in taken and own.fullmatch(drive):
                     result[at] = drive
@@ -162,4 +163,4 @@ def code_hash() -> str:
 
 def key_of(made_from: dict[str, Any]) -> str:
     """sha256 over all that a drive's results depend on."""
-    return hashlib.sha256(run_record.canonical_json(made_from).encode()).hexdigest()
+    return hashlib.sha256(canonical_json(made_from).encode()).hexdigest()

@@ -33,8 +33,8 @@ from vplog.errors import NewerError, ResultError
 from vplog.maps.storage import objects
 from vplog.maps.storage.damage import DamagedDriveError, UnreachableError
 from vplog.maps.storage.layout import ADD_AGAIN, HASH, TABLES, checked_record, folder_name
-from vplog.results import run_record
 from vplog.storage.folders import is_below
+from vplog.storage.json_records import has_checksum
 from vplog.storage.remote_path import RemotePath, names_below, reason
 
 if TYPE_CHECKING:
@@ -317,7 +317,7 @@ def checked_manifest(data: bytes, place: RemotePath) -> dict[str, Any]:
     """A manifest whose names stay within the map. Raises ResultError."""
     try:
         manifest = json.loads(data)
-        sound = run_record.has_checksum(manifest) and all(map(is_below, _Manifest.model_validate(manifest).files))
+        sound = has_checksum(manifest) and all(map(is_below, _Manifest.model_validate(manifest).files))
     except (ValueError, TypeError, AttributeError, RecursionError):
         sound, manifest = False, {}
     if not sound:

@@ -19,6 +19,7 @@ from vplog.maps.storage import objects
 from vplog.maps.storage.layout import RUN_TABLES, TABLES, folder_name, sha256_of
 from vplog.maps.storage.remote_map import Mirror, store_errors
 from vplog.results import run_record
+from vplog.storage.json_records import with_checksum
 from vplog.storage.remote_path import RemotePath, names_below
 from vplog.storage.scratch import files_in
 
@@ -148,7 +149,7 @@ def write_json(mirror: Mirror, name: str) -> None:
 
 def put_json(place: RemotePath, record: dict[str, Any]) -> None:
     """Write a record with its checksum. Raises OSError."""
-    text = json.dumps(run_record.with_checksum(record), ensure_ascii=False, allow_nan=False) + "\n"
+    text = json.dumps(with_checksum(record), ensure_ascii=False, allow_nan=False) + "\n"
     objects.put(place, text.encode())
 
 

@@ -32,7 +32,7 @@ class Chart:
     """An SVG picture."""
 
     label: str
-    """What it shows, for who cannot see it."""
+    """Text alternative, for screen readers."""
     paths: list[tuple[str, str]]
     """Classes and data of each path, in the order they are painted."""
     texts: list[Label]
@@ -46,7 +46,7 @@ def subsampled(rows: NDArray[Any], most: int) -> NDArray[Any]:
 
 
 def map_view(points: Floats) -> tuple[Floats, str]:
-    """(2, 3) from the world to the right and up of the map, and what that is in words.
+    """(2, 3) from the world to the right and up of the map, and its axes in words.
 
     From above where the ground is flat, else without the shortest axis; the longer of both goes to the right, which
     turns the map by 90 degrees and never mirrors it.
@@ -93,11 +93,32 @@ def histogram(above: Floats, below: Floats, label: str, thresholds: Sequence[tup
 
 def curves(named: Sequence[tuple[str, Floats]]) -> Chart:
     """Precision (P, second column) over recall (first), each named curve with its class."""
+    return _lines(named, "precision over recall", (0.0, 1.0), "recall", (0.0, 1.0), "precision")
+
+
+def over_time(lines: Sequence[tuple[str, Floats, Floats]], label: str, end_s: float) -> Chart | None:
+    """Lines by class (`dot` for single values), times in s and values (P,), with gaps at NaN; None without a value."""
+    values = np.concatenate([values for _, _, values in lines])
+    if not np.isfinite(values).any():
+        return None
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    named = [(kind, np.column_stack([times, values])) for kind, times, values in lines]
+    return _lines(named, label, (0.0, end_s), "seconds into the drive", (low, high if high > low else low + 1.0), "")
+
+
+def _lines(
+    named: Sequence[tuple[str, Floats]], label: str, x: tuple[float, float], x_label: str, y: tuple[float, float],
+    y_label: str,
+) -> Chart:  # fmt: skip
+    low, size = np.array([x[0], y[0]]), np.array([x[1] - x[0], y[1] - y[0]])
     paths = []
     for kind, points in named:
-        x, y = _LEFT + points[:, 0] * _ACROSS, _TOP + (1.0 - points[:, 1]) * _DOWN
-        paths.append((f"track {kind}", _line(subsampled(np.stack([x, y], 1), MOST_POINTS))))
-    return _with_axes("precision over recall", paths, [], (0.0, 1.0), "recall", (0.0, 1.0), "precision")
+        across = (subsampled(points[:, :2], MOST_POINTS) - low) / size * [_ACROSS, -_DOWN] + [_LEFT, _TOP + _DOWN]
+        gaps = np.flatnonzero(~np.isfinite(across).all(1))
+        pieces = [piece[np.isfinite(piece).all(1)] for piece in np.split(across, gaps)]
+        draw = _dots if kind.startswith("dot") else _line
+        paths.append((f"track {kind}", "".join(draw(piece) for piece in pieces if len(piece))))
+    return _with_axes(label, paths, [], x, x_label, y, y_label)
 
 
 def columns(values: Sequence[float], label: str, unit: str) -> Chart:
@@ -128,13 +149,11 @@ def _with_axes(
     foot = _HEIGHT - _BOTTOM
     frame = f"M{_LEFT} {_TOP}V{foot}H{_WIDTH - _RIGHT}"
     marks = [
-        _label(_LEFT + share * _ACROSS, foot + 16, "middle" if share < 1.0 else "end", _tick(x, share))
-        for share in (0.0, 0.25, 0.5, 0.75, 1.0)
+        _label(_LEFT + share * _ACROSS, foot + 16, "middle" if share < 0.95 else "end", text)
+        for share, text in round_ticks(x, 6)
     ]
     if y is not None:
-        marks += [
-            _label(_LEFT - 5, foot - share * _DOWN + 2, "end", _tick(y, share)) for share in (0.0, 0.5, 1.0)
-        ]  # fmt: skip
+        marks += [_label(_LEFT - 5, foot - share * _DOWN + 2, "end", text) for share, text in round_ticks(y, 4)]
     marks.append(_label(_LEFT + _ACROSS / 2, _HEIGHT - 8, "middle", x_label))
     marks.append(_label(4, 14, "start", y_label))
     return Chart(label, [*paths, ("axis", frame)], [*texts, *marks])
@@ -144,8 +163,13 @@ def _label(x: float, y: float, anchor: str, words: str) -> Label:
     return f"{x:.1f}", f"{y:.1f}", anchor, words
 
 
-def _tick(ends: tuple[float, float], share: float) -> str:
-    return f"{ends[0] + share * (ends[1] - ends[0]):.3g}"
+def round_ticks(ends: tuple[float, float], most: int) -> list[tuple[float, str]]:
+    """Place (0 to 1) and text of the multiples of 1, 2 or 5 times a power of ten in a range, at most so many."""
+    low, high = ends
+    power = 10.0 ** np.floor(np.log10((high - low) / most))
+    step = next(times * power for times in (1, 2, 5, 10) if (high - low) / (times * power) < most)
+    values = step * np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) + 0.0
+    return [((value - low) / (high - low), f"{value:.6g}") for value in values.tolist()]
 
 
 def _dots(points: Floats) -> str:

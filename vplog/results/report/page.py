@@ -1,4 +1,4 @@
-"""What each section of report.html shows, computed from a finished run."""
+"""Content of each section of report.html, computed from a finished run."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ _MOST_LOSSES = 100
 """Rows of the table of losses; run.json has them all."""
 _MOST_PICTURE_BYTES = 6_000_000
 """Bytes of all pictures together: the page then stays below 10 MB, base64 and table included."""
+_MOST_SIGMA = 10.0
+"""Residuals over time are drawn up to it: those of false closures are often a thousand."""
 _MOST_USED = 6
 """References shown of the most used, and of the least used."""
 _FIGURES = (
@@ -60,11 +62,13 @@ class TruthComparison:
     """By what candidates are ranked: (P, 3) recall, precision and the value there, by falling value."""
     at_place: Bools | None = None
     """(C,) candidates whose two frames show one place."""
+    error_m: Floats | None = None
+    """(N,) distance of each keyframe to the aligned truth, NaN where that does not cover it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Where a run was, before and after."""
+    """Trajectories of a run before and after the solve."""
 
     keyframes: Keyframes
     world_from_body: Floats
@@ -73,7 +77,7 @@ class Tracks:
     """The odometry, laid on the first solved keyframe."""
     after: Trajectory
     found: McapContent
-    """What result.mcap holds beside."""
+    """Pictures, references and fixes in result.mcap."""
     earth: Earth | None
     """Where the trajectory is on earth, None without satellite fixes."""
 
@@ -83,7 +87,7 @@ class Content:
     """A finished run."""
 
     record: dict[str, Any]
-    """What run.json holds."""
+    """Content of run.json."""
     tracks: Tracks
     covariance: Floats
     """(N, 6, 6) of the solved keyframes, NaN where unknown."""
@@ -117,6 +121,7 @@ def page(content: Content) -> str:
         candidates=len(closures),
         examples=examples,
         audit=_audit(content, drawn, [one["row"] for one in examples]),
+        over_time=_over_time(content),
         distributions=_distributions(content),
         references=_references(content),
         stages=_stages(mapping(record.get("stages"))),
@@ -124,7 +129,7 @@ def page(content: Content) -> str:
 
 
 def _tiles(content: Content) -> list[tuple[str, str]]:
-    """The drive in seven numbers, each with what it counts."""
+    """The drive in seven numbers, each with its label."""
     path_m = float(np.linalg.norm(np.diff(content.tracks.after.world_from_body[:, :3, 3], axis=0), axis=1).sum())
     stamps = content.tracks.after.stamp_ns
     totals = mapping(content.record.get("totals"))
@@ -140,11 +145,10 @@ def _tiles(content: Content) -> list[tuple[str, str]]:
 
 
 def _certainty(content: Content) -> list[str]:
-    """Whether the solution is the best there is for the closures kept, and how well keyframes are known."""
+    """The certificate of global optimality, and the uncertainty of the keyframes' positions."""
     found = [str(reason)] if (reason := mapping(content.record.get("certificate")).get("reason")) else []
-    known = content.covariance[np.isfinite(content.covariance).all((1, 2))]
-    if len(known):
-        sigma_m = np.sqrt(np.maximum(np.linalg.eigvalsh(known[:, 3:, 3:])[:, -1], 0.0))
+    sigma_m = _sigma_m(content.covariance)
+    if len(sigma_m := sigma_m[np.isfinite(sigma_m)]):
         to = "where GPS measures them" if content.record.get("gps") else "the first keyframe"
         found.append(
             f"Positions of keyframes relative to {to}, one sigma along the worst axis: median "
@@ -153,8 +157,48 @@ def _certainty(content: Content) -> list[str]:
     return found
 
 
+def _sigma_m(covariance: Floats) -> Floats:
+    """(N,) standard deviation of positions along the worst axis, NaN where unknown."""
+    sigma_m, known = np.full(len(covariance), np.nan), np.isfinite(covariance).all((1, 2))
+    sigma_m[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[known, 3:, 3:])[:, -1], 0.0))
+    return sigma_m
+
+
+def _over_time(content: Content) -> list[tuple[str, charts.Chart]]:
+    """Charts of the drive by its time: height, heading and speed, uncertainty, residuals of closures and error."""
+    tracks, closures, judged = content.tracks, content.closures, content.judged
+    if len(tracks.after.stamp_ns) < 2:
+        return []
+    sample_s, keyframe_s = ((one.stamp_ns - tracks.after.stamp_ns[0]) / 1e9 for one in (tracks.after, tracks.keyframes))
+    both = [("before", tracks.before.world_from_body), ("after", tracks.after.world_from_body)]
+    yaw = [(kind, np.degrees(np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0])))) for kind, poses in both]
+    used, residual = closures.of(*USED), np.minimum(closures.residual_after, _MOST_SIGMA)
+    solved = np.isfinite(residual)
+    dots = [("dot yes", solved & used), ("dot no", solved & ~used)]
+    at_s, error_m = keyframe_s[closures.query], None if judged is None else judged.error_m
+    series = {
+        "height, z in m": [(kind, sample_s, poses[:, 2, 3]) for kind, poses in both],
+        "heading, yaw in degrees": [(kind, sample_s, degrees) for kind, degrees in yaw],
+        "speed in m/s": [("after", *_speed(sample_s, tracks.after.world_from_body[:, :3, 3]))],
+        "position, one sigma in m": [("after", keyframe_s, _sigma_m(content.covariance))],
+        f"residual of closures in sigma, cut at {_MOST_SIGMA:.0f}": [
+            (d, at_s[rows], residual[rows]) for d, rows in dots
+        ],
+        "error of keyframes in m": [] if error_m is None else [("truth", keyframe_s, error_m)],
+    }
+    drawn = [(name, charts.over_time(lines, name, float(sample_s[-1]))) for name, lines in series.items() if lines]
+    return [(name, chart) for name, chart in drawn if chart is not None]
+
+
+def _speed(sample_s: Floats, positions: Floats) -> tuple[Floats, Floats]:
+    """Times and speeds in m/s, over a second at least: from sample to sample the noise of positions is a speed."""
+    times = np.arange(0.0, sample_s[-1], max(1.0, sample_s[-1] / charts.MOST_POINTS))
+    at = np.column_stack([np.interp(times, sample_s, column) for column in positions.T])
+    return times[1:], np.linalg.norm(np.diff(at, axis=0), axis=1) / np.diff(times)
+
+
 def _loss(loss: dict[str, Any], content: Content) -> list[str]:
-    """A row of what could not be read: how much, when, and why."""
+    """A row of the table of losses: messages, times in s, and the reason."""
     start_ns = int(content.tracks.keyframes.stamp_ns[0]) if len(content.tracks.keyframes.stamp_ns) else 0
     ends = [end for span in _list(loss.get("spans_ns")) for end in span]
     when = f"{(min(ends) - start_ns) / 1e9:.1f} to {(max(ends) - start_ns) / 1e9:.1f}" if ends else "-"
@@ -232,13 +276,13 @@ def _examples(content: Content) -> list[dict[str, Any]]:
 
 
 def _audit(content: Content, drawn: dict[str, Any], pictures: list[int]) -> dict[str, Any]:
-    """What the script of the page works on; `pictures` are the rows that have one in the page."""
+    """Data of the page's script; `pictures` are the ledger rows with a picture in the page."""
     closures, log = content.closures, content.record.get("log")
     order = np.lexsort((-closures.score.astype(np.float64), ~closures.of(*USED)))
     command = f"vplog run {shlex.quote(str(log))} -o RUN --decisions decisions.csv"
     return {
         "columns": _columns(content, sorted(order[:_MOST_ROWS].tolist())),
-        "kept": [verdict.value for verdict in USED],
+        "used": [verdict.value for verdict in USED],
         "sentences": {verdict.value: verdict.sentence for verdict in Verdict},
         "stamps": list(map(str, content.tracks.keyframes.stamp_ns.tolist())),  # beyond 2^53, where JavaScript rounds
         "map": drawn,
@@ -268,12 +312,12 @@ def _columns(content: Content, rows: list[int]) -> dict[str, list[Any]]:
 
 
 def _rounded(values: Floats | Any, digits: int) -> list[float | None]:
-    """What JSON can hold: null where a value is not known."""
+    """Values for JSON: null where one is not known."""
     return [round(value, digits) if np.isfinite(value) else None for value in values.astype(np.float64).tolist()]
 
 
 def _distributions(content: Content) -> list[tuple[str, charts.Chart | None]]:
-    """What accepted and rejected candidates differ in, with the thresholds of the settings."""
+    """Distributions of accepted and rejected candidates, with the thresholds of the settings."""
     closures, verify = content.closures, mapping(mapping(content.record.get("settings")).get("verify"))
     metric = mapping(verify.get("metric"))
     taken = closures.of(*USED)

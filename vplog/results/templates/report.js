@@ -1,11 +1,11 @@
 "use strict";
 (() => {
   const $ = (id) => document.getElementById(id), data = JSON.parse($("audit").textContent);
-  const { columns, kept, stamps, thumbnails, pictures, sentences } = data;
+  const { columns, used, stamps, thumbnails, pictures, sentences } = data;
   const count = columns.row.length, names = Object.keys(columns);
-  const isKept = (row) => kept.includes(columns.verdict[row]);
-  const isFalse = (row) => isKept(row) && columns.true?.[row] === "no";
-  const kindOf = (row) => isFalse(row) ? "false" : isKept(row) ? "yes"
+  const isUsed = (row) => used.includes(columns.verdict[row]);
+  const isFalse = (row) => isUsed(row) && columns.true?.[row] === "no";
+  const kindOf = (row) => isFalse(row) ? "false" : isUsed(row) ? "yes"
     : columns.residual_after[row] !== null || columns.verdict[row] === "rejected_by_decision" ? "no" : "before";
 
   // Decisions: by "query,match"; those that the run followed are there from the start
@@ -69,7 +69,7 @@
     for (const value of [decision, ...names.map((name) => columns[name][row])]) {
       const td = document.createElement("td"); td.textContent = value ?? ""; tr.append(td);
     }
-    tr.children[1 + names.indexOf("verdict")].className = isKept(row) ? "accepted" : "rejected";
+    tr.children[1 + names.indexOf("verdict")].className = isUsed(row) ? "accepted" : "rejected";
     return tr;
   };
   const drawLedger = () => {
@@ -82,9 +82,10 @@
 
   // The map: metres to px by `view`; every closure is a dot of constant size at its query
   const canvas = $("map"), layer = document.createElement("canvas"), tip = $("tip"), xy = data.map.keyframes;
-  let view = null, hovered = -1, pen = null;
+  let view = null, fitted = true, hovered = -1, pen = null;
   const place = ([x, y]) => [view.x + x * view.scale, view.y - y * view.scale];
   const fit = () => {
+    fitted = true;
     const all = data.map.paths.flatMap((path) => path.points), width = canvas.clientWidth, height = canvas.clientHeight;
     const low = [0, 1].map((at) => all.reduce((least, p) => Math.min(least, p[at]), Infinity));
     const high = [0, 1].map((at) => all.reduce((most, p) => Math.max(most, p[at]), -Infinity));
@@ -92,6 +93,7 @@
     view = { scale, x: width / 2 - scale * (low[0] + high[0]) / 2, y: height / 2 + scale * (low[1] + high[1]) / 2 };
   };
   const zoom = (factor, x, y) => {
+    fitted = false;
     view = { scale: view.scale * factor, x: x + (view.x - x) * factor, y: y + (view.y - y) * factor };
     drawMap();
   };
@@ -184,7 +186,7 @@
       const apart = (one) => Math.hypot(one.clientX - other.clientX, one.clientY - other.clientY);
       zoom(apart(event) / Math.max(apart(before), 1), other.clientX - left, other.clientY - top);
     } else if (moved > 4) {
-      view.x += event.clientX - before.clientX; view.y += event.clientY - before.clientY; drawMap();
+      fitted = false; view.x += event.clientX - before.clientX; view.y += event.clientY - before.clientY; drawMap();
     }
   });
   const lifted = (event) => {
@@ -203,7 +205,7 @@
     const row = selected, verdict = columns.verdict[row], decision = decisions.get(pairOf(row))?.decision;
     $("closure-title").textContent = "Closure " + columns.row[row] + ": keyframe " + columns.query[row] + " as a return to " + columns.match[row];
     $("closure-verdict").textContent = verdict + ". " + sentences[verdict] + (decision ? " Your decision: " + decision + "." : "");
-    $("closure-verdict").className = isKept(row) ? "accepted" : "rejected";
+    $("closure-verdict").className = isUsed(row) ? "accepted" : "rejected";
     $("closure-numbers").textContent = names.filter((name) => !["row", "verdict", "query", "match"].includes(name) && columns[name][row] !== null)
       .map((name) => name + " " + columns[name][row]).join(", ");
     $("command").value = data.explain + columns.query[row] + ":" + columns.match[row];
@@ -259,7 +261,7 @@
   $("filter").addEventListener("change", order); $("search").addEventListener("input", order); $("colour").addEventListener("change", drawMap);
   for (const [id, factor] of [["zoom-in", 1.5], ["zoom-out", 1 / 1.5]]) $(id).addEventListener("click", () => zoom(factor, canvas.clientWidth / 2, canvas.clientHeight / 2));
   $("fit").addEventListener("click", () => { fit(); drawMap(); });
-  window.addEventListener("resize", () => { drawMap(); drawLedger(); });
+  window.addEventListener("resize", () => { if (fitted) fit(); drawMap(); drawLedger(); });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawMap);
   order();
 })();

@@ -1,11 +1,9 @@
-"""Single pictures, one after the other, in a run or a map that stays open."""
+"""Single images, from files or memory, in a run or a map that stays open."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -15,27 +13,16 @@ from vplog.data import Bytes, Camera, Frame
 from vplog.errors import LogError, SettingsError
 from vplog.execution.execution import Execution
 from vplog.localize.localize import LocalizedPicture, localize_frame
-from vplog.localize.places import Places, opened
 from vplog.storage.remote_path import located
 
+if TYPE_CHECKING:
+    from vplog.localize.places import Places
 
-class Localizer:
-    """An open run or map."""
 
-    def __init__(self, places: Places) -> None:
-        self._places = places
-
-    @classmethod
-    @contextmanager
-    def opened(cls, root: Path) -> Iterator[Self]:
-        """A run folder or a map. Raises VplogError where it is neither."""
-        with opened(root, Execution()) as places:
-            yield cls(places)
-
-    def __call__(self, image: Bytes | Path | str, camera: Camera | Path | str) -> LocalizedPicture:
-        """The pose of a picture: a file, or (H, W) or (H, W, 3) uint8 in red, green, blue; its camera, or a calibration
-        file. Raises LogError where the picture is none or the camera's size is another."""
-        return localize_frame(self._places, _frame(image, camera), Execution())
+def localize_image(places: Places, image: Bytes | Path | str, camera: Camera | Path | str) -> LocalizedPicture:
+    """The pose of an image: a file, or (H, W) or (H, W, 3) uint8 in red, green, blue; its camera, or a calibration
+    file. Raises LogError where the file is no image or the camera's size is another."""
+    return localize_frame(places, _frame(image, camera), Execution())
 
 
 def _frame(image: Bytes | Path | str, camera: Camera | Path | str) -> Frame:

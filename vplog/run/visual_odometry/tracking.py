@@ -13,12 +13,13 @@ from vplog.features.matching import MatchSettings, match_features
 from vplog.features.sift import SiftSettings
 from vplog.geometry import se3
 from vplog.loops import undistort
+from vplog.loops.pose_refinement import Matches
 from vplog.loops.verify_metric import MetricSettings, find_pose, log10_false_alarms, refit
-from vplog.odometry.sensor import follow
+from vplog.run.visual_odometry.sensor import follow
 
 if TYPE_CHECKING:
     from vplog.data import Float32s, Floats, Frame
-    from vplog.odometry.sensor import Points, Sensor
+    from vplog.run.visual_odometry.sensor import Points, Sensor
 
 _CORNERS = 300
 """Points of a frame: RTAB-Map's and VINS' 150 to 1000; more cost time, and hardly sharpen a pose."""
@@ -75,7 +76,7 @@ class Motion:
 
 
 def corners(frame: Frame, taken: Float32s) -> Float32s:
-    """(K, 2) px of corners away from those `taken`, the strongest first: as many as are left to _CORNERS."""
+    """(K, 2) px of corners at a distance from those `taken`, the strongest first: as many as are left to _CORNERS."""
     image = frame.image
     height, width = image.shape
     apart = _SPREAD * np.sqrt(width * height / _CORNERS)
@@ -117,18 +118,16 @@ def rematch(reference: Frame, frame: Frame, sensor: Sensor) -> tuple[Points, Poi
 def solve(reference: Reference, rows: np.ndarray, observed: Points, sensor: Sensor) -> Motion | None:
     """The motion by points `rows` (K,) of the reference, observed in a frame; None where they agree on none."""
     known = np.isfinite(np.column_stack([observed.rays, observed.noise.reshape(-1, 4)]))
-    seen = np.flatnonzero(known.all(axis=1))
-    rows, observed = rows[seen], observed.rows(seen)
+    valid = np.flatnonzero(known.all(axis=1))
+    rows, observed = rows[valid], observed.rows(valid)
     points = reference.points.rows(rows)
     near = _SETTINGS.ransac_px / sensor.focal_px
     found = find_pose(_cloud(points), observed.rays, near, _SETTINGS.ransac_rounds)
     if found is None:
         return None
     xyrho = np.column_stack([points.rays, points.rho])
-    matches = (
-        xyrho, reference.covariance[rows], observed.rays, observed.rho, np.nan_to_num(observed.variance),
-        observed.noise,
-    )  # fmt: skip
+    variance = np.nan_to_num(observed.variance)
+    matches = Matches(xyrho, reference.covariance[rows], observed.rays, observed.noise, observed.rho, variance)
     most = _SETTINGS.max_error_px / sensor.pixel_sigma
     pose, hessian, excess, inlier = refit(se3.inverse(found[0]), found[1], matches, most)
     count, area = int(inlier.sum()), float(sensor.camera.width * sensor.camera.height)

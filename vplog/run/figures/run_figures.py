@@ -9,12 +9,12 @@ import numpy as np
 
 from vplog.data import ACCEPTED, Verdict
 from vplog.errors import ResultError
-from vplog.figures.closure_view import find_agreement, find_boxes
 from vplog.geometry import geodesy, se3
 from vplog.results.collage import FramePanel, ReferencePanel, collage
 from vplog.results.geo import Earth
 from vplog.results.mcap import McapExtras, ReferenceBoxes
 from vplog.results.previews import jpeg, scaled_size, shrink
+from vplog.run.figures.closure_view import find_agreement, find_boxes
 from vplog.stages import BoxState
 
 if TYPE_CHECKING:
@@ -135,7 +135,8 @@ def _draw(
 ) -> Bytes:
     nodes = int(closures.query[row]), int(closures.match[row])
     features = inputs.features(nodes[0]), inputs.features(nodes[1])
-    agreement = find_agreement(*features, _pose_columns(closures, row), inputs.camera, verify)
+    pose, inliers = closures.match_from_query[row], int(closures.inliers[row])
+    agreement = find_agreement(*features, pose, inliers, inputs.camera, verify)
     sides = [np.array([one.width, one.height]) for one in features]
     frames = [
         FramePanel(images[node], f"{name}: keyframe {node}", (points + 0.5) / side)
@@ -162,15 +163,6 @@ def _panels(
                 votes = state.voting_map(one, found.reference)
                 panels.append(ReferencePanel(found.image, f"votes of the {who}", none, none, votes))
     return panels
-
-
-def _pose_columns(closures: Closures, row: int) -> dict[str, Any]:
-    """The row as `find_agreement` takes it."""
-    pose = closures.match_from_query[row]
-    columns: dict[str, Any] = dict.fromkeys(("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
-    if np.isfinite(pose).all():
-        columns = dict(zip(columns, [*pose[:3, 3], *se3.quaternion(pose[None, :3, :3])[0]], strict=True))
-    return {**columns, "inliers": int(closures.inliers[row])}
 
 
 def earth_of(trajectory: Trajectory, gps: Gps | None, solved: dict[str, Any] | None) -> Earth | None:

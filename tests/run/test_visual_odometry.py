@@ -12,8 +12,8 @@ from vplog.data import Frame, Odometry
 from vplog.demo.scene import Scene, make_scene, take_picture
 from vplog.demo.settings import DemoSettings
 from vplog.geometry import se3
-from vplog.odometry.sensor import disparities, follow
-from vplog.odometry.visual import visual_odometry
+from vplog.run.visual_odometry.sensor import disparities, follow
+from vplog.run.visual_odometry.visual import visual_odometry
 
 FRAMES = 20
 BASELINE_M = 0.3

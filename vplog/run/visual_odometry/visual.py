@@ -16,15 +16,15 @@ import numpy as np
 from vplog.data import Odometry
 from vplog.geometry import se3
 from vplog.graph.bundle import Observations, adjust
-from vplog.odometry.sensor import Sensor
-from vplog.odometry.tracking import Reference, corners, track
+from vplog.run.visual_odometry.sensor import Sensor
+from vplog.run.visual_odometry.tracking import Reference, corners, track
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from vplog.data import Camera, Floats, Frame
-    from vplog.odometry.sensor import Points
-    from vplog.odometry.tracking import Motion
+    from vplog.run.visual_odometry.sensor import Points
+    from vplog.run.visual_odometry.tracking import Motion
 
 _WINDOW = 8
 """References that are adjusted together: as libviso's and VINS' 5 to 10; what is older hardly shares a landmark."""
@@ -47,7 +47,7 @@ class _View:
 
     world_from_camera: Floats
     row: int
-    """Of its frame among those with a pose."""
+    """Row of its frame among those with a pose."""
     motion: Floats
     """(6, 6) covariance of the motion since the reference before it."""
 
@@ -131,7 +131,7 @@ class _Tracker:
         self.reference = self._reference(frame)
 
     def _usable(self, frame: Frame, px: np.ndarray) -> Points:
-        """Those of the points that have a ray and a depth."""
+        """The points that have a ray and a depth."""
         points = self.sensor.measure(frame, px)
         return points.rows(np.isfinite(points.rho) & np.isfinite(points.noise).all(axis=(1, 2)))
 

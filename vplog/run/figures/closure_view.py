@@ -53,17 +53,15 @@ class SharedBoxes:
 
 
 def find_agreement(
-    query: Features, match: Features, row: dict[str, Any], camera: Camera, settings: VerifySettings
+    query: Features, match: Features, match_from_query: Floats, inliers: int, camera: Camera, settings: VerifySettings
 ) -> Agreement:
-    """The matches as verification takes them, and those that the closure's pose puts on their epipolar lines.
-
-    Where the ledger has no pose, those of the epipolar geometry with most matches.
-    """
+    """The matches as in verification, and those within the epipolar lines of the closure's pose (4, 4), which has so
+    many inliers; where it is NaN, those of the epipolar geometry with most matches."""
     mine, theirs = match_features(query, match, settings.matching)
     here, there = query.points[mine], match.points[theirs]
-    if row["tx"] is not None and camera.matrix is not None:
-        agrees = _on_epipolar_lines(here, there, row, camera, settings.metric.ransac_px)
-        model = f"the ledger's pose (verification also requires a known position, and counted {row['inliers']})"
+    if np.isfinite(match_from_query).all() and camera.matrix is not None:
+        agrees = _on_epipolar_lines(here, there, match_from_query, camera, settings.metric.ransac_px)
+        model = f"the ledger's pose (verification also requires a known position, and counted {inliers})"
         return Agreement(here, there, agrees, model)
     agrees, by_chance = epipolar_inliers(here, there, query.width, query.height, settings.epipolar)
     if by_chance:
@@ -71,10 +69,8 @@ def find_agreement(
     return Agreement(here, there, agrees, "the epipolar geometry that most agree with")
 
 
-def _on_epipolar_lines(here: Float32s, there: Float32s, row: dict[str, Any], camera: Camera, most_px: float) -> Any:
+def _on_epipolar_lines(here: Float32s, there: Float32s, body: Floats, camera: Camera, most_px: float) -> Any:
     """(K,) bool: by Sampson's distance (Hartley & Zisserman 2004, eq. 11.9), and in front of both cameras."""
-    turn = se3.rotation(np.array([row["qx"], row["qy"], row["qz"], row["qw"]]))
-    body = se3.pose(turn, np.array([row["tx"], row["ty"], row["tz"]]))
     match_from_query = se3.inverse(camera.body_from_camera) @ body @ camera.body_from_camera
     rays = [np.column_stack([undistort.rays(camera, points), np.ones(len(points))]) for points in (here, there)]
     turned = rays[0] @ match_from_query[:3, :3].T
@@ -94,9 +90,8 @@ def _on_epipolar_lines(here: Float32s, there: Float32s, row: dict[str, Any], cam
         square = (across**2).sum(axis=1)
         depth = (np.cross(observed, shift) * across).sum(axis=1), (np.cross(turned, shift) * across).sum(axis=1)
         ahead = (depth[0] > 0) & (depth[1] > 0)
-        far = (
-            square < (most_px / undistort.focal_px(camera)) ** 2
-        )  # parallel within the noise: at infinity, on either side of it
+        # parallel within the noise: at infinity, on either side of it
+        far = square < (most_px / undistort.focal_px(camera)) ** 2
         return (error_px < most_px) & (ahead | far)
 
 

@@ -1,4 +1,4 @@
-"""What one frame of a camera with depth or of a stereo pair measures at its points."""
+"""Measurements of one frame of an RGB-D or stereo camera: rays and inverse depths of its points."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _BACK_PX = 1.0
 _EDGE_SHARE = 0.05
 """Relative difference of the depths around a point above which it lies on an edge, whose depth is either side's."""
 _LEAST_DISPARITY_PX = 0.05
-"""px; what noise makes zero or less is as far away as this says: it still tells the rotation."""
+"""px; noise may make a disparity zero or less. A point at infinity still constrains the rotation."""
 
 
 @dataclass(frozen=True, eq=False)

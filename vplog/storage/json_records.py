@@ -1,0 +1,48 @@
+"""Records as JSON: plain values, one text for each value, and a checksum against damage."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from pathlib import PurePath
+from typing import Any
+
+CHECKSUM = "record_sha256"
+"""Field of a record: sha256 of `canonical_json` of all others. One without it is taken as it is: an older vplog or an
+editor wrote it."""
+
+
+def with_checksum(record: dict[str, Any]) -> dict[str, Any]:
+    """A record as plain values, with its checksum in place of the one that it may have."""
+    record = {name: value for name, value in record.items() if name != CHECKSUM}
+    return {**plain(record), CHECKSUM: _sha256(record)}
+
+
+def has_checksum(record: dict[str, Any]) -> bool:
+    """Whether a record has the checksum in it, which is taken out, or none at all."""
+    return CHECKSUM not in record or record.pop(CHECKSUM) == _sha256(record)
+
+
+def _sha256(record: dict[str, Any]) -> str:
+    return hashlib.sha256(canonical_json(record).encode()).hexdigest()
+
+
+def canonical_json(tree: Any) -> str:
+    """One text per value: sorted keys, no blanks. What a hash or a file header may hold."""
+    return json.dumps(plain(tree), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+
+
+def plain(value: Any) -> Any:
+    """The value with numpy scalars, arrays and paths as JSON has them."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):  # numpy scalars and arrays
+        return plain(value.tolist())
+    if isinstance(value, PurePath):
+        return str(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return None  # JSON has no NaN
+    return value
