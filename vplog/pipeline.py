@@ -11,7 +11,7 @@ from pydantic import model_validator
 from vplog import logs
 from vplog.cache.input_hashes import files_of
 from vplog.cache.steps import Steps
-from vplog.errors import SettingsError, nearest
+from vplog.errors import ResultError, SettingsError, nearest
 from vplog.execution.execution import Execution
 from vplog.features.extractors import FeatureSettings
 from vplog.features.sift import SiftSettings
@@ -123,6 +123,14 @@ def pipeline_from(tree: dict[str, Any], where: str, assignments: Iterable[str] =
     for assignment in assignments:
         tree = override(tree, assignment)
     return Pipeline.read(tree, where, assignments)
+
+
+def recorded_pipeline(folder: Path, record: dict[str, Any]) -> Pipeline:
+    """The settings of a run. Raises ResultError."""
+    try:
+        return Pipeline.read(record.get("settings") or {}, f"{folder}/run.json")
+    except SettingsError as error:
+        raise ResultError(f"{error} The run is of another version of vplog: run it again.") from None
 
 
 def pipeline_schema() -> dict[str, Any]:

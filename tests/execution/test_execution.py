@@ -40,9 +40,11 @@ def test_few_items_are_read_ahead(ahead: int) -> None:
             read += 1
             yield item
 
+    given_out = -1
     for given_out, item in enumerate(Execution(3).map(lambda item: item, items(), ahead)):
         assert item == given_out
         assert read - given_out <= 3 * ahead
+    assert (read, given_out) == (100, 99)
 
 
 def test_libraries_start_no_threads_within_a_worker() -> None:

@@ -145,3 +145,22 @@ def test_every_verb_refuses_in_one_line(verb: str, tmp_path: Path) -> None:
         chosen = [sys.executable, "-m", "vplog", "info", str(folder), "--image-topic", "left_*.png", "--json"]
         found = subprocess.run(chosen, capture_output=True, text=True, check=True)
         assert json.loads(found.stdout)["messages"] == 5
+
+
+@pytest.mark.parametrize("name", ["frame_{}.png", "cam0_{}.png", "{}_left.png", "rgb-{}.color.png"])
+def test_times_in_names_are_read_beside_words(name: str, tmp_path: Path) -> None:
+    stamps = 1_403_715_273_262_142_976 + 50_000_000 * np.arange(5)
+    write(tmp_path / "ns", [name.format(stamp) for stamp in stamps])
+    np.testing.assert_array_equal(logs.open(tmp_path / "ns").stamps(), stamps)
+    write(tmp_path / "s", [name.format(f"{stamp // 10**9}.{stamp % 10**9 // 1000:06}") for stamp in stamps])
+    np.testing.assert_array_equal(logs.open(tmp_path / "s").stamps(), stamps // 1000 * 1000)
+    write(tmp_path / "counted", [name.format(f"{10 * number:06}") for number in range(5)])
+    np.testing.assert_array_equal(logs.open(tmp_path / "counted").stamps(), 100_000_000 * np.arange(5))
+
+
+def test_what_the_system_hides_beside_images_is_none(tmp_path: Path) -> None:
+    write(tmp_path, [f"{number}.png" for number in range(5)])
+    (tmp_path / "._1.png").write_bytes(b"\0\5\x16\7")  # as macOS writes them on other disks
+    log = logs.open(tmp_path)
+    assert len(log.stamps()) == 5
+    assert not log.info().warnings

@@ -141,6 +141,7 @@ def test_boxes_are_the_largest_that_are_allowed(grid: int, share: float, aspects
     if grid * grid * share < 1:
         return
     shapes = rvp.box_shapes(grid, share, tuple(aspects))
+    assert 1 <= len(shapes) <= len(aspects)
     for width, height in shapes.tolist():
         assert 1 <= width <= grid
         assert 1 <= height <= grid

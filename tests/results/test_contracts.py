@@ -15,7 +15,9 @@ SCHEMAS = Path(__file__).parents[2] / "schemas"
 
 
 def test_contracts_in_the_repository_are_those_of_the_code(tmp_path: Path) -> None:
-    for path in write_schemas(tmp_path, pipeline_schema()):
+    written = write_schemas(tmp_path, pipeline_schema())
+    assert {path.name for path in written} == {path.name for path in SCHEMAS.iterdir()}
+    for path in written:
         assert (SCHEMAS / path.name).read_text() == path.read_text(), f"run `vplog schemas`: {path.name} has changed"
 
 

@@ -18,13 +18,13 @@ import cv2
 import numpy as np
 import pytest
 
-from vplog.data import Closures, Verdict
+from vplog.data import USED, Closures, Verdict
 from vplog.evaluate.body_truth import BodyTruth
 from vplog.evaluate.closures import score_closures
 from vplog.evaluate.truth import read_truth
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.results import mcap_read, tables
-from vplog.results.report.charts import round_ticks
+from vplog.results.report.charts import over_time, round_ticks
 from vplog.results.report.page import TruthComparison
 from vplog.results.report.page import page as write_page
 from vplog.results.run_record import read_run_json
@@ -143,13 +143,37 @@ def test_ticks_stand_at_round_numbers(seed: int) -> None:
     most = int(rng.integers(2, 9))
     ticks = round_ticks((low, high), most)
     assert most / 2.5 - 1 <= len(ticks) <= most
-    assert all(-1e-6 <= share <= 1 + 1e-6 for share, _ in ticks)
+    assert all(-1e-6 <= share <= 1 + 1e-6 and text != "-0" for share, text in ticks)
     shares, values = [share for share, _ in ticks], [float(text) for _, text in ticks]
     assert np.allclose(low + np.array(shares) * (high - low), values, atol=1e-5 * max(abs(low), high - low))
     if len(values) > 2:
         steps = np.diff(shares) * (high - low)
         assert float(f"{steps[0]:e}".split("e")[0]) == pytest.approx(float(f"{steps[-1]:e}".split("e")[0]), rel=1e-6)
         assert round(float(f"{steps[0]:.3e}".split("e")[0])) in (1, 2, 5)
+
+
+def test_lines_over_time_have_gaps_where_values_are_unknown() -> None:
+    chart = over_time(
+        [("after", np.arange(7.0), np.array([2.0, 3.0, np.nan, np.nan, 5.0, 4.0, np.nan]))], "height", 7.0
+    )
+    assert chart is not None
+    [(_, line), _] = chart.paths
+    first, second = (np.array(re.findall(r"[\d.]+", piece), float).reshape(-1, 2) for piece in line.split("M")[1:])
+    assert (first[1, 0] - first[0, 0]) * 4 == pytest.approx(second[0, 0] - first[0, 0], abs=0.5)
+    assert first[0, 1] > first[1, 1] > second[1, 1] > second[0, 1]  # down is positive
+    assert over_time([("after", np.arange(3.0), np.full(3, np.nan))], "height", 2.0) is None
+
+
+def test_the_drive_over_time(page: str, finished: Path) -> None:
+    for name in ("Height, z in m", "Heading, yaw in degrees", "Speed in m/s", "Position, one sigma in m"):
+        assert f"<h3>{name}</h3>" in page
+    closures = tables.read_closures(finished / "closures.parquet")
+    dots = re.findall(r'<path class="track dot (yes|no)" d="((?:M[\d. ]+h0){2,})"', page)
+    used = closures.of(*USED)
+    assert {kind: path.count("M") for kind, path in dots}["yes"] == int(
+        np.isfinite(closures.residual_after[used]).sum()
+    )
+    assert "Error of keyframes" not in page
 
 
 def test_warnings_stages_and_thresholds_are_told(page: str, finished: Path) -> None:
@@ -176,6 +200,7 @@ def test_against_the_truth(verb: Verb, finished: Path, drive: Drive, tmp_path: P
     text = (tmp_path / "r.html").read_text()
     assert found["bytes"] == (tmp_path / "r.html").stat().st_size
     assert "Precision and recall" in text
+    assert "<h3>Error of keyframes in m</h3>" in text
     told = ledger(text)
     evaluation = verb("evaluate", finished, "--truth", drive.truth, "--json").json
     assert f"{evaluation['ate_after']['rmse_m']:.3f}" in text

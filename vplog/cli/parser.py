@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 
 STDOUT = Path("-")
+words: list[str] = []
+"""The words of the command line."""
 _ROLES = ("image", "depth", "right", "camera-info", "odometry", "gps", "imu", "mask")
 _MOST = 10**9
 """Largest count an option may have: far above any drive, and whole in every number type."""
@@ -97,7 +99,9 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """The shortest usage, then what is wrong in one line; exit 2."""
         usage, end = self._brief_usage or self._required_usage(), "" if message.endswith((".", "?", "!")) else "."
-        self.exit(2, f"{usage}{self.prog}: error: {without_secrets(message)}{end} All options: {self.prog} --help\n")
+        self.exit(
+            2, f"{usage}{self.prog}: error: {without_secrets(message, words)}{end} All options: {self.prog} --help\n"
+        )
 
     def _required_usage(self) -> str:
         usage = self._get_formatter()

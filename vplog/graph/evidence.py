@@ -1,10 +1,10 @@
 """How well a set of true closures explains all of them: the logarithm of its marginal likelihood.
 
 True closures are measurements of the solved graph; the poses are integrated over (Laplace's approximation, exact where
-the graph is linear), and the residuals may have the tails of Student's t. False ones come in runs, since neighbouring
-keyframes look alike: a run measures a place that is displaced by the same motion, and different runs may share their
-displacement, as where one aisle is taken for the next. So a run of false closures is one accident, and so is a family
-of runs.
+the graph is linear), and some of the residuals may be larger than the noise of the others. False ones come in runs,
+since neighbouring keyframes look alike: a run measures a place that is displaced by the same motion, and different runs
+may share their displacement, as where one aisle is taken for the next. So a run of false closures is one accident, and
+so is a family of runs.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.special import gammaln
 
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed, parts
@@ -41,9 +40,10 @@ _SAMPLE = 200
 """Poses all pairs of which are looked at."""
 _CONCENTRATIONS = (2.0 ** np.arange(-4, 13)).tolist()
 """Concentrations of the Chinese restaurant process of families: from one family to as many as there are runs."""
-_TAILS = np.array([3.0, 5.0, 10.0, 30.0])
-"""Degrees of freedom of Student's t: closures of real front ends err more often by much than a Gaussian has it."""
-_EM_STEPS = 30
+_TAIL = 3.0
+"""Noise of closures that err by much as a multiple of that of the others."""
+_TAIL_SHARES = np.array([0.0, 0.01, 0.02, 0.05, 0.1, 0.2])[:, None]
+"""Shares of them among the true ones, as likely as each other."""
 _LOG_2PI = math.log(2.0 * math.pi)
 _LEAST_SIDE = 0.1
 """Shortest side of the box of places as a share of its longest: a flat drive still has false closures off its plane."""
@@ -99,19 +99,16 @@ def _log_true(factors: Factors, weight: Floats, poses: Floats, true: Ints, room:
 
 
 def log_tails(chi2: Floats, d: int) -> float:
-    """Log of how much likelier residuals of d dimensions, squared (K,), are by Student's t than by a Gaussian.
+    """Log of how much likelier residuals of d dimensions, squared (K,), are where some closures err more than others.
 
-    Either has their own scale, the t by expectation maximisation (Lange, Little and Taylor 1989, section 3), so that
-    only the shape counts; 0 where that gains less than half the log of K, which BIC takes for the degrees of freedom.
+    A share of them, which may be none, has `_TAIL` times the noise: Tukey's contaminated normal distribution (A survey
+    of sampling from contaminated distributions, 1960). The noise stays as it is: residuals below it, as those of
+    closures that nothing checks, tell nothing, and what errs by far more than `_TAIL` times it is not explained.
     """
-    nu, K = _TAILS[:, None], len(chi2)
-    gaussian = -0.5 * d * K * (math.log(max(float(chi2.mean()) / d, 1e-12)) + 1.0 + _LOG_2PI)
-    scale2 = np.full_like(nu, max(float(np.median(chi2)), 1e-12) / d)
-    for _ in range(_EM_STEPS):
-        scale2 = np.maximum(((nu + d) / (nu + chi2 / scale2) * chi2).mean(1, keepdims=True) / d, 1e-12)
-    unit = gammaln(0.5 * (nu + d)) - gammaln(0.5 * nu) - 0.5 * d * np.log(math.pi * nu * scale2)
-    student = (unit - 0.5 * (nu + d) * np.log1p(chi2 / (nu * scale2))).sum(1)
-    return max(float(student.max()) - gaussian - 0.5 * math.log(K), 0.0)
+    wide = 0.5 * chi2 * (1.0 - _TAIL**-2) - d * math.log(_TAIL)
+    with np.errstate(divide="ignore"):
+        gain = np.logaddexp(np.log1p(-_TAIL_SHARES), np.log(_TAIL_SHARES) + wide).sum(1)
+    return float(np.logaddexp.reduce(gain)) - math.log(len(gain))
 
 
 def log_room(graph: PoseGraph, places: Floats) -> float:

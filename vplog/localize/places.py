@@ -28,6 +28,7 @@ from vplog.maps.search.sequences import best_lines
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings
 from vplog.maps.storage.layout import PICTURES, folder_name
+from vplog.pipeline import recorded_pipeline
 from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record, tables
 from vplog.results.landmark_table import LandmarkTable
@@ -37,7 +38,6 @@ from vplog.stages import CodedState, PlaceState
 from vplog.storage.json_records import plain
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.scratch import scratch
-from vplog.verbs.report import recorded_pipeline
 
 if TYPE_CHECKING:
     from vplog.loops.candidate import Drive

@@ -56,12 +56,14 @@ def natural_order(name: str) -> tuple:
 
 
 def stamps_of(names: list[str]) -> list[int] | None:
-    """ns from file stems that are times; None where they count the images.
+    """ns from file stems that are times, or hold one beside words that all have (`frame_1403715273262142976`); None
+    where they count the images.
 
     Times are decimal seconds, or whole s, ms, us or ns that all lie between 1990 and 2100. Others are us or ns since
     some start, as of a machine's boot, where their median step is the period of a camera in one of the two: counters
     go in steps of a few, with leading zeros or without.
     """
+    names = _changing(names)
     if all(re.fullmatch(r"[0-9]{1,10}\.[0-9]{1,9}", name) for name in names):
         parts = [name.split(".") for name in names]
         return [int(whole) * 10**9 + int(fraction.ljust(9, "0")) for whole, fraction in parts]
@@ -75,6 +77,15 @@ def stamps_of(names: list[str]) -> list[int] | None:
         step = statistics.median(b - a for a, b in pairwise(values))
         unit = next((ns for ns in (10**3, 1) if _PERIODS_NS[0] <= step * ns < _PERIODS_NS[1]), 0)
     return [int(name) * unit for name in names] if unit and values[-1] * unit < 2**63 else None
+
+
+def _changing(names: list[str]) -> list[str]:
+    """The one number of each name that is not the same in all; the names where there is none or more change."""
+    parts = [re.split(r"([0-9]+(?:\.[0-9]+)?)", name) for name in names]
+    if len({len(part) for part in parts}) > 1:
+        return names
+    changing = [column for column in zip(*parts, strict=True) if len({*column}) > 1]
+    return list(changing[0]) if len(changing) == 1 else names
 
 
 Group = dict[str, list["Path"]]

@@ -122,20 +122,17 @@ def _log_breaks(odometry: Odometry, stamp_ns: np.ndarray) -> None:
     )  # fmt: skip
 
 
+_ARRAYS = {"stamp_ns": np.int64, "odom_from_body": np.float64, "covariance": np.float64, "breaks": np.int64}
+"""Fields of visual odometry, and their types."""
+
+
 def _plain(odometry: Odometry) -> dict[str, Any]:
-    breaks, covariance = odometry.breaks, odometry.covariance
-    return {
-        "stamp_ns": odometry.stamp_ns.tolist(),
-        "poses": odometry.odom_from_body[:, :3].tolist(),
-        "covariance": None if covariance is None else covariance.tolist(),
-        "breaks": None if breaks is None else breaks.tolist(),
-    }
+    return {name: getattr(odometry, name).tolist() for name in _ARRAYS}
 
 
 def _from_plain(tree: dict[str, Any]) -> Odometry:
-    stamp_ns, top = np.array(tree["stamp_ns"], np.int64), np.array(tree["poses"], np.float64)
-    poses = np.concatenate([top, np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(top), 1, 1))], axis=1)
-    covariance = np.array(tree["covariance"], np.float64)
-    if poses.shape != (len(stamp_ns), 4, 4) or covariance.shape != (len(stamp_ns), 6, 6):
+    arrays: dict[str, Any] = {name: np.array(tree[name], kind) for name, kind in _ARRAYS.items()}
+    count = len(arrays["stamp_ns"])
+    if arrays["odom_from_body"].shape != (count, 4, 4) or arrays["covariance"].shape != (count, 6, 6):
         raise ValueError("poses and covariances do not fit the stamps")
-    return Odometry(stamp_ns, poses, covariance, breaks=np.array(tree["breaks"], np.int64))
+    return Odometry(**arrays)

@@ -13,6 +13,7 @@ from vplog.data import Closures, Keyframes
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
+from vplog.pipeline import recorded_pipeline
 from vplog.results import run_record, tables
 from vplog.run.figures.closure_view import SharedBoxes, find_agreement, find_boxes
 from vplog.run.keyframes import row_of
@@ -20,7 +21,7 @@ from vplog.run.provenance import reopened
 from vplog.stages import BoxState, Log
 from vplog.verbs import explain_text
 from vplog.verbs.explain_figure import View, draw
-from vplog.verbs.report import frames_at, recorded_pipeline, recorded_places
+from vplog.verbs.report import frames_at, recorded_places
 
 if TYPE_CHECKING:
     from vplog.pipeline import Pipeline

@@ -16,12 +16,12 @@ from vplog.data import Bytes, Features, Ints, Structure
 from vplog.features.extraction import describe
 from vplog.features.store import FeatureStore
 from vplog.loops.structure import pairs_to_match, triangulate
+from vplog.pipeline import recorded_pipeline
 from vplog.results import colmap, run_record, tables
 from vplog.results.staging import check_contents, staged
 from vplog.run.provenance import reopened
 from vplog.storage.folders import check_regular, is_below
 from vplog.storage.scratch import files_in, scratch
-from vplog.verbs.report import recorded_pipeline
 
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution

@@ -10,12 +10,12 @@ import numpy as np
 
 from vplog import logs
 from vplog.data import Bytes, Features, Gps, Ints
-from vplog.errors import LibraryError, ResultError, SettingsError, TruthError
+from vplog.errors import LibraryError, ResultError, TruthError
 from vplog.evaluate.closures import closure_sentences
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
 from vplog.geometry import se3
-from vplog.pipeline import Pipeline
+from vplog.pipeline import Pipeline, recorded_pipeline
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.previews import shrink
 from vplog.results.report.page import TruthComparison
@@ -76,6 +76,8 @@ def judge(
     # of the truth only what the drive covers, so that the map is that of the drive
     during = (known.stamp_ns >= keyframes.stamp_ns[0]) & (known.stamp_ns <= keyframes.stamp_ns[-1])
     path = se3.transform(world_from_truth, known.world_from_body[during][:, :3, 3])
+    error_m = np.full(len(keyframes.stamp_ns), np.nan)
+    error_m[at.known] = np.linalg.norm(se3.transform(world_from_truth, true) - solved, axis=1)
     return TruthComparison(
         Path(shown(truth)).name,
         found.record,
@@ -85,6 +87,7 @@ def judge(
         judged.right | judged.wrong,
         judged.curves,
         judged.at_place,
+        error_m,
     )
 
 
@@ -133,11 +136,3 @@ def recorded_places(
                 f"{original(library)} is not the library of the run in {folder}, so its boxes cannot be drawn."
             )
     return state, column
-
-
-def recorded_pipeline(folder: Path, record: dict[str, Any]) -> Pipeline:
-    """The settings of a run. Raises ResultError."""
-    try:
-        return Pipeline.read(record.get("settings") or {}, f"{folder}/run.json")
-    except SettingsError as error:
-        raise ResultError(f"{error} The run is of another version of vplog: run it again.") from None

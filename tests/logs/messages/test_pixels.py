@@ -29,7 +29,8 @@ def raw(encoding: str, pixels: np.ndarray, padding: int = 0, big_endian: bool = 
 
 @pytest.mark.parametrize("padding", [0, 5])
 @pytest.mark.parametrize(
-    ("encoding", "order"), [("rgb8", "RGB"), ("bgr8", "BGR"), ("rgba8", "RGBA"), ("bgra8", "BGRA"), ("8UC3", "BGR")]
+    ("encoding", "order"),
+    [("rgb8", "RGB"), ("bgr8", "BGR"), ("rgba8", "RGBA"), ("bgra8", "BGRA"), ("8UC3", "BGR"), ("8UC4", "BGRA")],
 )
 def test_colours_become_the_same_grey(encoding: str, order: str, padding: int) -> None:
     colour = {c: RNG.integers(0, 256, (7, 9)).astype(np.uint8) for c in "RGBA"}
@@ -82,8 +83,9 @@ def test_low_bits_of_sixteen_are_seen(bits: int) -> None:
     assert np.abs(expected - pixels * 255.0 / 2**bits).max() < 3
     file = cv2.imencode(".png", pixels)[1].tobytes()
     np.testing.assert_array_equal(grey(ImageMessage(0, "", "mono16; png compressed ", file, True)), expected)
-    colour = grey(raw("rgb16", np.stack([pixels] * 3, axis=-1)))
-    np.testing.assert_allclose(colour, expected, atol=1)
+    for encoding in ("rgb16", "bgr16", "16UC3", "rgba16", "bgra16", "16UC4"):
+        colour = grey(raw(encoding, np.stack([pixels] * (4 if "4" in encoding or "a" in encoding else 3), axis=-1)))
+        np.testing.assert_allclose(colour, expected, atol=1)
 
 
 def test_hot_pixels_take_no_greys() -> None:
@@ -142,6 +144,18 @@ def test_depth_in_png() -> None:
         np.testing.assert_allclose(depth[1:], pixels[1:] / 1000.0, rtol=1e-6)
     assert is_depth(ImageMessage(0, "", "16UC1; compressedDepth png", file, True))
     assert not is_depth(ImageMessage(0, "", "bgr8; jpeg compressed bgr8", file, True))
+
+
+def test_depth_in_tiff() -> None:
+    """The one format of compressed_image_transport that takes 32FC1."""
+    millimetres = RNG.integers(1, 65535, (6, 5)).astype(np.uint16)
+    metres = RNG.uniform(0.5, 9, (6, 5)).astype(np.float32)
+    metres[0, 0], millimetres[0, 0] = np.nan, 0
+    for encoding, pixels, expected in (("32FC1", metres, metres), ("16UC1", millimetres, millimetres / 1000.0)):
+        file = cv2.imencode(".tiff", pixels)[1].tobytes()
+        depth = depth_m(ImageMessage(0, "", f"{encoding}; tiff compressed ", file, True))
+        assert np.isnan(depth[0, 0])
+        np.testing.assert_allclose(depth[1:], expected[1:], rtol=1e-6)
 
 
 def test_quantised_inverse_depth() -> None:

@@ -13,7 +13,7 @@ _HIGH_PROFILES = (100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135)
 _HEAD = 64
 """Bytes of a slice that are looked at; its frame_num lies within the first ten."""
 _PARAMETERS = 4096
-"""Bytes of a parameter set that are looked at; with all scaling lists it has a few hundred."""
+"""Bytes of a parameter set that are looked at; usual ones have some tens."""
 _SLICE, _IDR, _SPS = 1, 5, 7
 """nal_unit_type, table 7-1."""
 
@@ -23,7 +23,8 @@ class FrameNumbers:
 
     def __init__(self) -> None:
         self._bits = 0
-        """Bits of frame_num; 0 where they are of no use: no parameter set was read, or it allows gaps."""
+        """Bits of frame_num; 0 where they are of no use: no parameter set was read, or it allows gaps or has scaling
+        lists."""
         self._separate = False
         """Slices name their colour plane."""
         self._last = -1
@@ -69,10 +70,9 @@ class FrameNumbers:
             self._separate = chroma == 3 and bool(bits.read(1))
             bits.exp_golomb(2)  # bit depths of luma and chroma
             bits.read(1)  # lossless transform
-            if bits.read(1):
-                for i in range(8 if chroma != 3 else 12):
-                    if bits.read(1):
-                        _skip_scaling_list(bits, 16 if i < 6 else 64)
+            if bits.read(1):  # scaling lists, which cameras do not send
+                self._bits = 0
+                return
         size = bits.exp_golomb() + 4
         order = bits.exp_golomb()  # pic_order_cnt_type
         if order == 0:
@@ -108,13 +108,3 @@ class _Bits:
                 zeros += 1
             value = (1 << zeros) - 1 + self.read(zeros)
         return value
-
-
-def _skip_scaling_list(bits: _Bits, size: int) -> None:
-    """7.3.2.1.1.1."""
-    last = following = 8
-    for _ in range(size):
-        if following:
-            code = bits.exp_golomb()
-            following = (last + (code + 1 >> 1 if code & 1 else -(code >> 1))) % 256
-        last = following or last

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from vplog.logs.messages.records import BadMessageError
-from vplog.storage.image_file import PNG, BadImageError, decode_image
+from vplog.storage.image_file import BadImageError, decode_image, image_size
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -30,58 +30,26 @@ _LEAST_UNKNOWN = 0.001
 """Share of px without measurement that depth images have at least; a camera has a few dead ones in a million."""
 _INVALID_MM = 65535
 """Depth in mm that means no measurement in 7-Scenes; 0 does in ROS REP 118 and cameras' firmware."""
-_LAYOUTS: dict[str, tuple[str, int, int | None]] = {
-    "mono8": ("u1", 1, None),
-    "8UC1": ("u1", 1, None),
-    "rgb8": ("u1", 3, cv2.COLOR_RGB2GRAY),
-    "8UC3": ("u1", 3, cv2.COLOR_BGR2GRAY),
-    "bgr8": ("u1", 3, cv2.COLOR_BGR2GRAY),
-    "rgba8": ("u1", 4, cv2.COLOR_RGBA2GRAY),
-    "bgra8": ("u1", 4, cv2.COLOR_BGRA2GRAY),
-    "8UC4": ("u1", 4, cv2.COLOR_BGRA2GRAY),
-    "mono16": ("u2", 1, None),
-    "16UC1": ("u2", 1, None),
-    "rgb16": ("u2", 3, cv2.COLOR_RGB2GRAY),
-    "bgr16": ("u2", 3, cv2.COLOR_BGR2GRAY),
-    "rgba16": ("u2", 4, cv2.COLOR_RGBA2GRAY),
-    "bgra16": ("u2", 4, cv2.COLOR_BGRA2GRAY),
-    "16SC1": ("i2", 1, None),
-    "32FC1": ("f4", 1, None),
-    "64FC1": ("f8", 1, None),
-    "yuv422": ("u1", 2, cv2.COLOR_YUV2GRAY_UYVY),
-    "uyvy": ("u1", 2, cv2.COLOR_YUV2GRAY_UYVY),
-    "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2GRAY_YUY2),
-    "yuyv": ("u1", 2, cv2.COLOR_YUV2GRAY_YUY2),
-    "nv12": ("u1", 1, None),
-    "nv21": ("u1", 1, None),
-    "nv24": ("u1", 1, None),
-}
-"""ROS encoding: type of a channel, channels, OpenCV's conversion to grey (8UC3 is BGR, as cv_bridge has it). Of nv12,
-nv21 and nv24 the luma comes first, and it is the grey image; what follows is not read."""
-_MOSAICS = {
-    "rggb": cv2.COLOR_BayerBG2GRAY,
-    "bggr": cv2.COLOR_BayerRG2GRAY,
-    "gbrg": cv2.COLOR_BayerGR2GRAY,
-    "grbg": cv2.COLOR_BayerGB2GRAY,
-}
-"""ROS names a mosaic by its first two rows, OpenCV by the second and third px of its second row."""
-_LAYOUTS |= {f"bayer_{name}{8 * size}": (f"u{size}", 1, code) for name, code in _MOSAICS.items() for size in (1, 2)}
-_COLOURS = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
+_LAYOUTS: dict[str, tuple[str, int, str]] = {
+    **dict.fromkeys(("mono8", "8UC1", "nv12", "nv21", "nv24"), ("u1", 1, "GRAY2{}")),
+    **dict.fromkeys(("mono16", "16UC1"), ("u2", 1, "GRAY2{}")),
+    **{f"{kind}{8 * size}": (f"u{size}", len(kind), f"{kind.upper()}2{{}}")
+       for kind in ("rgb", "bgr", "rgba", "bgra") for size in (1, 2)},
+    **{f"{8 * size}UC{count}": (f"u{size}", count, f"{kind}2{{}}")
+       for count, kind in ((3, "BGR"), (4, "BGRA")) for size in (1, 2)},
+    "16SC1": ("i2", 1, "GRAY2{}"),
+    "32FC1": ("f4", 1, "GRAY2{}"),
+    "64FC1": ("f8", 1, "GRAY2{}"),
+    **dict.fromkeys(("yuv422", "uyvy"), ("u1", 2, "YUV2{}_UYVY")),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), ("u1", 2, "YUV2{}_YUY2")),
+    **{f"bayer_{name}{8 * size}": (f"u{size}", 1, f"Bayer{code}2{{}}")
+       for name, code in (("rggb", "BG"), ("bggr", "RG"), ("gbrg", "GR"), ("grbg", "GB")) for size in (1, 2)},
+}  # fmt: skip
+"""ROS encoding: type of a channel, channels, OpenCV's conversion to GRAY or RGB (8UC3 is BGR, as cv_bridge has it). Of
+nv12, nv21 and nv24 the luma comes first, and it is the grey image; what follows is not read. ROS names a mosaic by its
+first two rows, OpenCV by the second and third px of its second row."""
+_COLOURS = {3: "BGR2{}", 4: "BGRA2{}"}
 """As OpenCV decodes them."""
-_RGB = {
-    None: cv2.COLOR_GRAY2RGB,
-    cv2.COLOR_RGB2GRAY: None,
-    cv2.COLOR_BGR2GRAY: cv2.COLOR_BGR2RGB,
-    cv2.COLOR_RGBA2GRAY: cv2.COLOR_RGBA2RGB,
-    cv2.COLOR_BGRA2GRAY: cv2.COLOR_BGRA2RGB,
-    cv2.COLOR_YUV2GRAY_UYVY: cv2.COLOR_YUV2RGB_UYVY,
-    cv2.COLOR_YUV2GRAY_YUY2: cv2.COLOR_YUV2RGB_YUY2,
-    cv2.COLOR_BayerBG2GRAY: cv2.COLOR_BayerBG2RGB,
-    cv2.COLOR_BayerRG2GRAY: cv2.COLOR_BayerRG2RGB,
-    cv2.COLOR_BayerGB2GRAY: cv2.COLOR_BayerGB2RGB,
-    cv2.COLOR_BayerGR2GRAY: cv2.COLOR_BayerGR2RGB,
-}
-"""For each conversion to grey that to red, green, blue."""
 _DEPTH_ENCODINGS = ("16UC1", "16SC1", "32FC1", "64FC1")
 _SIXTEEN_BITS = "16UC1"
 """Depth in mm, or what a thermal camera counts."""
@@ -155,28 +123,29 @@ def spread(count: int) -> int:
 
 def grey(message: ImageMessage, levels: Levels | None = None) -> Bytes:
     """(H, W) uint8; of 16 bits by the `levels` of the topic, or by its own. Raises BadMessageError."""
-    return _converted(message, levels, *_pixels(message))
+    return _converted(message, levels, *_pixels(message), "GRAY")
 
 
 def rgb(message: ImageMessage, levels: Levels | None = None) -> Bytes:
     """(H, W, 3) uint8 red, green, blue; three times the grey where it has no colour. As `grey`."""
-    pixels, conversion = _pixels(message, colour=True)
-    return _converted(message, levels, pixels, _RGB[conversion])
+    return _converted(message, levels, *_pixels(message, colour=True), "RGB")
 
 
-def _converted(message: ImageMessage, levels: Levels | None, pixels: Any, conversion: int | None) -> Bytes:
+def _converted(message: ImageMessage, levels: Levels | None, pixels: Any, conversion: str, to: str) -> Bytes:
     if pixels.dtype == np.uint16:
         pixels = (levels or levels_of([message]) or Levels(0, 2**16 - 1)).apply(pixels)
     if pixels.dtype != np.uint8:
         raise BadMessageError(f"encoding {message.encoding[:40]!r} is depth, not an image")
     try:
-        return np.ascontiguousarray(pixels if conversion is None else cv2.cvtColor(pixels, conversion), np.uint8)
+        if not conversion.startswith(f"{to}2"):
+            pixels = cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion.format(to)}"))
+        return np.ascontiguousarray(pixels, np.uint8)
     except cv2.error:  # a mosaic or a row of shared colours of one px
         raise BadMessageError(f"{message.encoding[:40]!r} with {pixels.shape[1]} x {pixels.shape[0]} px") from None
 
 
-def _pixels(message: ImageMessage, colour: bool = False) -> tuple[Any, int | None]:
-    """(H, W) or (H, W, C) pixels of as many bits as they come in, and OpenCV's conversion to grey; those of image files
+def _pixels(message: ImageMessage, colour: bool = False) -> tuple[Any, str]:
+    """(H, W) or (H, W, C) pixels of as many bits as they come in, and OpenCV's conversion of them; those of image files
     are grey already without `colour`."""
     if not message.compressed:
         return _raw(message)
@@ -184,7 +153,7 @@ def _pixels(message: ImageMessage, colour: bool = False) -> tuple[Any, int | Non
     pixels = _imdecode(message.data, unchanged=colour or mosaic is not None)
     if pixels.ndim > 2:
         return pixels, _COLOURS[pixels.shape[2]]
-    return pixels, mosaic and mosaic[2]  # some transports compress the mosaic
+    return pixels, mosaic[2] if mosaic else "GRAY2{}"  # some transports compress the mosaic
 
 
 def depth_m(message: ImageMessage) -> Float32s:
@@ -193,7 +162,7 @@ def depth_m(message: ImageMessage) -> Float32s:
     if not message.compressed:
         pixels, _ = _raw(message)
         return _metres(pixels, message.encoding)
-    if message.data[:8] == PNG:
+    if image_size(message.data):  # without the header of compressedDepth: PNG, or TIFF, which holds metres, too
         return _metres(_imdecode(message.data, unchanged=True), message.encoding)
     if "rvl" in message.encoding.lower():
         from vplog.logs.messages.rvl import decode_rvl  # numba loads here
@@ -227,8 +196,8 @@ def _metres(pixels: Any, encoding: str) -> Float32s:
     return np.where(np.isfinite(pixels) & (pixels > 0), pixels, np.nan).astype(np.float32)
 
 
-def _raw(message: ImageMessage) -> tuple[Any, int | None]:
-    """(H, W) or (H, W, C) pixels in native byte order without row padding, and the conversion to grey."""
+def _raw(message: ImageMessage) -> tuple[Any, str]:
+    """(H, W) or (H, W, C) pixels in native byte order without row padding, and OpenCV's conversion of them."""
     if message.encoding not in _LAYOUTS:
         raise BadMessageError(f"encoding {message.encoding[:40]!r} is not supported; these are: {', '.join(_LAYOUTS)}")
     kind, channels, conversion = _LAYOUTS[message.encoding]

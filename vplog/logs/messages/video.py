@@ -53,6 +53,9 @@ _IDR = re.compile(rb"\x00\x00\x01[\x05\x25\x45\x65]")
 _REFERENCES = 16
 """Pictures that H.264 keeps at most: so long behind a recovery point may packets release some that came before it,
 which FFmpeg takes for an error."""
+_DELIMITER, _SEQUENCE_HEADER = b"\x12\x00", 1
+"""The unit (OBU) that an AV1 packet may begin with, and the type of the one behind it at a key frame: AV1 bitstream
+5.3."""
 _UNREAD, _PLAIN, _PARAMETERS, _KEY, _WHOLE_KEY = range(5)
 """What a packet is: not read; needs those before it; parameter sets alone; a key frame without, or with them."""
 
@@ -197,8 +200,9 @@ def packet_kind(codec: str, data: bytes) -> int:
     """Whether decoding can start at a packet: by its first unit that holds a picture."""
     if codec == "vp9":  # uncompressed header, VP9 bitstream 6.2: marker 10, profile, show_existing_frame, frame_type
         return _WHOLE_KEY if data and data[0] >> 6 == 2 and not data[0] & 0b1100 else _PLAIN
-    if codec == "av1":  # a sequence header, OBU type 1, comes with every key frame: AV1 bitstream 7.5
-        return _WHOLE_KEY if 1 in _obu_types(data) else _PLAIN
+    if codec == "av1":  # a sequence header comes with every key frame, behind the delimiter: AV1 bitstream 7.5
+        first = data.removeprefix(_DELIMITER)[:1]
+        return _WHOLE_KEY if first and first[0] >> 3 & 0xF == _SEQUENCE_HEADER else _PLAIN
     parameters = recovery = False
     for unit in _START_CODE.finditer(data):
         header = unit[1][0]
@@ -228,28 +232,6 @@ def _payload_types(data: bytes) -> set[int]:
             position += 1
         found.add(numbers[0])
         position += numbers[1]
-    return found
-
-
-def _obu_types(data: bytes) -> set[int]:
-    """Types of the units of an AV1 packet (AV1 bitstream 5.3), up to the first without a size."""
-    found, position = set(), 0
-    while position < len(data):
-        header = data[position]
-        found.add(header >> 3 & 0xF)
-        position += 2 if header & 4 else 1
-        if not header & 2:
-            break
-        size = 0
-        for i in range(8):  # leb128
-            if position >= len(data):
-                return found
-            byte = data[position]
-            position += 1
-            size |= (byte & 0x7F) << (7 * i)
-            if not byte & 0x80:
-                break
-        position += size
     return found
 
 

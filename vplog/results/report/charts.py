@@ -93,11 +93,32 @@ def histogram(above: Floats, below: Floats, label: str, thresholds: Sequence[tup
 
 def curves(named: Sequence[tuple[str, Floats]]) -> Chart:
     """Precision (P, second column) over recall (first), each named curve with its class."""
+    return _lines(named, "precision over recall", (0.0, 1.0), "recall", (0.0, 1.0), "precision")
+
+
+def over_time(lines: Sequence[tuple[str, Floats, Floats]], label: str, end_s: float) -> Chart | None:
+    """Lines by class (`dot` for single values), times in s and values (P,), with gaps at NaN; None without a value."""
+    values = np.concatenate([values for _, _, values in lines])
+    if not np.isfinite(values).any():
+        return None
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    named = [(kind, np.column_stack([times, values])) for kind, times, values in lines]
+    return _lines(named, label, (0.0, end_s), "seconds into the drive", (low, high if high > low else low + 1.0), "")
+
+
+def _lines(
+    named: Sequence[tuple[str, Floats]], label: str, x: tuple[float, float], x_label: str, y: tuple[float, float],
+    y_label: str,
+) -> Chart:  # fmt: skip
+    low, size = np.array([x[0], y[0]]), np.array([x[1] - x[0], y[1] - y[0]])
     paths = []
     for kind, points in named:
-        x, y = _LEFT + points[:, 0] * _ACROSS, _TOP + (1.0 - points[:, 1]) * _DOWN
-        paths.append((f"track {kind}", _line(subsampled(np.stack([x, y], 1), MOST_POINTS))))
-    return _with_axes("precision over recall", paths, [], (0.0, 1.0), "recall", (0.0, 1.0), "precision")
+        across = (subsampled(points[:, :2], MOST_POINTS) - low) / size * [_ACROSS, -_DOWN] + [_LEFT, _TOP + _DOWN]
+        gaps = np.flatnonzero(~np.isfinite(across).all(1))
+        pieces = [piece[np.isfinite(piece).all(1)] for piece in np.split(across, gaps)]
+        draw = _dots if kind.startswith("dot") else _line
+        paths.append((f"track {kind}", "".join(draw(piece) for piece in pieces if len(piece))))
+    return _with_axes(label, paths, [], x, x_label, y, y_label)
 
 
 def columns(values: Sequence[float], label: str, unit: str) -> Chart:
@@ -147,7 +168,7 @@ def round_ticks(ends: tuple[float, float], most: int) -> list[tuple[float, str]]
     low, high = ends
     power = 10.0 ** np.floor(np.log10((high - low) / most))
     step = next(times * power for times in (1, 2, 5, 10) if (high - low) / (times * power) < most)
-    values = step * np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1)
+    values = step * np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) + 0.0
     return [((value - low) / (high - low), f"{value:.6g}") for value in values.tolist()]
 
 

@@ -27,6 +27,8 @@ _MOST_LOSSES = 100
 """Rows of the table of losses; run.json has them all."""
 _MOST_PICTURE_BYTES = 6_000_000
 """Bytes of all pictures together: the page then stays below 10 MB, base64 and table included."""
+_MOST_SIGMA = 10.0
+"""Residuals over time are drawn up to it: those of false closures are often a thousand."""
 _MOST_USED = 6
 """References shown of the most used, and of the least used."""
 _FIGURES = (
@@ -60,6 +62,8 @@ class TruthComparison:
     """By what candidates are ranked: (P, 3) recall, precision and the value there, by falling value."""
     at_place: Bools | None = None
     """(C,) candidates whose two frames show one place."""
+    error_m: Floats | None = None
+    """(N,) distance of each keyframe to the aligned truth, NaN where that does not cover it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +121,7 @@ def page(content: Content) -> str:
         candidates=len(closures),
         examples=examples,
         audit=_audit(content, drawn, [one["row"] for one in examples]),
+        over_time=_over_time(content),
         distributions=_distributions(content),
         references=_references(content),
         stages=_stages(mapping(record.get("stages"))),
@@ -142,15 +147,54 @@ def _tiles(content: Content) -> list[tuple[str, str]]:
 def _certainty(content: Content) -> list[str]:
     """The certificate of global optimality, and the uncertainty of the keyframes' positions."""
     found = [str(reason)] if (reason := mapping(content.record.get("certificate")).get("reason")) else []
-    known = content.covariance[np.isfinite(content.covariance).all((1, 2))]
-    if len(known):
-        sigma_m = np.sqrt(np.maximum(np.linalg.eigvalsh(known[:, 3:, 3:])[:, -1], 0.0))
+    sigma_m = _sigma_m(content.covariance)
+    if len(sigma_m := sigma_m[np.isfinite(sigma_m)]):
         to = "where GPS measures them" if content.record.get("gps") else "the first keyframe"
         found.append(
             f"Positions of keyframes relative to {to}, one sigma along the worst axis: median "
             f"{figure(float(np.median(sigma_m)), 3)} m, largest {figure(float(sigma_m.max()), 3)} m."
         )
     return found
+
+
+def _sigma_m(covariance: Floats) -> Floats:
+    """(N,) standard deviation of positions along the worst axis, NaN where unknown."""
+    sigma_m, known = np.full(len(covariance), np.nan), np.isfinite(covariance).all((1, 2))
+    sigma_m[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[known, 3:, 3:])[:, -1], 0.0))
+    return sigma_m
+
+
+def _over_time(content: Content) -> list[tuple[str, charts.Chart]]:
+    """Charts of the drive by its time: height, heading and speed, uncertainty, residuals of closures and error."""
+    tracks, closures, judged = content.tracks, content.closures, content.judged
+    if len(tracks.after.stamp_ns) < 2:
+        return []
+    sample_s, keyframe_s = ((one.stamp_ns - tracks.after.stamp_ns[0]) / 1e9 for one in (tracks.after, tracks.keyframes))
+    both = [("before", tracks.before.world_from_body), ("after", tracks.after.world_from_body)]
+    yaw = [(kind, np.degrees(np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0])))) for kind, poses in both]
+    used, residual = closures.of(*USED), np.minimum(closures.residual_after, _MOST_SIGMA)
+    solved = np.isfinite(residual)
+    dots = [("dot yes", solved & used), ("dot no", solved & ~used)]
+    at_s, error_m = keyframe_s[closures.query], None if judged is None else judged.error_m
+    series = {
+        "height, z in m": [(kind, sample_s, poses[:, 2, 3]) for kind, poses in both],
+        "heading, yaw in degrees": [(kind, sample_s, degrees) for kind, degrees in yaw],
+        "speed in m/s": [("after", *_speed(sample_s, tracks.after.world_from_body[:, :3, 3]))],
+        "position, one sigma in m": [("after", keyframe_s, _sigma_m(content.covariance))],
+        f"residual of closures in sigma, cut at {_MOST_SIGMA:.0f}": [
+            (d, at_s[rows], residual[rows]) for d, rows in dots
+        ],
+        "error of keyframes in m": [] if error_m is None else [("truth", keyframe_s, error_m)],
+    }
+    drawn = [(name, charts.over_time(lines, name, float(sample_s[-1]))) for name, lines in series.items() if lines]
+    return [(name, chart) for name, chart in drawn if chart is not None]
+
+
+def _speed(sample_s: Floats, positions: Floats) -> tuple[Floats, Floats]:
+    """Times and speeds in m/s, over a second at least: from sample to sample the noise of positions is a speed."""
+    times = np.arange(0.0, sample_s[-1], max(1.0, sample_s[-1] / charts.MOST_POINTS))
+    at = np.column_stack([np.interp(times, sample_s, column) for column in positions.T])
+    return times[1:], np.linalg.norm(np.diff(at, axis=0), axis=1) / np.diff(times)
 
 
 def _loss(loss: dict[str, Any], content: Content) -> list[str]:
@@ -238,7 +282,7 @@ def _audit(content: Content, drawn: dict[str, Any], pictures: list[int]) -> dict
     command = f"vplog run {shlex.quote(str(log))} -o RUN --decisions decisions.csv"
     return {
         "columns": _columns(content, sorted(order[:_MOST_ROWS].tolist())),
-        "kept": [verdict.value for verdict in USED],
+        "used": [verdict.value for verdict in USED],
         "sentences": {verdict.value: verdict.sentence for verdict in Verdict},
         "stamps": list(map(str, content.tracks.keyframes.stamp_ns.tolist())),  # beyond 2^53, where JavaScript rounds
         "map": drawn,

@@ -1,11 +1,11 @@
 "use strict";
 (() => {
   const $ = (id) => document.getElementById(id), data = JSON.parse($("audit").textContent);
-  const { columns, kept, stamps, thumbnails, pictures, sentences } = data;
+  const { columns, used, stamps, thumbnails, pictures, sentences } = data;
   const count = columns.row.length, names = Object.keys(columns);
-  const isKept = (row) => kept.includes(columns.verdict[row]);
-  const isFalse = (row) => isKept(row) && columns.true?.[row] === "no";
-  const kindOf = (row) => isFalse(row) ? "false" : isKept(row) ? "yes"
+  const isUsed = (row) => used.includes(columns.verdict[row]);
+  const isFalse = (row) => isUsed(row) && columns.true?.[row] === "no";
+  const kindOf = (row) => isFalse(row) ? "false" : isUsed(row) ? "yes"
     : columns.residual_after[row] !== null || columns.verdict[row] === "rejected_by_decision" ? "no" : "before";
 
   // Decisions: by "query,match"; those that the run followed are there from the start
@@ -69,7 +69,7 @@
     for (const value of [decision, ...names.map((name) => columns[name][row])]) {
       const td = document.createElement("td"); td.textContent = value ?? ""; tr.append(td);
     }
-    tr.children[1 + names.indexOf("verdict")].className = isKept(row) ? "accepted" : "rejected";
+    tr.children[1 + names.indexOf("verdict")].className = isUsed(row) ? "accepted" : "rejected";
     return tr;
   };
   const drawLedger = () => {
@@ -205,7 +205,7 @@
     const row = selected, verdict = columns.verdict[row], decision = decisions.get(pairOf(row))?.decision;
     $("closure-title").textContent = "Closure " + columns.row[row] + ": keyframe " + columns.query[row] + " as a return to " + columns.match[row];
     $("closure-verdict").textContent = verdict + ". " + sentences[verdict] + (decision ? " Your decision: " + decision + "." : "");
-    $("closure-verdict").className = isKept(row) ? "accepted" : "rejected";
+    $("closure-verdict").className = isUsed(row) ? "accepted" : "rejected";
     $("closure-numbers").textContent = names.filter((name) => !["row", "verdict", "query", "match"].includes(name) && columns[name][row] !== null)
       .map((name) => name + " " + columns[name][row]).join(", ");
     $("command").value = data.explain + columns.query[row] + ":" + columns.match[row];
