@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
 from vplog.logs.formats.compression import BadChunkError, unpack
-from vplog.logs.formats.container import Channel, Contents, Notes, block_of, by_topic, topics_of
+from vplog.logs.formats.container import Channel, Contents, Notes, block_of
 from vplog.logs.formats.layout import ChunkLosses
-from vplog.logs.formats.loss_account import main_span, sampled
+from vplog.logs.formats.loss_account import sampled
 from vplog.logs.formats.ros1_layout import CONNECTION, MAGIC, MESSAGE, fields, number, read_layout, time_ns
 from vplog.storage.remote_path import RemotePath
 
@@ -29,7 +29,7 @@ class Ros1Bag:
 
     def __init__(self, path: Path, notes: Notes, name: str = "") -> None:
         """`name` is what the file is called in remarks."""
-        self._name, self._account, length = name or path.name, notes.account, path.stat().st_size
+        self._name, length = name or path.name, path.stat().st_size
         self._file = path.open("rb")
         self._channels: dict[int, Channel] = {}
         self._doubtful: dict[int, Channel] = {}
@@ -50,11 +50,7 @@ class Ros1Bag:
             for connection, channel in self._doubtful.items():
                 self._channels.setdefault(connection, channel)
             by_id, times = self._counted()
-        counts = Counter(dict.fromkeys(self._channels.values(), 0))
-        for connection in by_id.keys() & self._channels.keys():
-            counts[self._channels[connection]] += by_id[connection]
-        self._account_for(by_topic(counts), main_span(times))
-        return Contents(dict(sorted(counts.items())), min(times, default=0), max(times, default=0))
+        return self._losses.contents(by_id, times, "index")
 
     def _counted(self) -> tuple[Counter[int], list[int]]:
         """Messages by connection, and log times of each chunk, the first and last among them."""
@@ -94,15 +90,6 @@ class Ros1Bag:
 
     def read(self, place: Place) -> Octets:
         return self._data.part(*place)
-
-    def _account_for(self, found: dict[str, int], span: tuple[int, int]) -> None:
-        layout = self._layout
-        total = self._losses.add_missing(found, span, "is damaged near byte")
-        self._losses.add_end(sum(found.values()), [(span[1], span[1])] if span[1] else [])
-        whole = layout.cut_at is None and all(chunk.counts for chunk in layout.missing)
-        listed = topics_of(layout.recorded, self._channels)
-        self._account.set_recorded(self._name, listed or (total if whole else {}), *span)
-        self._losses.reconcile(found, total, span, "index")
 
     def _connect(self, header: dict[bytes, bytes], data: bytes) -> None:
         """The first sound definition of a connection holds, and a damaged one where there is no sound one."""

@@ -174,7 +174,7 @@ class _LayoutReader:
         while field := _VALUES.match(head, end + 4):
             name, _, values[name] = field[0].partition(b"=")
             end = field.end()
-        is_chunk = not values or not values.keys().isdisjoint(_FIELDS[_CHUNK])
+        is_chunk = values.keys() <= _FIELDS[_CHUNK] | {b"op"}
         starts = [position + 8 + int.from_bytes(head[:4], "little"), position + end + 4]
         ends = {start + int.from_bytes(self.at(start - 4, 4), "little") for start in starts}
         by_header = (number(values, b"size"), _ENTRY[_INDEX] * number(values, b"count"))
@@ -187,7 +187,7 @@ class _LayoutReader:
         skipped = {chunk.record: chunk for chunk in layout.missing}
         layout.missing, listed = [], len(self._infos) == self._chunk_count
         others = (chunk for chunk in layout.chunks if chunk.record not in self._infos and not chunk.doubtful)
-        shifted = {(frozenset(chunk.counts.items()), chunk.first_ns) for chunk in others}  # by bytes inserted or lost
+        shifted = {(frozenset(chunk.counts.items()), chunk.last_ns) for chunk in others}  # by bytes inserted or lost
         for offset, info in sorted(self._infos.items()):
             if (chunk := found.get(offset)) is not None and not _is_another(chunk, info):
                 chunk.first_ns, chunk.last_ns = info.first_ns, info.last_ns
@@ -199,7 +199,7 @@ class _LayoutReader:
                 header, start, stop = self._head(offset)
                 self._record(_CHUNK, header or {}, offset, start, stop)
                 layout.chunks[-1].counts = info.counts
-            elif (frozenset(info.counts.items()), info.first_ns) in shifted:
+            elif (frozenset(info.counts.items()), info.last_ns) in shifted:
                 listed = False
             elif gaps := [start for start, stop in layout.gaps if start <= offset < stop]:  # else the index is damaged
                 own = skipped.get(gaps[0])  # by the index records behind it, the last chunk in the gap
@@ -214,6 +214,7 @@ class _LayoutReader:
             layout.recorded = dict(sum((Counter(info.counts) for info in self._infos.values()), Counter()))
         if not self._infos or not listed:
             layout.missing += skipped.values()
+        layout.gaps = []  # each has its chunk among the missing ones
         layout.in_order()
         ended = self._infos or 0 < self._index_at <= (layout.cut_at or 0)
         if layout.cut_at is not None and ended and not layout.missing:
