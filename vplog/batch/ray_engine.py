@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-import vplog
 from vplog.batch.ray_cluster import Head, connected, watched_head
 from vplog.batch.worker import Outcome, Task, compute_drive, made_by
 from vplog.errors import SettingsError, VplogError
@@ -24,6 +23,7 @@ from vplog.run.feature_extraction import Part, compute_part, missing_parts, part
 from vplog.run.provenance import library_of
 from vplog.storage.remote_path import located
 from vplog.storage.scratch import files_in, packed, pieces, scratch, unpacked, write_pieces
+from vplog.version import __version__
 
 if TYPE_CHECKING:
     from vplog.storage.scratch import Bytes
@@ -130,7 +130,7 @@ class RayEngine:
             )
         own, answers = made_by(), self._on_every_node(about_node)
         for answer in self._ray.wait(list(answers), num_returns=len(answers), timeout=_PROBE_S)[0]:
-            found, same = self._answer(answer), f"Install the same there: vplog {vplog.__version__}."
+            found, same = self._answer(answer), f"Install the same there: vplog {__version__}."
             if isinstance(found, self._ray.exceptions.RayTaskError):
                 raise SettingsError(f"{answers[answer]} cannot run vplog: {found.cause}. {same}")
             if isinstance(found, BaseException):  # it has just left

@@ -14,9 +14,7 @@ from importlib import metadata
 from itertools import accumulate
 from pathlib import Path
 
-import vplog
-
-_PACKAGE = Path(vplog.__file__).parent
+_PACKAGE = Path(__file__).parents[1]
 _PUBLISHED_AS = {"cv2": "opencv-python-headless", "faiss": "faiss-cpu", "yaml": "PyYAML", "google": "protobuf"}
 """Packages whose name on PyPI is not the one they are imported by; a search for others takes half a second."""
 
@@ -26,8 +24,8 @@ def code_of(*modules: str) -> dict[str, str]:
     """sha256 over the vplog files that these modules import, transitively and themselves included, as `code`; and the
     version of Python, the kind of machine, and the version of every other package that those files import.
 
-    What is imported for type checkers alone does not count, as it does not run. A package that is entered on the way
-    to one of its modules counts by its own file, not by all that it imports besides.
+    What is imported for type checkers alone does not count, as it does not run. A package below vplog that is entered
+    on the way to one of its modules counts by its own file, not by all that it imports besides.
     """
     own = tuple(module for module in modules if module.partition(".")[0] == "vplog")
     files, packages = imported(own)
@@ -45,7 +43,7 @@ def imported(modules: tuple[str, ...]) -> tuple[dict[str, Path], set[str]]:
     """Files by name of the vplog modules that these import, and the names of the packages of others."""
     files: dict[str, Path] = {}
     packages: set[str] = set()
-    waiting, followed = list(modules), set[str]()
+    waiting, followed = ["vplog", *modules], set[str]()
     while waiting:
         module = waiting.pop()
         if module in followed:

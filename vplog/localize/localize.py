@@ -13,8 +13,8 @@ from vplog.data import Camera, Features, Frame, Ints, Verdict
 from vplog.errors import LibraryError, LogError
 from vplog.features.extraction import describe
 from vplog.geometry import se3
+from vplog.geometry.masking import masked
 from vplog.loops.localize import Localization, localize
-from vplog.masking import masked
 from vplog.results.geo import on_earth
 from vplog.results.tables import POSE_COLUMNS
 from vplog.stages import EncodedFrame, FrameState, Log, StoredState

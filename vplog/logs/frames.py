@@ -12,6 +12,7 @@ import numpy as np
 
 from vplog.data import Frame
 from vplog.errors import LogError, plural
+from vplog.geometry.masking import filled
 from vplog.logs.cameras import camera_from_image
 from vplog.logs.masks import resized_mask
 from vplog.logs.messages import pixels, video
@@ -19,7 +20,6 @@ from vplog.logs.messages.decode import decode
 from vplog.logs.messages.pixels import depth_m, levels_of, spread
 from vplog.logs.messages.records import BadMessageError, ImageMessage
 from vplog.logs.messages.video import VideoStream
-from vplog.masking import filled
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

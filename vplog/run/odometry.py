@@ -13,7 +13,7 @@ from vplog.cache.codecs import json_codec
 from vplog.cache.steps import Steps, step
 from vplog.data import Camera, Frame, Keyframes, Odometry
 from vplog.errors import LogError
-from vplog.masking import masked
+from vplog.geometry.masking import masked
 from vplog.run.feature_extraction import image_topics
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.run.visual_odometry.visual import visual_odometry

@@ -17,7 +17,7 @@ from vplog.data import Bytes, Ints, Keyframes, Reference
 from vplog.errors import LibraryError, SettingsError
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
-from vplog.masking import masked
+from vplog.geometry.masking import masked
 from vplog.places.coverage import (
     STRONGEST,
     Coverage,

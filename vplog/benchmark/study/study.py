@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import vplog
 from vplog import logs
 from vplog.benchmark.compare import check_truth, every_image, protocol, same_drive
 from vplog.benchmark.feature_cache import FeatureFolder
@@ -37,6 +36,7 @@ from vplog.results.staging import check_contents, staged
 from vplog.storage.folders import check_regular
 from vplog.storage.json_records import canonical_json, plain
 from vplog.storage.urls import shown
+from vplog.version import __version__
 
 if TYPE_CHECKING:
     from vplog.pipeline import Pipeline
@@ -99,7 +99,7 @@ def study(
             {**common, "code": code_of(*_SCORES)}, out / "trials.json", scratch, folders, execution,
         )  # fmt: skip
         account = {
-            "vplog": vplog.__version__,
+            "vplog": __version__,
             "drives": [
                 {"name": name, "log": str(path), "frames": len(log.stamps()), "hash": digest}
                 for name, path, log, digest in zip(names, drives, opened, hashes, strict=True)
