@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import random
 import shutil
+import subprocess
+import sys
 from functools import partial
 from http.server import ThreadingHTTPServer
 from threading import Thread
@@ -145,6 +147,10 @@ def test_a_run_by_a_signed_link_is_gone_on_with_when_it_is_given_again(
         ["batch", f"http://127.0.0.1:1/a?{QUERY}", "-o", "OUT"], ["map", "info", f"http://127.0.0.1:1/m?{QUERY}"],
         ["run", "a.mcap", "-o", f"http://127.0.0.1:1/out?{QUERY}"],
         ["compare", "a", "--min-gap", "1", "--methods", "gist", "--truth", f"http://h/t.tum?{QUERY}"],
+        *([word, *more, f"http://h/a\n.mcap?a=b \"x\" \u00fc {SECRET}"] for word, more in (
+            ("optimize", ("-o", "OUT")), ("config", ("--pipeline",)), ("config", ("--set",)), ("info", ("a",)),
+            ("run", ("a", "-o", "OUT", "--mask")), ("schemas", ("-o",)), ("compare", ("a", "--methods")), ("b", ()),
+        )),
     ],
     ids=lambda words: " ".join(words)[:40].replace(SECRET, ""),
 )  # fmt: skip
@@ -180,6 +186,8 @@ def test_urls_are_cut_and_paths_are_not() -> None:
     assert shown("http://h/a b.mcap?sig=a b") == "http://h/a b.mcap"
     assert shown("https://u:p@s@h/a@2.mcap") == "https://h/a@2.mcap"
     assert shown("http:/h/a?sig=1") == "http:/h/a"
+    assert shown("https://u%3Ap%40h/a\uff1fsig=1") == shown("https://u:p%2540h/a\uff03sig=1") == "https://h/a"
+    assert without_secrets("No https://u%3Ap%40h/a\uff1fsig=1.") == "No https://h/a"
     assert shown("https://h:80/a@b;c?sig='1'#\"2\"") == "https://h:80/a@b;c"
     assert shown("https://h/a;jsessionid=1") == "https://h/a"
     for password in ("p/1", "p?1", "p#1", "p@1", "p:1"):
@@ -238,3 +246,10 @@ def test_logs_that_differ_in_their_queries_are_two(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(RemotePath, "is_dir", lambda _: False)
     paths: list[Any] = [RemotePath(f"http://h/get?id={number}") for number in range(4)]
     assert sorted(hash_inputs(paths).values()) == sorted(stat_signature(paths).values()) == ["0", "1", "2", "3"]
+
+
+def test_a_traceback_is_shown_without_secrets(tmp_path: Path) -> None:
+    words = ["info", f"http://127.0.0.1:1/a?b c={QUERY} {SECRET}", "--debug"]
+    done = subprocess.run([sys.executable, "-m", "vplog", *words], capture_output=True, text=True, check=False)
+    assert "Traceback" in done.stderr
+    assert SECRET not in done.stdout + done.stderr

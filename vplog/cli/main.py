@@ -33,6 +33,7 @@ from vplog.cli.parser import (
     share,
     topic_options,
     topics_of,
+    words,
 )
 from vplog.cli.printing import Progress, print_json, print_result, print_status
 from vplog.cli.results import add_results
@@ -60,7 +61,8 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # noqa: SIM115, PTH123 (of the process)
-    arguments = _parser().parse_args(sys.argv[1:] if argv is None else argv)
+    words[:] = sys.argv[1:] if argv is None else argv
+    arguments = _parser().parse_args(words)
     arguments.shown = getattr(arguments, "output", None)  # a verb may write elsewhere first
     try:
         with _interrupted_by(signal.SIGTERM), _local_copies(arguments), limited(getattr(arguments, "threads", None)):
@@ -148,6 +150,7 @@ def _interrupted(error: BaseException) -> NoReturn:
 
 def _fail(arguments: argparse.Namespace, message: str) -> NoReturn:
     if arguments.debug:
+        sys.excepthook = printing.print_traceback
         raise  # noqa: PLE0704 (called from an except block)
     _flush()
     print_status(" ".join([f"error: {message}", *getattr(sys.exception(), "__notes__", [])]))

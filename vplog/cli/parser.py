@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 
 STDOUT = Path("-")
+words: list[str] = []
+"""The words of the command line."""
 _ROLES = ("image", "depth", "right", "camera-info", "odometry", "gps", "imu", "mask")
 _DASHES = "\u2013\u2014\u2212"
 """What text editors make of two hyphens."""
@@ -106,7 +108,7 @@ class Parser(argparse.ArgumentParser):
         """The shortest usage, then what is wrong in one line; exit 2."""
         message = message.replace("ignored explicit argument", "takes no value, not")
         usage, end = self._brief_usage or self._required_usage(), "" if message.endswith((".", "?", "!")) else "."
-        wrong = f"{printable(without_secrets(message))}{end}"
+        wrong = f"{printable(without_secrets(message, words))}{end}"
         self.exit(2, f"{usage}{self.prog}: error: {wrong} All options: {self.prog} --help\n")
 
     def _required_usage(self) -> str:

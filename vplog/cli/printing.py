@@ -9,6 +9,7 @@ import re
 import shlex
 import sys
 import textwrap
+import traceback
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from itertools import zip_longest
@@ -16,6 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TextIO
 
+from vplog.cli.parser import words
 from vplog.errors import plural
 from vplog.storage.urls import printable, without_secrets
 
@@ -31,7 +33,13 @@ _UNMOVED_M = 1e-3
 def print_status(message: str) -> None:
     """A line on stderr, wrapped as those of results; a closed or full stderr is ignored."""
     with suppress(OSError):
-        print(_wrapped(f"vplog: {printable(without_secrets(message))}", terminal_width(sys.stderr)), file=sys.stderr)
+        line = printable(f"vplog: {without_secrets(message, words)}")
+        print(_wrapped(line, terminal_width(sys.stderr)), file=sys.stderr)
+
+
+def print_traceback(_: type[BaseException], error: BaseException, __: TracebackType | None) -> None:
+    """A traceback on stderr, which may name URLs as any other text."""
+    print(without_secrets("".join(traceback.format_exception(error)), words), end="", file=sys.stderr)
 
 
 def warn(warnings: Iterable[str]) -> None:

@@ -3,7 +3,7 @@ and every sample gets a pose."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -12,17 +12,10 @@ from vplog.geometry import se3
 from vplog.graph.build import build_graph, checked
 from vplog.graph.consistency import is_loop
 from vplog.graph.correct_trajectory import correct_trajectory
-from vplog.graph.noise import NoiseSettings, edge_covariance
+from vplog.graph.noise import edge_covariance
 
 if TYPE_CHECKING:
-    from vplog.graph.solve import OptimiserSettings
-
-
-class JoinedSettings(Protocol):
-    """The settings that this takes, as the pipeline has them."""
-
-    noise: NoiseSettings
-    solve: OptimiserSettings
+    from vplog.pipeline import Pipeline
 
 
 class JoinedLog(NamedTuple):
@@ -36,11 +29,11 @@ class JoinedLog(NamedTuple):
 
 def join_by_odometry(
     odometry: Odometry, keyframes: Keyframes, rows: Ints, world_from_body: Floats, covariance: Floats,
-    settings: JoinedSettings,
+    pipeline: Pipeline,
 ) -> JoinedLog:  # fmt: skip
     """The trajectory by odometry and the poses (L, 4, 4), with covariance (L, 6, 6) in the body, of keyframes `rows`
     (L,), one at least. Raises GraphError where there is none."""
-    edges, _, _ = edge_covariance(odometry, keyframes.stamp_ns, settings.noise)
+    edges, _, _ = edge_covariance(odometry, keyframes.stamp_ns, pipeline.noise)
     graph, _, _ = build_graph(keyframes, edges, None)
     world = len(keyframes.stamp_ns)  # the map is one more node, to which only localised frames lead
     odom_from_world = keyframes.odom_from_body[rows[0]] @ se3.inverse(world_from_body[0])
@@ -53,7 +46,7 @@ def join_by_odometry(
         [*graph.kind, *[EdgeKind.LOOP] * len(rows)],
     )
     graph, _ = checked(graph)
-    solution = settings.solve(graph)  # not `decided`: it takes what one place measures alike for one accident
+    solution = pipeline.solve(graph)  # not `decided`: it takes what one place measures alike for one accident
     poses = solution.world_from_body
     solved = se3.between(np.broadcast_to(poses[world], (world, 4, 4)), poses[:world])
     agrees = solution.weight[is_loop(graph)] > 0.5

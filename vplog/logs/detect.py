@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 from vplog.errors import LogError, nearest_path, plural
 from vplog.logs import image_folder
-from vplog.logs.datasets.find import find_roots, is_video, read_folder, read_video
+from vplog.logs.datasets import video
+from vplog.logs.datasets.find import find_roots, read_folder
 from vplog.logs.datasets.images import read as read_images
 from vplog.logs.datasets.streams import DataSetContainer
 from vplog.logs.formats import mcap_file, ros1_bag, sqlite_bag
@@ -76,7 +77,7 @@ def check_log(path: Path) -> None:
     try:
         _check_there(path)
         if not path.is_dir():
-            if not (_magic(path) or is_video(path)):
+            if not (_magic(path) or video.is_video(path)):
                 raise LogError(_no_log(path))
         elif not (path / "metadata.yaml").is_file() and (isinstance(path, RemotePath) or not find_roots(path)):
             files = [file for file in path.iterdir() if file.is_file()]
@@ -100,10 +101,10 @@ def _check_there(path: Path) -> None:
 
 
 def _open_file(path: Path, choice: TopicChoice, notes: Notes) -> Log:
-    if not _magic(path) and is_video(path):
+    if not _magic(path) and video.is_video(path):
         if isinstance(path, RemotePath):
             raise LogError(f"{path} is a video, and videos are read from local files. Copy it to this machine.")
-        return _published(path, path.stem, read_video(path), notes, choice)
+        return _published(path, path.stem, video.read(path), notes, choice)
     container, kind = open_container(path, notes)
     return _recorded(path, _name(path), _KINDS[kind], container, notes, choice)
 

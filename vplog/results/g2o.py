@@ -97,8 +97,9 @@ def read_g2o(path: Path) -> GraphFile:
         raise GraphError(f"{path} has no EDGE_SE2 or EDGE_SE3:QUAT line, so there is no pose graph in it to solve.")
 
     known, ends = _ids(path, vertices, 1)[:, 0], _ids(path, edges, 2)
-    again = _first(np.unique(known, return_index=True)[1], len(known))
-    if again is not None:
+    repeated = np.setdiff1d(np.arange(len(known)), np.unique(known, return_index=True)[1])
+    if len(repeated):
+        again = repeated[0]
         before = vertices.line[int(np.argmax(known == known[again]))]
         raise _at(path, vertices.line[again], f"vertex {known[again]} was already given in line {before}")
     ids = np.unique(np.concatenate([known, ends.ravel()]))
@@ -194,12 +195,6 @@ def _ids(path: Path, lines: _Lines, named: int) -> Ints:
     return np.array(
         [_id(path, lines.line[row // named], word) for row, word in enumerate(lines.ids)], np.int64
     ).reshape(-1, named)
-
-
-def _first(first_rows: Ints, count: int) -> int | None:
-    """The first of `count` rows that is not among these."""
-    missing = np.setdiff1d(np.arange(count), first_rows)
-    return int(missing[0]) if len(missing) else None
 
 
 def _numbers(path: Path, lines: _Lines, columns: int) -> Floats:

@@ -93,6 +93,7 @@ def test_every_type_agrees_with_protobuf() -> None:
 
     raw = RawImage(frame_id="c", width=WIDTH, height=HEIGHT, encoding="mono8", step=WIDTH, data=bytes(WIDTH * HEIGHT))
     odometry = Odometry(frame_id="odom", body_frame_id="base", pose_covariance=np.arange(36.0))
+    odometry.velocity_covariance.extend(np.arange(36.0) / 10)
     odometry.pose.position.x, odometry.pose.orientation.w, odometry.timestamp.seconds = 3.0, 1.0, 7
     several = FrameTransforms(transforms=[m.message for m in foxglove_messages(Drive())[:2]])
     poses = PosesInFrame(frame_id="odom", poses=[Pose(), odometry.pose])

@@ -146,6 +146,18 @@ def test_depth_in_png() -> None:
     assert not is_depth(ImageMessage(0, "", "bgr8; jpeg compressed bgr8", file, True))
 
 
+def test_depth_in_tiff() -> None:
+    """The one format of compressed_image_transport that takes 32FC1."""
+    millimetres = RNG.integers(1, 65535, (6, 5)).astype(np.uint16)
+    metres = RNG.uniform(0.5, 9, (6, 5)).astype(np.float32)
+    metres[0, 0], millimetres[0, 0] = np.nan, 0
+    for encoding, pixels, expected in (("32FC1", metres, metres), ("16UC1", millimetres, millimetres / 1000.0)):
+        file = cv2.imencode(".tiff", pixels)[1].tobytes()
+        depth = depth_m(ImageMessage(0, "", f"{encoding}; tiff compressed ", file, True))
+        assert np.isnan(depth[0, 0])
+        np.testing.assert_allclose(depth[1:], expected[1:], rtol=1e-6)
+
+
 def test_quantised_inverse_depth() -> None:
     """As the transport's encoder: raw = a / depth + b with a = q (q + 1), b = 1 - a / max."""
     metres = RNG.uniform(0.5, 9, (6, 5)).astype(np.float32)

@@ -26,6 +26,8 @@ from vplog.logs.messages.records import CalibrationMessage
 if TYPE_CHECKING:
     from vplog.data import Floats
 
+_VSLAM_LAB = {"camera_model": "cam_model", "resolution": "image_dimension", "distortion_model": "distortion_type"}
+"""VSLAM-LAB's names of what Kalibr has, by Kalibr's."""
 _SECTION = re.compile(r"(Camera\d?)\.fx")
 
 
@@ -112,13 +114,9 @@ def _model(name: Any) -> str:
 
 def _listed(part: dict) -> CalibratedCamera:
     """A camera of VSLAM-LAB's calibration.yaml."""
-    if part.get("cam_model", "pinhole") != "pinhole":
-        raise BadCalibrationError(f"cam_model {reprlib.repr(part['cam_model'])[:40]} is not supported; pinhole is")
-    focal, centre = (numbers_of(part.get(name), 2) for name in ("focal_length", "principal_point"))
-    width, height = numbers_of(part.get("image_dimension", [0, 0]), 2)
-    lens = numbers_of(part.get("distortion_coefficients", []), None)
-    model = _model(part.get("distortion_type", "none"))
-    calibration = pinhole(focal, centre, (size_of(width), size_of(height)), model, lens)
+    focal, centre = (numbers_of(part.get(name), 2).tolist() for name in ("focal_length", "principal_point"))
+    named = {kalibrs: part[own] for kalibrs, own in _VSLAM_LAB.items() if own in part}
+    calibration = _intrinsics(part | named | {"intrinsics": [*focal, *centre]})
     placed = rigid_of(part["T_BS"]) if "T_BS" in part else None
     per_m = float(numbers_of([part["depth_factor"]], 1)[0]) if "depth_factor" in part else None
     return CalibratedCamera(text_of(part.get("cam_name")), "", calibration, None, placed, per_m)

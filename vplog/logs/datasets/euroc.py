@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from vplog.logs.calibration_file import read_calibrations
 from vplog.logs.datasets.folders import below, image_files
 from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, imu_stream
-from vplog.logs.datasets.tables import listed_images, numbers_of, poses_of, rows_of, stamps_ns
+from vplog.logs.datasets.tables import listed_images, poses_of
 from vplog.logs.image_folder import named_stamps
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def read(path: Path) -> DataSet:
         if folder.name.startswith("cam"):
             streams += _camera(folder)
         elif folder.name.startswith("imu") and (folder / "data.csv").is_file():
-            streams.append(_imu(folder / "data.csv", folder.name))
+            streams.append(imu_stream(folder.name, folder / "data.csv"))
     truths = [path / name / "data.csv" for name in _POSES]
     found = next((file for file in truths if file.is_file()), None)
     return DataSet("euroc", streams, None if found is None else poses_of(found, 1, scalar_first=True))
@@ -45,9 +45,3 @@ def _camera(folder: Path) -> list[Stream]:
         stamp_ns, _ = named_stamps(files)
     camera = read_calibrations(sensor)[0] if sensor.is_file() else None
     return camera_streams(folder.name, stamp_ns, files, camera)
-
-
-def _imu(table: Path, name: str) -> Stream:
-    rows = rows_of(table, 7)
-    values = numbers_of(table, rows, 1, 6)
-    return imu_stream(name, stamps_ns(table, [row[0] for row in rows], 1), values[:, :3], values[:, 3:])

@@ -1,10 +1,10 @@
-"""Which data set a folder or a file is, by its content."""
+"""Which data set a folder is, by its content."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from vplog.logs.datasets import colmap, euroc, kitti, tum_rgbd, utm_images, video, vslam_lab
+from vplog.logs.datasets import colmap, euroc, kitti, tum_rgbd, utm_images, vslam_lab
 from vplog.logs.datasets.folders import below
 
 if TYPE_CHECKING:
@@ -28,12 +28,3 @@ def find_roots(path: Path) -> list[Path]:
 def read_folder(root: Path) -> DataSet:
     """One of `find_roots`. Raises LogError."""
     return next(one.read(root) for one in _FOLDERS if one.roots(root))
-
-
-def is_video(path: Path) -> bool:
-    return video.is_video(path)
-
-
-def read_video(path: Path) -> DataSet:
-    """Raises LogError."""
-    return video.read(path)

@@ -11,6 +11,7 @@ import numpy as np
 
 from vplog.errors import LogError
 from vplog.logs.datasets import ros1
+from vplog.logs.datasets.tables import numbers_of, rows_of, stamps_ns
 from vplog.logs.formats.container import Block, Channel, Contents, block_of, by_topic
 from vplog.logs.messages.pixels import scaled_depth_m
 from vplog.logs.messages.records import BadMessageError
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
 
-    from vplog.data import Floats, Gps, Ints, Trajectory
+    from vplog.data import Gps, Ints, Trajectory
     from vplog.logs.calibrations.camera import CalibratedCamera
     from vplog.logs.formats.container import Notes, Place
 
@@ -147,10 +148,12 @@ def depth_stream(topic: str, stamp_ns: Ints, files: Sequence[Path], per_m: float
     return Stream(Channel(topic, "sensor_msgs/Image", "ros1"), stamp_ns, message, length)
 
 
-def imu_stream(topic: str, stamp_ns: Ints, gyro: Floats, acceleration: Floats) -> Stream:
-    """Rates (K, 3) in rad/s and accelerations (K, 3) in m/s^2 of the body."""
+def imu_stream(topic: str, table: Path) -> Stream:
+    """Rates in rad/s and accelerations in m/s^2 of the body: a stamp in ns and six numbers a line. Raises LogError."""
+    rows = rows_of(table, 7)
+    stamp_ns, values = stamps_ns(table, [row[0] for row in rows], 1), numbers_of(table, rows, 1, 6)
     channel = Channel(topic, "sensor_msgs/Imu", "ros1")
-    return Stream(channel, stamp_ns, lambda row: ros1.imu(int(stamp_ns[row]), BODY, gyro[row], acceleration[row]))
+    return Stream(channel, stamp_ns, lambda row: ros1.imu(int(stamp_ns[row]), BODY, values[row, :3], values[row, 3:]))
 
 
 def fix_stream(topic: str, gps: Gps) -> Stream:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from vplog.errors import LogError
 from vplog.logs.calibration_file import read_calibrations
 from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, depth_stream, imu_stream
-from vplog.logs.datasets.tables import lines_of, listed_images, numbers_of, poses_of, rows_of, stamps_ns
+from vplog.logs.datasets.tables import lines_of, listed_images, poses_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,9 +31,7 @@ def read(path: Path) -> DataSet:
         first = next(iter(cameras.values()))
         streams = camera_streams("rgb", *listed_images(path / "rgb.txt", path, 10**9), first)
     if (imu := path / "imu_0.csv").is_file():
-        rows = rows_of(imu, 7)
-        values = numbers_of(imu, rows, 1, 6)
-        streams.append(imu_stream("imu_0", stamps_ns(imu, [row[0] for row in rows], 1), values[:, :3], values[:, 3:]))
+        streams.append(imu_stream("imu_0", imu))
     return DataSet("vslam-lab", streams, _truth(path))
 
 

@@ -21,7 +21,9 @@ _FIELDS = {
     "foxglove.CameraCalibration": "timestamp frame_id width height distortion_model D K R P",
     "foxglove.PoseInFrame": "timestamp frame_id pose",
     "foxglove.PosesInFrame": "timestamp frame_id poses",
-    "foxglove.Odometry": "timestamp frame_id body_frame_id pose linear_velocity angular_velocity pose_covariance",
+    "foxglove.Odometry": (
+        "timestamp frame_id body_frame_id pose linear_velocity angular_velocity pose_covariance velocity_covariance"
+    ),
     "foxglove.LocationFix": (
         "timestamp frame_id latitude longitude altitude position_covariance position_covariance_type"
     ),

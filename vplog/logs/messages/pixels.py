@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from vplog.logs.messages.records import BadMessageError
-from vplog.storage.image_file import PNG, BadImageError, decode_image
+from vplog.storage.image_file import BadImageError, decode_image, image_size
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -162,7 +162,7 @@ def depth_m(message: ImageMessage) -> Float32s:
     if not message.compressed:
         pixels, _ = _raw(message)
         return _metres(pixels, message.encoding)
-    if message.data[:8] == PNG:
+    if image_size(message.data):  # without the header of compressedDepth: PNG, or TIFF, which holds metres, too
         return _metres(_imdecode(message.data, unchanged=True), message.encoding)
     if "rvl" in message.encoding.lower():
         from vplog.logs.messages.rvl import decode_rvl  # numba loads here
