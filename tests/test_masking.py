@@ -51,6 +51,17 @@ def test_fill_changes_masked_px_alone_and_keeps_the_border_smooth(seed: int) -> 
     assert (filled(other, used) == result).all()  # nothing of what was masked is left
 
 
+def test_the_fill_goes_from_the_border_to_the_mean() -> None:
+    image, used = np.full((100, 600), 100, np.uint8), np.ones((100, 600), bool)
+    image[:, 200:300], used[:, 300:] = 220, False
+    row = filled(image, used)[50, 299:].astype(int)
+    assert row[0] == 220
+    assert row[1] > 210
+    assert (np.diff(row) <= 0).all()
+    assert (np.diff(row) >= -20).all()
+    assert row[-1] == 140
+
+
 def test_no_feature_is_masked_and_the_others_are_as_many_as_without() -> None:
     image, used = textured(240, 320, np.random.default_rng(4)), np.ones((240, 320), bool)
     used[140:] = False

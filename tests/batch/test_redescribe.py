@@ -97,7 +97,7 @@ def test_drives_keep_their_topics_and_names(finished: Path, tmp_path: Path, monk
     other = tmp_path / "library"
     shutil.copytree(finished / "library", other)
     record = json.loads((other / "library.json").read_text())
-    (other / "library.json").write_text(json.dumps({**record, "hash": "f" * 64}))
+    run_record.write_run_json(other / "library.json", {**record, "hash": "f" * 64})
     told = redescribe_map(tmp_path / "map", other, tmp_path / "new")
     assert asked == [(["ride", "walk", "walk-10"], None, "bobb"), (["walk-2"], "/left", "bobb")]
     assert told["failed"] == 0
@@ -108,7 +108,7 @@ def test_where_every_log_is_gone_the_same_command_goes_on(finished: Path, tmp_pa
     make_map(tmp_path / "map", finished, {"walk": (str(tmp_path / "walk.mcap"), {})})
     other = Path(shutil.copytree(finished / "library", tmp_path / "library"))
     record = json.loads((other / "library.json").read_text())
-    (other / "library.json").write_text(json.dumps({**record, "hash": "f" * 64}))
+    run_record.write_run_json(other / "library.json", {**record, "hash": "f" * 64})
     for _ in range(2):
         told = redescribe_map(tmp_path / "map", other, tmp_path / "new")
         assert [(one["state"], "no longer exists" in one["error"]) for one in told["drives"]] == [("failed", True)]

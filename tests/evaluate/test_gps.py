@@ -87,6 +87,7 @@ def test_fixes_outside_the_drive_are_one_line() -> None:
     for trajectory, says in ((straight(15, 1.0), "Only 2 of 8"), (straight(1, 1.0), "fewer than 2 poses")):
         with pytest.raises(TruthError, match=says):
             ate_to_gps(trajectory, fixes)
+    assert ate_to_gps(straight(25, 1.0), fixes).count == 3, "so many are needed"
 
 
 def test_fixes_of_a_real_drive_lie_on_its_truth() -> None:

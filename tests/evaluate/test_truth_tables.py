@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from vplog.errors import TruthError
+from vplog.evaluate import truth_tables
 from vplog.evaluate.place_truth import TruthChoice, open_truth
 from vplog.evaluate.truth_tables import read_array
 
@@ -238,3 +239,13 @@ def test_damaged_arrays(tmp_path: Path) -> None:
             read_array(path, 3, 4)
         except TruthError as error:
             assert "\n" not in str(error)
+
+
+def test_a_file_that_is_far_too_large_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(truth_tables, "_FILE_BYTES", 20)
+    path = tmp_path / "pairs.csv"
+    path.write_text("query,match\n" + "1,2\n" * 2)
+    assert len(truth_tables.read_table(path)[1]) == 2
+    path.write_text("query,match\n" + "1,2\n" * 3)
+    with pytest.raises(TruthError, match="is larger than 0 MB, so it is no table of pairs"):
+        truth_tables.read_table(path)

@@ -151,6 +151,19 @@ def test_stamps_that_run_backwards_give_way_to_the_log_times(seed: int) -> None:
     assert "backwards" not in " ".join(said)
 
 
+@given(seeds, st.floats(0.2, 1.5))
+def test_bursts_in_no_order_do_not_run_backwards(seed: int, burst_s: float) -> None:
+    """A link sends what has waited, within a few ms and the last as well first."""
+    rng = np.random.default_rng(seed)
+    true_ns, _ = topic(rng, 20, rng.uniform(10, 40))
+    burst_ns = int(burst_s * SECOND)
+    order = np.lexsort((-true_ns if seed % 2 else rng.random(len(true_ns)), -(-true_ns // burst_ns)))
+    log_ns = -(-true_ns[order] // burst_ns) * burst_ns + np.arange(len(true_ns)) * 1000
+    times, _, said = ordered(stamps(true_ns[order], log_ns))
+    np.testing.assert_array_equal(times[0], true_ns)
+    assert "backwards" not in " ".join(said)
+
+
 @given(seeds, st.floats(1.7, 60))
 def test_whole_seconds_give_way_to_finer_log_times(seed: int, hz: float) -> None:
     rng = np.random.default_rng(seed)
@@ -280,3 +293,25 @@ def test_bursts_of_two_publishers_are_no_step(seed: int) -> None:
     times, _, said = ordered(stamps(header_ns[order], log_ns[order]))
     np.testing.assert_array_equal(times[0], np.unique(header_ns))
     assert not [line for line in said if "set back" in line or "set by" in line]
+
+
+@given(seeds, st.floats(0.5, 3.0), st.floats(1.0, 4.0))
+def test_how_long_a_gap_is_that_a_clock_was_set_back_over_the_motion_tells(
+    seed: int, gap_s: float, more_s: float
+) -> None:
+    """Both clocks went back by more than the gap, so that none tells its length; the way over it does."""
+    rng = np.random.default_rng(seed)
+    true_ns, log_ns = topic(rng, 30, rng.uniform(10, 40))
+    at = START_NS + 15 * SECOND
+    kept = (true_ns < at) | (true_ns > at + int(gap_s * SECOND))
+    true_ns, log_ns = true_ns[kept], log_ns[kept]
+    steps = [(at, int((gap_s + more_s) * SECOND))]
+    poses = PoseTrack("/odom")
+    for header, log, true in zip(after(true_ns, true_ns, steps), after(log_ns, true_ns, steps), true_ns, strict=True):
+        place = (2.0 * float(true - START_NS) / SECOND, 0.0, 0.0)
+        poses.add(PoseMessage(int(header), "odom", "base_link", place, (0.0, 0.0, 0.0, 1.0), None), int(log))
+    poses.set_xyz()
+    times, rows, said = ordered(poses.stamps)
+    np.testing.assert_array_equal(rows[0], np.arange(len(true_ns)))
+    assert np.ptp(times[0] - true_ns) <= 0.15 * SECOND
+    assert any("set back" in line for line in said)

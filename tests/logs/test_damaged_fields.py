@@ -6,7 +6,9 @@ Seeded bits anywhere in the files too. Nothing is made up, and nothing is lost w
 from __future__ import annotations
 
 import random
+import sqlite3
 from collections import Counter
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tests.logs.log_fields import Field
+    from vplog.logs.formats.container import Message
 
 Messages = Counter[tuple[str, int, bytes]]
 """Topic, log time and bytes of each message."""
@@ -386,3 +389,121 @@ def test_the_index_of_a_bag_counts_what_damage_to_a_chunk_and_its_own_index_took
         data[chunk + 120 : chunk + 140] = bytes(20)
         path.write_bytes(data)
         assert problem(path, WRITTEN, Format(write_bag), content=False) == ""  # type: ignore[arg-type]
+
+
+def chunk_starts(whole: bytes, suffix: str) -> list[int]:
+    """Offsets of the chunk records."""
+    name, before = ("op5.header_length", 0) if suffix == ".bag" else ("chunk.record_length", 1)
+    return [field.offset - before for field in FIELDS[suffix](whole) if field.name == name]
+
+
+CHUNKED = ["mcap-none", "mcap-lz4", "mcap-zstd", "bag-none", "bag-bz2", "bag-lz4"]
+
+
+@pytest.mark.parametrize("name", CHUNKED)
+def test_chunks_that_are_gone_or_in_each_others_place_are_accounted_for(name: str, tmp_path: Path) -> None:
+    """With their indexes: a file system lost blocks, or put them together in another order."""
+    form = FORMATS[name]._replace(counted=False)
+    path = form.write(tmp_path)
+    whole, problems = path.read_bytes(), []
+    starts = chunk_starts(whole, path.suffix)
+    for (a, b), (c, d) in zip(pairwise(starts), pairwise(starts[1:]), strict=False):
+        gone, swapped = whole[:a] + whole[b:], whole[:a] + whole[c:d] + whole[a:b] + whole[d:]
+        for data in (gone, swapped):
+            path.write_bytes(data)
+            if found := problem(path, WRITTEN, form, content=False):
+                problems.append(f"{a}: {len(data)}: {found}")
+    assert not problems, "\n".join(problems)
+
+
+@pytest.mark.parametrize("name", [*CHUNKED, "bag-unindexed", "bag-none-unindexed", "mcap-no-summary", "mcap-cut-off"])
+def test_bytes_that_are_zero_or_gone_or_new_are_accounted_for(name: str, tmp_path: Path) -> None:
+    """Over the end of one chunk and the head of the next, up to all of two; nothing tells what two chunks held."""
+    form = FORMATS[name]._replace(counted=False)
+    path = form.write(tmp_path)
+    whole, problems, rng = path.read_bytes(), [], random.Random(17)
+    for start in chunk_starts(whole, path.suffix):
+        for before, width in ((100, 150), (200, 900), (10, 1500), (3, 4)):
+            at = max(start - before, 13)
+            zeros = whole[:at] + bytes(min(width, len(whole) - at)) + whole[at + width :]
+            more = whole[:at] + rng.randbytes(width) + whole[at:]
+            for data in (zeros, more):
+                path.write_bytes(data)
+                found = problem(path, WRITTEN, form, content=False)
+                if (
+                    found
+                    and not ("cut" in found and form.cut)
+                    and not found.startswith("invented loss: missed {}, said {} [")
+                ):
+                    problems.append(f"{at} {width} {len(data)}: {found}")
+    assert not problems, f"{len(problems)}\n" + "\n".join(problems)
+
+
+def test_pages_of_a_database_in_each_others_place_are_accounted_for(tmp_path: Path) -> None:
+    """SQLite finds no row that is not where its tree says, and goes on without a word."""
+    form = FORMATS["db3"]
+    path = form.write(tmp_path)
+    with sqlite3.connect(path) as db:
+        topics = [row[0] for row in db.execute("SELECT DISTINCT topic_id FROM messages ORDER BY topic_id")]
+        for number in range(300):
+            row = topics[number % 3], START_NS + number, bytes(80)
+            db.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", row)
+    db.close()
+    whole = path.read_bytes()
+    page = int.from_bytes(whole[16:18], "big")
+    leaves = [
+        at
+        for at in range(page, len(whole), page)
+        if whole[at] == 13 and int.from_bytes(whole[at + 3 : at + 5], "big") > 9
+    ]
+    notes = Notes()
+    before = Counter((m.log_ns, bytes(m.data)) for m in every_message(path, notes))
+    assert len(leaves) > 4
+    assert not notes.lines
+    for a, b in pairwise(leaves):
+        path.write_bytes(
+            whole[:a] + whole[b : b + page] + whole[a + page : b] + whole[a : a + page] + whole[b + page :]
+        )
+        notes = Notes()
+        read = Counter((m.log_ns, bytes(m.data)) for m in every_message(path, notes))
+        lost = [loss.messages for loss in notes.account.losses]
+        assert not read - before
+        assert before.total() - read.total() <= sum(count or 0 for count in lost) or None in lost, notes.lines
+
+
+def every_message(path: Path, notes: Notes) -> list[Message]:
+    container, _ = open_container(path, notes)
+    return list(messages_in(container, container.contents().counts))
+
+
+def test_an_index_that_is_cut_off_ends_with_the_file(tmp_path: Path) -> None:
+    """Of a chunk that begins at time 0, as which bytes behind the end of the file could be taken."""
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "test")
+        channel = writer.register_channel("/a", "cdr", writer.register_schema(KIND, "ros2msg", b"string data"))
+        for number in range(10):
+            writer.add_message(channel, number, bytes(20), number)
+        writer.finish()
+    whole = path.read_bytes()
+    index = next(field for field in FIELDS[".mcap"](whole) if field.name == "message_index.record_length")
+    path.write_bytes(whole[: index.offset + 60])
+    notes = Notes()
+    assert len(every_message(path, notes)) == 10
+    assert [loss.reason for loss in notes.account.losses] == ["cut"]
+
+
+def test_where_nothing_is_left_the_times_are_those_of_most_chunks(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "log.mcap", compression=CompressionType.LZ4)
+    data = bytearray(path.read_bytes())
+    starts = chunk_starts(bytes(data), ".mcap")
+    for start in starts:
+        data[start + 80] ^= 255
+    data[starts[2] + 9 + 15] ^= 64  # the high byte of its last time
+    path.write_bytes(data)
+    notes = Notes()
+    assert not every_message(path, notes)
+    spans = [span for loss in notes.account.losses for span in loss.spans_ns]
+    assert spans
+    assert all(abs(ns - START_NS) < _FARTHEST_NS for span in spans for ns in span)

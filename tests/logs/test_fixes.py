@@ -111,9 +111,10 @@ def test_fixes_without_an_altitude_still_say_where(rows: Any, covariance: np.nda
     assert "no altitude" in said
 
 
-def test_an_infinite_covariance_is_unknown() -> None:
+@pytest.mark.parametrize("variances", [[np.inf, 1.0, 1.0], [-1.0, 0.0, 0.0], [1.0, 1.0, -1e-3], [0.0, 0.0, 0.0]])
+def test_a_covariance_that_no_noise_has_is_unknown(variances: list[float]) -> None:
     fixes = drive(2)
-    fixes[7] = dataclasses.replace(fixes[7], covariance=np.diag([np.inf, 1.0, 1.0]))
+    fixes[7] = dataclasses.replace(fixes[7], covariance=np.diag(variances))
     gps, _ = track(fixes)
     assert gps is not None
     assert np.flatnonzero(np.isnan(gps.covariance).all((1, 2))).tolist() == [7]

@@ -88,6 +88,21 @@ def test_the_second_lap_finds_the_first() -> None:
         assert (np.diff(found.score[found.query == query]) <= 0).all()
 
 
+@pytest.mark.parametrize(
+    ("suppress", "per_query", "rows"), [(1, 3, [50, 48, 30]), (0, 3, [50, 51, 48]), (2, 9, [50, 30, 10]), (1, 1, [50])]
+)
+def test_the_best_that_are_no_neighbours_of_a_better_one_are_taken(
+    suppress: int, per_query: int, rows: list[int]
+) -> None:
+    ranked = np.array([50, 51, 48, 30, 52, 10], np.int32)
+    ranking = Ranking(ranked, np.linspace(1, 0.5, 6, dtype=np.float32))
+    found = propose([(ranking, 2 * ranked)] * 2, ProposeSettings(suppress=suppress, per_query=per_query))
+    assert found.match.tolist() == rows * 2
+    assert found.support.tolist() == [2 * row for row in rows * 2]
+    assert found.query.tolist() == [0] * len(rows) + [1] * len(rows)
+    assert found.rank.tolist() == [*range(len(rows))] * 2
+
+
 @pytest.mark.parametrize("count", [0, 1, 20])
 def test_no_candidates_are_fine(count: int) -> None:
     nothing = Ranking(np.zeros(0, np.int32), np.zeros(0, np.float32))

@@ -74,6 +74,22 @@ def test_agrees_with_opencv_run_to_its_end_and_with_the_formula(model: str, dist
     np.testing.assert_allclose(seen * [500.0, 510.0] + [320.0, 240.0], grid[:, 0], atol=1e-5)
 
 
+@pytest.mark.parametrize(("model", "distortion"), LENSES)
+def test_derivatives_are_central_differences_and_noise_follows_from_them(model: str, distortion: list[float]) -> None:
+    lens, at, step = camera(model, distortion), np.random.default_rng(2).uniform(-0.4, 0.4, (20, 2)), 1e-4
+
+    def project(rays: np.ndarray) -> np.ndarray:
+        return undistort.project(lens, np.column_stack([rays, np.ones(len(rays))]))
+
+    along = [(project(at + step * axis) - project(at - step * axis)) / (2 * step) for axis in np.eye(2)]
+    J = undistort.px_from_ray(lens, at)
+    np.testing.assert_allclose(J, np.stack(along, axis=2), rtol=1e-4, atol=0.01)
+    expected = 0.25 * np.linalg.inv(np.swapaxes(J, 1, 2) @ J)
+    np.testing.assert_allclose(undistort.noise_of_rays(lens, at, 0.5), expected, rtol=1e-9, atol=1e-15)
+    assert lens.matrix is not None
+    assert undistort.focal_px(lens) ** 2 == pytest.approx(lens.matrix[0, 0] * lens.matrix[1, 1])
+
+
 def test_a_fisheye_without_coefficients_is_not_a_pinhole() -> None:
     point = np.array([[1.0, 0.0, 1.0]])
     assert undistort.project(camera("equidistant"), point)[0, 0] == pytest.approx(320 + 500 * np.pi / 4)

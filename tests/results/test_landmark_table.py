@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from tests.loops.scene import camera, empty, pose, scene, view
@@ -51,6 +53,19 @@ def test_a_table_of_another_state_is_refused(tmp_path: Path) -> None:
     (tmp_path / "landmarks.parquet").write_bytes(data[: len(data) // 2])
     with pytest.raises(ResultError, match="cannot be read"):
         LandmarkTable(tmp_path / "landmarks.parquet", "key")
+
+
+@pytest.mark.parametrize("name", ["y", "inverse_depth", "sigma", "descriptors"])
+def test_columns_of_different_length_are_one_line(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "landmarks.parquet"
+    write_landmarks(path, keyframes(3), LENS, "depth", "key")
+    table = pq.read_table(path)
+    at, values = table.schema.get_field_index(name), table[name].to_pylist()
+    values[1] = values[1][:-1]
+    changed = table.set_column(at, table.schema.field(at), pa.array(values, table.schema.field(at).type))
+    pq.write_table(changed, path)
+    with pytest.raises(ResultError, match="keyframe 1 cannot be read: columns of different length"):
+        LandmarkTable(path, "key")[1]
 
 
 def test_four_bits_stand_for_the_middle_of_their_values() -> None:

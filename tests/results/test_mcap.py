@@ -4,9 +4,6 @@ import dataclasses
 import importlib.util
 import io
 import json
-import os
-import subprocess
-import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +12,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
+from tests.rerun import rerun
 from tests.results.example import COUNT, METADATA, Run, make_run
 from vplog.data import ACCEPTED, Closures, EdgeKind, Keyframes, Verdict
 from vplog.geometry import se3
@@ -171,16 +169,8 @@ def test_drive_without_closures_or_keyframes(tmp_path: Path, count: int) -> None
 def test_rerun_opens_it(tmp_path: Path) -> None:
     """Rerun makes poses and named transforms of it, not raw bytes."""
     write(tmp_path / "result.mcap")
-    settings = {**os.environ, "HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path), "NO_COLOR": "1"}
-
-    def rerun(*arguments: str) -> str:
-        command = [sys.executable, "-m", "rerun_cli", *arguments]
-        done = subprocess.run(command, cwd=tmp_path, env=settings, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    rerun("mcap", "convert", "result.mcap", "-o", "result.rrd")
-    chunks = rerun("rrd", "print", "result.rrd").splitlines()
+    rerun(tmp_path, "mcap", "convert", "result.mcap", "-o", "result.rrd")
+    chunks = rerun(tmp_path, "rrd", "print", "result.rrd").splitlines()
     for entity, rows, component in (
         ("/path/optimised", 2, "InstancePoses3D:translations"),
         ("/path/odometry", 1, "CoordinateFrame:frame"),
@@ -192,6 +182,6 @@ def test_rerun_opens_it(tmp_path: Path) -> None:
         ("/loop_closures", len(RUN.closures), "vplog.LoopClosure:message"),
     ):
         assert any(f"with {rows} rows" in c and f"- {entity} -" in c and component in c for c in chunks), entity
-    frames = rerun("rrd", "print", "-vvv", "--entity", "/tf", "result.rrd")
+    frames = rerun(tmp_path, "rrd", "print", "-vvv", "--entity", "/tf", "result.rrd")
     assert "base_link" in frames
     assert "map" in frames

@@ -8,7 +8,6 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.rerun import rerun
 from tests.results.example import COUNT, METADATA, make_run
 from tests.results.test_mcap import decode, of
 from vplog.data import USED, Gps, Verdict
@@ -256,17 +256,9 @@ def test_pictures_are_jpegs_that_opencv_reads() -> None:
 @pytest.mark.skipif(importlib.util.find_spec("rerun_cli") is None, reason="rerun-sdk is not installed")
 def test_rerun_converts_the_whole_picture_and_finds_no_fault(tmp_path: Path) -> None:
     write(tmp_path / "r.mcap")
-    settings = {**os.environ, "HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path), "NO_COLOR": "1"}
-
-    def rerun(*arguments: str) -> str:
-        command = [sys.executable, "-m", "rerun_cli", *arguments]
-        done = subprocess.run(command, cwd=tmp_path, env=settings, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    rerun("mcap", "convert", "r.mcap", "-o", "r.rrd")
-    rerun("rrd", "verify", "r.rrd")
-    chunks = rerun("rrd", "print", "r.rrd").splitlines()
+    rerun(tmp_path, "mcap", "convert", "r.mcap", "-o", "r.rrd")
+    rerun(tmp_path, "rrd", "verify", "r.rrd")
+    chunks = rerun(tmp_path, "rrd", "print", "r.rrd").splitlines()
     topic = camera_topic(CAMERA)
     for entity, rows, component in (
         (f"{topic}/image", COUNT, "EncodedImage:blob"),

@@ -121,7 +121,8 @@ def test_a_link_that_allows_no_head_is_read() -> None:
         assert path.read_bytes() == DATA
 
 
-def test_nothing_there_is_nothing() -> None:
-    with saying(lambda _: b"HTTP/1.1 404 Not Found\r\n\r\n") as url:
+@pytest.mark.parametrize("status", ["404 Not Found", "410 Gone"])
+def test_nothing_there_is_nothing(status: str) -> None:
+    with saying(lambda _: f"HTTP/1.1 {status}\r\n\r\n".encode()) as url:
         assert head(url) == {}
         assert not located(url).exists()

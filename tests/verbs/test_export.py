@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import shutil
 import struct
-import subprocess
 import sys
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
@@ -17,6 +15,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from tests.rerun import rerun
 from tests.results.example import read_map
 from vplog.data import Gps, Verdict
 from vplog.geometry import geodesy, se3
@@ -164,16 +163,8 @@ def test_utm_is_the_path_in_metres(exported: Callable[[str], Path], finished: Pa
 @pytest.mark.skipif(importlib.util.find_spec("rerun_cli") is None, reason="rerun-sdk is not installed")
 def test_rerun_reads_its_own(exported: Callable[[str], Path], finished: Path, tmp_path: Path) -> None:
     path = exported("rrd")
-    settings = {**os.environ, "HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path), "NO_COLOR": "1"}
-
-    def rerun(*arguments: str) -> str:
-        command = [sys.executable, "-m", "rerun_cli", "rrd", *arguments]
-        done = subprocess.run(command, cwd=tmp_path, env=settings, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    rerun("verify", str(path))
-    chunks = rerun("print", str(path)).splitlines()
+    rerun(tmp_path, "rrd", "verify", str(path))
+    chunks = rerun(tmp_path, "rrd", "print", str(path)).splitlines()
     keyframes, _ = tables.read_keyframes(finished / "keyframes.parquet")
     for entity, rows, component in (
         ("/map/path/odometry", 1, "LineStrips3D:strips"),

@@ -33,8 +33,8 @@ _UNMOVED_M = 1e-3
 def print_status(message: str) -> None:
     """A line on stderr, wrapped as those of results; a closed or full stderr is ignored."""
     with suppress(OSError):
-        line = printable(f"vplog: {without_secrets(message, words)}")
-        print(_wrapped(line, terminal_width(sys.stderr)), file=sys.stderr)
+        text = printable(without_secrets(message, words))
+        print(_wrapped(f"vplog: {text}", terminal_width(sys.stderr)), file=sys.stderr)
 
 
 def print_traceback(_: type[BaseException], error: BaseException, __: TracebackType | None) -> None:

@@ -13,12 +13,10 @@ import numpy as np
 from vplog.data import EdgeKind
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed
-from vplog.graph.marginals import edge_covariances
 from vplog.graph.normal_equations import edge_costs
 
 if TYPE_CHECKING:
     from vplog.data import Bools, Floats, Int32s, Ints, PoseGraph
-    from vplog.graph.least_squares import Objective
 
 
 def residual_sigma(graph: PoseGraph, world_from_body: Floats, edges: Ints | None = None) -> Floats:
@@ -142,16 +140,6 @@ def far_from_odometry(graph: PoseGraph, probability: float, chain: OdometryChain
     """Loops (E,) whose distance to the odometry alone is beyond what noise reaches with this probability."""
     bound = chi2_quantile(probability, degrees_of_freedom(graph))
     return np.asarray(np.nan_to_num(residual_before(graph, chain)) ** 2 > bound)
-
-
-def redundancy(objective: Objective, poses: Floats, rows: Ints) -> float:
-    """Degrees of freedom with which the rest of what is minimised checks edges `rows`.
-
-    An edge's own less the trace of its Omega times its covariance in the solution (Foerstner 1979).
-    """
-    graph = objective.factors.graph
-    covariance = edge_covariances(objective, poses, rows)
-    return degrees_of_freedom(graph) * len(rows) - float(np.einsum("eij,eji->", informed(graph)[rows], covariance))
 
 
 @lru_cache

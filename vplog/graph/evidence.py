@@ -184,7 +184,9 @@ def _log_false(graph: PoseGraph, false: Ints, chain: OdometryChain, room: float)
         else:
             total += inner
             together.append(one)
-    return total + _log_displacements(together, chain, room), accidents
+    if together:
+        total += families(Displacements.of(together, chain), room)[1]
+    return total, accidents
 
 
 def _accidents(graph: PoseGraph, false: Ints, chain: OdometryChain, room: float) -> Iterator[Ints]:
@@ -260,11 +262,6 @@ def forward(graph: PoseGraph, edges: Ints) -> tuple[Ints, Ints, Floats, Floats]:
         np.where(back, se3.inverse(graph.a_from_b[edges]), graph.a_from_b[edges]),
         np.where(back, Ad @ noise @ np.swapaxes(Ad, 1, 2), noise),
     )
-
-
-def _log_displacements(together: list[_Run], chain: OdometryChain, room: float) -> float:
-    """Log density of the runs' displacements."""
-    return families(Displacements.of(together, chain), room)[1] if together else 0.0
 
 
 def agreeing(graph: PoseGraph, loops: Ints, chain: OdometryChain) -> list[Ints]:

@@ -78,6 +78,25 @@ class Scale:
 
 
 @dataclass(frozen=True, eq=False)
+class _Measurements:
+    """The weighted edges of a graph, and GPS fixes where there are any."""
+
+    graph: PoseGraph
+    weight: Floats
+    """(E,)."""
+    fixes: Fixes | None
+    inlier: Floats
+    """(F,) 1 for the fixes that are used, 0 for the others."""
+
+    def objective(self, scales: list[Scale], sigmas: Sigmas, poses: Floats) -> Objective:
+        """All of them with these metres and sigmas, the fixes in the world of the poses (N, 4, 4)."""
+        factors = Factors.of(rescaled(self.graph, scales, sigmas))
+        if self.fixes is None:
+            return Objective(factors, self.weight)
+        return with_fixes(factors, self.weight, poses, self.fixes, self.inlier)
+
+
+@dataclass(frozen=True, eq=False)
 class Refined:
     """A solution with what it says of the sensors."""
 
@@ -139,8 +158,9 @@ def refine(
         return _refined(rescaled(graph, [], sigmas), solution, poses, sigmas, [], fixes, inlier)
 
     scales, trail = scales if settings.scale else [], [sigmas]
+    measured = _Measurements(graph, weight, fixes, inlier)
     for _ in range(settings.max_rounds):
-        objective = _objective(rescaled(graph, scales, sigmas), weight, poses, fixes, inlier)
+        objective = measured.objective(scales, sigmas, poses)
         poses = minimised(objective, poses, _STEPS, 1e-6).world_from_body
         before, factor = sigmas, 1.0
         if settings.noise:
@@ -149,9 +169,10 @@ def refine(
             if len(trail) >= 3 and sigmas.differ(before, _STEADY):
                 sigmas = extrapolated(*trail[-3:])
                 trail = [sigmas]
-        moved = [_scale_step(graph, weight, scales, n, sigmas, poses, fixes, inlier) for n in range(len(scales))]
+        moved = [_scale_step(measured, scales, number, sigmas, poses) for number in range(len(scales))]
         if fixes is not None:
             fixes, inlier, factor = with_noise_of(fixes, inlier, poses, positions_redundancy(objective, poses))
+            measured = replace(measured, fixes=fixes, inlier=inlier)
         scales = [replace(one, value=one.value + step) for one, (step, _) in zip(scales, moved, strict=True)]
         steady = abs(np.log(factor)) <= 2.0 * _STEADY and not sigmas.differ(before, _STEADY)
         if not steady or any(abs(step) > _SMALL * sigma for step, sigma in moved):
@@ -163,9 +184,8 @@ def refine(
         scales = sure
     else:
         scales = []  # they wander
-    present = rescaled(graph, scales, sigmas)
-    poses = minimised(_objective(present, weight, poses, fixes, inlier), poses, _STEPS, 1e-6).world_from_body
-    return _refined(present, solution, poses, sigmas, scales, fixes, inlier)
+    poses = minimised(measured.objective(scales, sigmas, poses), poses, _STEPS, 1e-6).world_from_body
+    return _refined(rescaled(graph, scales, sigmas), solution, poses, sigmas, scales, fixes, inlier)
 
 
 def _lengths(graph: PoseGraph, edges: Bools) -> Floats:
@@ -191,35 +211,25 @@ def rescaled(graph: PoseGraph, scales: list[Scale], sigmas: Sigmas) -> PoseGraph
     return replace(graph, a_from_b=a_from_b, information=information)
 
 
-def _objective(graph: PoseGraph, weight: Floats, poses: Floats, fixes: Fixes | None, inlier: Floats) -> Objective:
-    """The weighted edges (E,) of the graph, and the fixes (F,) in the world of the poses where there are any."""
-    factors = Factors.of(graph)
-    return Objective(factors, weight) if fixes is None else with_fixes(factors, weight, poses, fixes, inlier)
-
-
 def _scale_step(
-    graph: PoseGraph,
-    weight: Floats,
-    scales: list[Scale],
-    number: int,
-    sigmas: Sigmas,
-    poses: Floats,
-    fixes: Fixes | None,
-    inlier: Floats,
+    measured: _Measurements, scales: list[Scale], number: int, sigmas: Sigmas, poses: Floats
 ) -> tuple[float, float]:
     """A secant step towards the scale of least error, poses following it, and the sigma of what it leads to.
 
     At the best poses for a scale the error does not change with the poses, so its slope is that with the poses fixed.
     """
-    one = scales[number]
+    one, weight = scales[number], measured.weight
 
-    def at(value: float) -> PoseGraph:
-        return rescaled(graph, [*scales[:number], replace(one, value=value), *scales[number + 1 :]], sigmas)
+    def at(value: float) -> list[Scale]:
+        return [*scales[:number], replace(one, value=value), *scales[number + 1 :]]
+
+    def chi2(value: float, best: Floats) -> float:
+        return float((weight * residual_sigma(rescaled(measured.graph, at(value), sigmas), best) ** 2).sum())
 
     def gradient(value: float) -> float:
-        best = minimised(_objective(at(value), weight, poses, fixes, inlier), poses, _STEPS, 1e-8).world_from_body
-        errors = [float((weight * residual_sigma(at(value + side), best) ** 2).sum()) for side in (-_STEP, _STEP)]
-        return (errors[1] - errors[0]) / (4.0 * _STEP) + (value - 1.0) / one.sigma**2
+        best = minimised(measured.objective(at(value), sigmas, poses), poses, _STEPS, 1e-8).world_from_body
+        slope = (chi2(value + _STEP, best) - chi2(value - _STEP, best)) / (4.0 * _STEP)
+        return slope + (value - 1.0) / one.sigma**2
 
     aside = one.sigma / 4.0
     here, there = gradient(one.value), gradient(one.value + aside)

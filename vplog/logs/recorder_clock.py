@@ -27,6 +27,10 @@ _OVERLAP = 2
 """Turns beyond these, of all topics together, by which a time was passed twice; one message more makes two."""
 _MOST_STEPS = 20
 """A clock is set a few times in a drive; times that go back more often are in no order."""
+_AROUND = 10
+"""Messages on either side of a step by which its speed is known."""
+_LONGEST_GAP_NS = 10 * 10**9
+"""ns; a way that takes longer at that speed is a jump of the poses."""
 _FURTHEST_STEP = 3
 """Times nine tenths of the steps from one message to the next: a drive that goes on does not step further."""
 
@@ -43,6 +47,8 @@ class _Drop:
     """By how much the log times go back: less than the clock was set back by, as time passed."""
     elapsed_ns: int
     """How much, by the header stamps or the period."""
+    moved_ns: int
+    """How much, by the motion over the step; 0 where it does not tell."""
     overlap: int
     """Turns from one side to the other beyond those of neighbours."""
     continuous: bool
@@ -60,7 +66,8 @@ def correct_clock_steps(topics: Iterable[Stamps], notes: Notes) -> None:
         drops = [drop for drop in drops if drop.before >= position]
         if sum(drop.overlap for drop in group) >= _OVERLAP or any(drop.continuous for drop in group):
             fastest = min(group, key=lambda drop: (drop.period_ns, drop.elapsed_ns))
-            steps.append((position, max(fastest.back_ns + fastest.elapsed_ns, *(drop.back_ns for drop in group))))
+            sizes = (drop.back_ns + drop.moved_ns for drop in group)
+            steps.append((position, max(fastest.back_ns + fastest.elapsed_ns, *sizes)))
     if not 0 < len(steps) <= _MOST_STEPS:
         return
     positions, sizes = np.transpose(np.array(steps, np.int64))
@@ -99,11 +106,21 @@ def _drops(one: Stamps) -> list[_Drop]:
             _Drop(
                 int(positions[row - 1]), int(positions[row]), period,
                 -int(step[row - 1]), elapsed if elapsed > 0 else period,
+                0 if elapsed > 0 or one.xyz_m is None else _time_by_motion(one.xyz_m, row, period),
                 max(_alternations(log_ns[before], log_ns[behind]) - _ALTERNATIONS, 0),
                 _is_continuous(log_ns, one.xyz_m, row),
             )
         )  # fmt: skip
     return found
+
+
+def _time_by_motion(xyz_m: Floats, row: int, period_ns: int) -> int:
+    """How long the way from the row before takes at the speed around it, in ns; 0 where that is a jump, no motion."""
+    near = slice(max(row - _AROUND, 0), row + _AROUND)
+    step_m = np.linalg.norm(np.diff(xyz_m[near], axis=0), axis=1)
+    usual_m = float(np.median(step_m[step_m > 0])) if step_m.any() else np.inf
+    elapsed_ns = int(period_ns * np.linalg.norm(xyz_m[row] - xyz_m[row - 1]) / usual_m)
+    return elapsed_ns if elapsed_ns < _LONGEST_GAP_NS else 0
 
 
 def _duplicates(one: Stamps, log_ns: Ints, header_ns: Ints, before: Ints, behind: Ints) -> np.ndarray:

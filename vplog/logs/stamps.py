@@ -156,8 +156,10 @@ def _no_clock(header_ns: Ints, log_ns: Ints) -> str:
     """Why header stamps are no times, as it follows the topic's name; empty where they may be."""
     if len(np.unique(header_ns)) * _STANDING < len(header_ns):
         return "has header stamps that do not advance"
-    steps = np.diff(header_ns[np.argsort(log_ns, kind="stable")])
-    if len(steps) >= _STANDING and 2 * int((steps < 0).sum()) > len(steps):
+    ordered = header_ns[np.argsort(log_ns, kind="stable")]
+    steps, part = np.diff(ordered), len(ordered) // 4  # those of a link's bursts are in no order, and yet advance
+    falls = part and np.median(ordered[-part:]) < np.median(ordered[:part])
+    if len(steps) >= _STANDING and falls and 2 * int((steps < 0).sum()) > len(steps):
         return "has header stamps that run backwards"
     late_ns = log_ns - header_ns  # whole seconds are later by up to one; a receiver's on the second, by as much always
     spread_ns = float(np.subtract(*np.quantile(late_ns, (0.9, 0.1))))

@@ -151,8 +151,7 @@ def body_covariance(odom_from_body: Floats, logged: Floats) -> Floats:
     dt in the fixed axes; so each 3x3 block S becomes R^T S R. Rows that no noise can have (all zero, NaN, a negative
     variance: -1 first is ROS's mark for unknown) are NaN.
     """
-    variances = np.diagonal(logged, axis1=1, axis2=2)
-    usable = np.asarray((np.abs(logged) < _LARGEST).all((1, 2)) & (variances >= 0).all(1) & logged.any((1, 2)))
+    usable = _is_set(logged)
     result = logged[:, _ROTATION_FIRST][:, :, _ROTATION_FIRST]
     turn = np.zeros_like(result)
     turn[:, :3, :3] = turn[:, 3:, 3:] = np.swapaxes(odom_from_body[:, :3, :3], 1, 2)
@@ -160,6 +159,12 @@ def body_covariance(odom_from_body: Floats, logged: Floats) -> Floats:
     result = (result + np.swapaxes(result, 1, 2)) / 2  # symmetric to the last bit
     result[~usable] = np.nan
     return result
+
+
+def _is_set(covariance: Floats) -> np.ndarray:
+    """(T,) bool: whether (T, N, N) covariances are known: not all zero, nor NaN, infinite or of a negative variance."""
+    variances = np.diagonal(covariance, axis1=1, axis2=2)
+    return np.asarray((np.abs(covariance) < _LARGEST).all((1, 2)) & (variances >= 0).all(1) & covariance.any((1, 2)))
 
 
 class GyroTrack:
@@ -227,7 +232,7 @@ class FixTrack:
             return None
         fixes = [self._fixes[row] for row in rows]
         covariance = np.array([fix.covariance for fix in fixes])
-        covariance[~(covariance.any((1, 2)) & (np.abs(covariance) < _LARGEST).all((1, 2)))] = np.nan
+        covariance[~_is_set(covariance)] = np.nan
         latitude, longitude, altitude = np.array(
             [(fix.latitude_deg, fix.longitude_deg, fix.altitude_m) for fix in fixes], np.float64
         ).T

@@ -8,6 +8,7 @@ a table. No clock, path or thread count enters a file, and row groups have a fix
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -445,6 +446,18 @@ def read_metadata(path: Path) -> dict[str, str]:
     with _reading(path):
         header = read_schema(path).metadata or {}
         return {key.decode(): value.decode() for key, value in sorted(header.items()) if key.startswith(b"vplog.")}
+
+
+def read_table_metadata(path: Path) -> TableMetadata:
+    """What a table was made with, by its header. Raises ResultError where that lacks the settings."""
+    header = read_metadata(path)
+    try:
+        settings = json.loads(header.get("vplog.settings", "null"))
+    except (ValueError, RecursionError):
+        settings = None
+    if not isinstance(settings, dict):
+        raise ResultError(f"{path} lacks its settings. Compute it again from its log.")
+    return TableMetadata(settings, header.get("vplog.library", ""))
 
 
 def placed_table(columns: Sequence[Any]) -> pa.Table:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -46,6 +47,28 @@ def test_chunks_come_in_turn_and_damaged_ones_are_told(threads: bool, monkeypatc
     next(some)
     some.close()
     assert loaded[-1] == 100  # who looks for one does not load those behind it
+
+
+def test_no_more_is_unpacked_ahead_than_may_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And whoever stops in the middle leaves nothing behind."""
+    monkeypatch.setattr(chunks_module, "_ALONE_S", 0.0)
+    monkeypatch.setattr(chunks_module, "_AHEAD_BYTES", 2 * 2**20)
+    size, loaded = 2**20, []
+
+    def load(number: int) -> bytes:
+        loaded.append(number)
+        return bytes([number]) * size
+
+    chunks = Chunks(load, lambda *_: None, lambda _: size, lambda _: False, True)
+    for number, data in chunks.iterate(range(12)):
+        time.sleep(0.01)
+        assert data == bytes([number]) * size
+        assert max(loaded) <= number + 1
+    loaded.clear()
+    some = chunks.iterate(range(100, 200), lambda number: number == 102)
+    assert [next(some)[0], next(some)[0]] == [100, 101]
+    some.close()
+    assert max(loaded) <= 103
 
 
 def test_what_is_kept_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

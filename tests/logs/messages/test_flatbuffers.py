@@ -113,6 +113,18 @@ def test_every_type_agrees_with_protobuf() -> None:
                 np.testing.assert_array_equal(getattr(a, key), expected, err_msg=f"{name}.{key}")
 
 
+def test_a_vector_longer_than_the_message_is_an_error() -> None:
+    """Not what there is of it."""
+    from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+
+    data = bytearray(flat(CompressedImage(frame_id="camera", data=b"0123456789", format="png")))
+    at = data.index(b"0123456789")
+    assert data[at - 4 : at] == (10).to_bytes(4, "little")
+    data[at - 4 : at] = (len(data)).to_bytes(4, "little")
+    with pytest.raises(BadMessageError, match="a vector of it points outside"):
+        decode(Channel("/t", "foxglove.CompressedImage", "flatbuffer"), bytes(data))
+
+
 @given(st.binary(max_size=120), st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), max_size=4))
 def test_damage_is_a_known_error_or_a_message(junk: bytes, flips: list[tuple[int, int]]) -> None:
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage

@@ -7,6 +7,7 @@ import shutil
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from tests.benchmarks.scale import made_up_library, write_drive
@@ -16,10 +17,10 @@ from vplog.batch.batch import settings_for
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.joining.joint_record import read_joint, write_joint
 from vplog.maps.search.index import update_index
-from vplog.maps.storage import map_store
+from vplog.maps.storage import lease_lock, map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import damaged_files
-from vplog.maps.storage.layout import drive_record
+from vplog.maps.storage.layout import drive_record, set_drive_id
 from vplog.maps.storage.map_store import Store, folder_name
 from vplog.pipeline import load_pipeline
 from vplog.places.bobb import BobbSettings
@@ -285,3 +286,18 @@ def test_a_setting_that_is_gone_and_was_off_stops_no_old_map(tmp_path: Path) -> 
                 settings_for(store.root)
         else:
             assert settings_for(store.root) == load_pipeline("default")
+
+
+@pytest.mark.parametrize("settings", [None, "", "[]", "[" * 10**6])
+def test_a_table_without_its_settings_is_said_in_one_line(settings: str | None, tmp_path: Path) -> None:
+    path = make_map(tmp_path / "map", DRIVES) / "runs" / folder_name("walk") / "keyframes.parquet"
+    table = pq.read_table(path)
+    header = {key: value for key, value in table.schema.metadata.items() if key != b"vplog.settings"}
+    path.unlink()
+    pq.write_table(table.replace_schema_metadata(header | ({"vplog.settings": settings} if settings else {})), path)
+    with pytest.raises(ResultError, match=r"keyframes\.parquet lacks its settings"):
+        set_drive_id(path, "stroll")
+
+
+def test_a_lock_of_nested_brackets_names_no_holder() -> None:
+    assert lease_lock._holder(b"[" * 10**6) == {}

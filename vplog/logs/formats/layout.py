@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from vplog.errors import plural
-from vplog.logs.formats.container import topics_of
+from vplog.logs.formats.container import Contents, by_topic, topics_of
+from vplog.logs.formats.loss_account import main_span
 
 if TYPE_CHECKING:
     import re
@@ -143,27 +145,59 @@ class ChunkLosses:
         known = self.channels
         return not chunk.counts or any(known.get(i) in wanted or i not in known for i in chunk.counts)
 
+    def is_counted(self, number: int) -> bool:
+        """Whether a chunk has indexes, and all of them: a file may be cut between those of its last one."""
+        layout = self.layout
+        return bool(layout.chunks[number].counts) and (bool(layout.recorded) or number + 1 < len(layout.chunks))
+
     def add_chunk(self, chunk: Chunk, counts: Mapping[int, int], spans: list[Span], what: str) -> None:
         """Messages by channel id that are lost of a damaged chunk; `what` ends the sentence about it."""
         lost = topics_of(counts, self.channels) if chunk.counts else None
         detail = f"{self.name} has a damaged chunk at byte {chunk.start}{what}."
         self.notes.account.add("damaged_chunk", lost, (self.name, chunk.start), spans, detail)
 
-    def add_unknown(self, chunk: Chunk, count: int, spans: list[Span]) -> None:
-        """Messages of channels that nothing defines so far; none where they are defined by now."""
+    def add_unknown(self, chunk: Chunk, counts: Mapping[int, int], damaged: bool, spans: list[Span]) -> None:
+        """Messages of channels that nothing defines so far; none where they are defined by now. Those of a damaged
+        chunk on a channel that its indexes do not list are among what it lacks."""
+        known = self.channels
+        count = sum(
+            n for i, n in counts.items() if i not in known and (i in chunk.counts or not (damaged and chunk.counts))
+        )
         self.notes.account.add("unknown_channel", {"": count} if count else {}, (self.name, chunk.start), spans)
 
-    def add_missing(self, found: Mapping[str, int], span: Span, detail: str) -> dict[str, int]:
-        """The chunks in damaged bytes, of a file whose messages cover `span`. Messages by topic, found or lost."""
-        total = dict(found)
-        for chunk in self.layout.missing:
+    def contents(self, by_id: Mapping[int, int], times: list[int], what: str) -> Contents:
+        """The messages per channel id that were found, at these log times (of each chunk the first and the last), held
+        against `what` the file says of itself."""
+        counts = dict.fromkeys(self.channels.values(), 0)
+        for number in by_id.keys() & self.channels.keys():
+            counts[self.channels[number]] += by_id[number]
+        self._account_for(by_topic(counts), main_span(times), what)
+        return Contents(dict(sorted(counts.items())), min(times, default=0), max(times, default=0))
+
+    def _account_for(self, found: Mapping[str, int], span: Span, what: str) -> None:
+        """What was not found, of a file whose messages cover `span`, and how much of what was recorded that is."""
+        layout, account, name = self.layout, self.notes.account, self.name
+        recorded = topics_of(layout.recorded, self.channels)
+        total = Counter(found)
+        for chunk in layout.missing:
             counts = topics_of(chunk.counts, self.channels)
             when = (chunk.first_ns, chunk.last_ns) if chunk.last_ns else self.between(chunk.start, span)
-            about = detail and f"{self.name} {detail} {chunk.start}."
-            self.notes.account.add("damaged_bytes", counts or None, (self.name, chunk.start), [when], about)
-            for topic, count in counts.items():
-                total[topic] = total.get(topic, 0) + count
-        return total
+            detail = f"{name} is damaged near byte {chunk.start}."
+            account.add("damaged_bytes", counts or None, (name, chunk.start), [when], detail)
+            total.update(counts)
+        for start, stop in layout.gaps:
+            detail = f"{name} is damaged near byte {start}; reading resumes at byte {stop}."
+            account.add("damaged_bytes", None, (name, -start), [self.between(start, span)], detail)
+        if layout.unknown_at is not None and (not recorded or total.total() < sum(recorded.values())):
+            detail = f"{name} has a record of an unknown kind at byte {layout.unknown_at}."
+            account.add("damaged_bytes", None, (name, layout.unknown_at), [span], detail)
+        self._add_end(sum(found.values()), [(span[1], span[1])])
+        whole = layout.cut_at is None and not layout.gaps and all(chunk.counts for chunk in layout.missing)
+        account.set_recorded(name, recorded or (total if whole else {}), *span)
+        unexplained = account.reconcile({name}, recorded, found)
+        if unexplained and sum(recorded.values()) > total.total():  # else it names other topics
+            detail = f"The {what} of {name} counts more messages than it holds."
+            account.add("damaged_bytes", unexplained, (name, 0), [span], detail)
 
     def between(self, position: int, span: Span) -> Span:
         """The time between the chunk before a damaged place and the one behind it; `span` is that of the file."""
@@ -172,7 +206,7 @@ class ChunkLosses:
         behind = min((chunk.first_ns for chunk in chunks if chunk.start > position), default=span[1])
         return before, behind
 
-    def add_end(self, messages: int, spans: list[Span]) -> None:
+    def _add_end(self, messages: int, spans: list[Span]) -> None:
         """Where the file is cut, or goes on with another recording, behind so many messages."""
         layout, account, name = self.layout, self.notes.account, self.name
         if layout.cut_at is not None:

@@ -212,15 +212,23 @@ class LossAccount:
 
     def _in_log(self, reason: str, spans: list[Span]) -> list[Span]:
         """The spans without what is far from the log: stamps that damage has changed."""
-        start, end = self.start_ns, max(self.start_ns or 0, self.end_ns)
         if reason not in _HOW_MANY_OPEN:
             return spans
         spans = [(a or b, b) for a, b in spans if b]  # 0 is no time
-        if start is None:
-            return spans
+        start, end = self._span
         least, most = start - _FARTHEST_NS, end + _FARTHEST_NS
         ends = [(max(a, min(start, b)) if a < least else a, min(b, max(end, a)) if b > most else b) for a, b in spans]
         return [(a, b) for a, b in ends if a <= most and b >= least]
+
+    @property
+    def _span(self) -> Span:
+        """Log times of the first and last message; where none was found, where most of the lost ones lie."""
+        if self.start_ns is not None:
+            return self.start_ns, max(self.start_ns, self.end_ns)
+        found = [
+            ns for places in self._copy().values() for lost in places.values() for span in lost.spans for ns in span
+        ]
+        return main_span([ns for ns in found if ns])
 
     @property
     def sentences(self) -> list[str]:

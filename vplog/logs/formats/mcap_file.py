@@ -14,9 +14,9 @@ from mcap.opcode import Opcode
 
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
 from vplog.logs.formats.compression import BadChunkError, crc32, unpack
-from vplog.logs.formats.container import Channel, Contents, Notes, by_topic, topics_of
+from vplog.logs.formats.container import Channel, Contents, Notes
 from vplog.logs.formats.layout import ChunkLosses
-from vplog.logs.formats.loss_account import main_span, sampled
+from vplog.logs.formats.loss_account import sampled
 from vplog.logs.formats.mcap_chunk import ChunkReader
 from vplog.logs.formats.mcap_layout import MAGIC, RECORD, read_layout
 from vplog.storage.remote_path import RemotePath
@@ -66,18 +66,17 @@ class McapFile:
         listed = sum((Counter(chunk.counts) for chunk in layout.missing), +by_id)
         if layout.recorded and layout.recorded != dict(listed) and layout.chunks:
             by_id, times = self._counted(unpack_all=True)
-        counts = dict.fromkeys(self._channels.values(), 0)
-        for channel_id in by_id.keys() & self._channels.keys():
-            counts[self._channels[channel_id]] += by_id[channel_id]
-        self._account_for(by_topic(counts), main_span(times))
-        return Contents(dict(sorted(counts.items())), min(times, default=0), max(times, default=0))
+        for number in self._unread:  # more channels may be defined by now
+            self._add_unread(number)
+        return self._losses.contents(by_id, times, "statistics record")
 
     def _counted(self, unpack_all: bool) -> tuple[Counter[int], list[int]]:
         """Messages by channel id, and log times of each chunk, the first and last among them."""
         counts: Counter[int] = Counter()
         times: list[int] = []
         for number, chunk in enumerate(self._layout.chunks):
-            if chunk.counts and chunk.counts.keys() <= self._channels.keys() and not unpack_all:
+            sure = self._losses.is_counted(number) and not unpack_all
+            if sure and chunk.counts.keys() <= self._channels.keys():
                 counts.update(chunk.counts)
                 times += (chunk.first_ns, chunk.last_ns)
             else:
@@ -86,6 +85,8 @@ class McapFile:
                 times += sampled(reader.whole(data).log_ns)
                 damaged = self._account_for_chunk(chunk, reader) or not data
                 counts.update(reader.counts | Counter(chunk.counts) if damaged else reader.counts)
+                if not damaged:
+                    chunk.counts = dict(reader.counts)
         return counts, times
 
     def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
@@ -109,27 +110,6 @@ class McapFile:
         if self._local and _is_plain(chunk):  # as when its messages were found
             return self._at(chunk.start + start, stop - start)
         return self._data.part(number, start, stop)
-
-    def _account_for(self, found: dict[str, int], span: tuple[int, int]) -> None:
-        """What was not found, and how much of what was recorded that is."""
-        layout, account, name = self._layout, self._notes.account, self._name
-        for number in self._unread:  # more channels may be defined by now
-            self._add_unread(number)
-        recorded = topics_of(layout.recorded, self._channels)
-        total = self._losses.add_missing(found, span, "")
-        for start, stop in layout.gaps:
-            detail = f"{name} is damaged near byte {start}; reading resumes at byte {stop}."
-            account.add("damaged_bytes", None, (name, -start), [self._losses.between(start, span)], detail)
-        if layout.unknown_at is not None and (not recorded or sum(total.values()) < sum(recorded.values())):
-            detail = f"{name} has a record of an unknown kind at byte {layout.unknown_at}."
-            account.add("damaged_bytes", None, (name, layout.unknown_at), [span], detail)
-        self._losses.add_end(sum(found.values()), [(span[1], span[1])])
-        whole = layout.cut_at is None and not layout.gaps
-        account.set_recorded(name, recorded or (total if whole or layout.missing else {}), *span)
-        unexplained = account.reconcile({name}, recorded, found)
-        if unexplained and sum(recorded.values()) > sum(total.values()):  # else it names other topics
-            detail = f"The statistics of {name} count more messages than it holds."
-            account.add("damaged_bytes", unexplained, (name, 0), [span], detail)
 
     def _define(self, opcode: int, data: bytes, doubtful: bool = False) -> None:
         """Take a schema or a channel: the first sound definition of a number, or a doubtful one until there is a sound
@@ -174,8 +154,7 @@ class McapFile:
             span = min(last_ns, chunk.last_ns), chunk.last_ns
             short = {i: n - counts[i] for i, n in chunk.counts.items()}
             self._losses.add_chunk(chunk, short, [span], "; the rest of it is left out")
-        unknown = sum(count for channel_id, count in counts.items() if channel_id not in self._channels)
-        self._losses.add_unknown(chunk, unknown, [(chunk.first_ns, chunk.last_ns)])
+        self._losses.add_unknown(chunk, counts, damaged, [(chunk.first_ns, chunk.last_ns)])
         return damaged
 
     def _unpack(self, number: int) -> bytes:

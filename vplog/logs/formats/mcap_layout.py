@@ -203,7 +203,9 @@ class _LayoutReader:
     def _entries_stop(self, start: int) -> int:
         """Where the entries of a message index stop, by their times, which are those of its chunk."""
         chunk, at = self._indexing, start + 6
-        while chunk and chunk.first_ns <= int.from_bytes(self.at(at, 8), "little") <= chunk.last_ns > 0:
+        while chunk and at + _ENTRY <= self._length:
+            if not chunk.first_ns <= int.from_bytes(self.at(at, 8), "little") <= chunk.last_ns:
+                break
             at += _ENTRY
         return at
 
@@ -323,8 +325,12 @@ class _LayoutReader:
         if chunks and chunks[-1].record >= 0:
             chunks[-1].doubtful = True
         if not self._indexed and self.at(found, 1) == bytes([Opcode.MESSAGE_INDEX]):
-            self._indexing = Chunk(position, found)
-            self.layout.missing.append(self._indexing)
+            first_ns = int.from_bytes(self.at(found + _INDEX_HEAD.size, 8), "little")
+            if chunks and chunks[-1].record >= 0 and chunks[-1].first_ns <= first_ns <= chunks[-1].last_ns:
+                self._indexing = chunks[-1]
+            else:
+                self._indexing = Chunk(position, found)
+                self.layout.missing.append(self._indexing)
         if found - position >= (_LEAST_CHUNK if self._chunked else RECORD.size + _MESSAGE_HEAD.size):
             self.layout.gaps.append((position, found))  # else no message has room in it
         return found

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
 from vplog.logs.formats.compression import BadChunkError, unpack
-from vplog.logs.formats.container import Channel, Contents, Notes, block_of, by_topic, topics_of
+from vplog.logs.formats.container import Channel, Contents, Notes, block_of
 from vplog.logs.formats.layout import ChunkLosses
-from vplog.logs.formats.loss_account import main_span, sampled
+from vplog.logs.formats.loss_account import sampled
 from vplog.logs.formats.ros1_layout import CONNECTION, MAGIC, MESSAGE, fields, number, read_layout, time_ns
 from vplog.storage.remote_path import RemotePath
 
@@ -29,7 +29,7 @@ class Ros1Bag:
 
     def __init__(self, path: Path, notes: Notes, name: str = "") -> None:
         """`name` is what the file is called in remarks."""
-        self._name, self._account, length = name or path.name, notes.account, path.stat().st_size
+        self._name, length = name or path.name, path.stat().st_size
         self._file = path.open("rb")
         self._channels: dict[int, Channel] = {}
         self._doubtful: dict[int, Channel] = {}
@@ -50,18 +50,14 @@ class Ros1Bag:
             for connection, channel in self._doubtful.items():
                 self._channels.setdefault(connection, channel)
             by_id, times = self._counted()
-        counts = Counter(dict.fromkeys(self._channels.values(), 0))
-        for connection in by_id.keys() & self._channels.keys():
-            counts[self._channels[connection]] += by_id[connection]
-        self._account_for(by_topic(counts), main_span(times))
-        return Contents(dict(sorted(counts.items())), min(times, default=0), max(times, default=0))
+        return self._losses.contents(by_id, times, "index")
 
     def _counted(self) -> tuple[Counter[int], list[int]]:
         """Messages by connection, and log times of each chunk, the first and last among them."""
         counts: Counter[int] = Counter()
         times: list[int] = []
         for row, chunk in enumerate(self._layout.chunks):
-            if chunk.counts and chunk.counts.keys() <= self._channels.keys() and chunk.last_ns:
+            if self._losses.is_counted(row) and chunk.counts.keys() <= self._channels.keys() and chunk.last_ns:
                 found = chunk.counts
                 times += chunk.first_ns, chunk.last_ns
             else:
@@ -71,6 +67,8 @@ class Ros1Bag:
                 chunk.first_ns = min([*own, chunk.first_ns] if chunk.first_ns else own, default=0)
                 chunk.last_ns = max([*own, chunk.last_ns])
                 times += sampled(own)
+                if not chunk.damaged:
+                    chunk.counts = dict(found)
             if chunk.damaged:
                 found = Counter(found) | Counter(chunk.counts)
             if chunk.listed and (chunk.disputed or not chunk.damaged) and found != chunk.listed:
@@ -92,15 +90,6 @@ class Ros1Bag:
 
     def read(self, place: Place) -> Octets:
         return self._data.part(*place)
-
-    def _account_for(self, found: dict[str, int], span: tuple[int, int]) -> None:
-        layout = self._layout
-        total = self._losses.add_missing(found, span, "is damaged near byte")
-        self._losses.add_end(sum(found.values()), [(span[1], span[1])] if span[1] else [])
-        whole = layout.cut_at is None and all(chunk.counts for chunk in layout.missing)
-        listed = topics_of(layout.recorded, self._channels)
-        self._account.set_recorded(self._name, listed or (total if whole else {}), *span)
-        self._account.reconcile({self._name}, listed, found)
 
     def _connect(self, header: dict[bytes, bytes], data: bytes) -> None:
         """The first sound definition of a connection holds, and a damaged one where there is no sound one."""
@@ -136,7 +125,7 @@ class Ros1Bag:
             chunk.damaged = True
             short = {i: count - counts[i] for i, count in chunk.counts.items()}
             self._losses.add_chunk(chunk, short, span, "; the rest of it is left out")
-        self._losses.add_unknown(chunk, sum(n for i, n in counts.items() if i not in self._channels), span)
+        self._losses.add_unknown(chunk, counts, damaged, span)
         return found
 
     def _unpack(self, row: int) -> bytes:

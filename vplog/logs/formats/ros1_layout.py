@@ -12,6 +12,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
+from vplog.logs.formats.compression import frame_length
 from vplog.logs.formats.layout import MOST_GAPS, Chunk, Layout, ResyncSearch
 
 if TYPE_CHECKING:
@@ -35,18 +36,25 @@ _FIELDS = {
 """What the header of each kind of record outside the chunks has."""
 _ENTRY = {_INDEX: 12, _CHUNK_INFO: 8}
 """Bytes of each of the `count` entries of a record: time and offset of a message; a connection and its count."""
-_FIRST = re.compile(rb"(?:op|compression|size|ver|conn|count|chunk_pos|start_time|end_time)=")
-"""Names in the headers of chunks and of indexes."""
-_RECORD_START = re.compile(rb".\x00\x00\x00[\x04-\x1b]\x00\x00\x00(?=%s)" % _FIRST.pattern, re.DOTALL)
+_RECORD_START = re.compile(
+    rb".\x00\x00\x00[\x04-\x1b]\x00\x00\x00(?=(?:op|compression|size|ver|conn|count|chunk_pos|start_time|end_time)=)",
+    re.DOTALL,
+)
 """Length of a header below 256 bytes, and its first field, one of a chunk's or an index's."""
 _BEGIN = re.compile(re.escape(MAGIC))
 """How a recording begins: another one may be appended to the first."""
 _HEAD = 256
 """Bytes in which the head of a record ends, but for a connection's of a long topic."""
-_NAME = re.compile(rb"(compression|size)=|(?:ver|conn|count|topic|index_pos|conn_count|chunk_count|chunk_pos)=")
-"""Names in the header of a chunk, and those that no chunk has."""
-_HEADS = re.compile(rb"compression=|(?<!_)count=")
-"""A name in the header of every chunk, and of every index; neither is in the records that lie in chunks."""
+_MAX_CHUNK = 2**28
+"""Bytes of a packed chunk whose end is looked for; recorders make them of 768 kB."""
+_LEAST_CHUNK = 48
+"""Bytes of a chunk record without data."""
+_VALUES = re.compile(
+    rb"compression=(?:none|lz4|bz2)|op=.|(?:size|ver|conn|count|(?:conn|chunk)_count)=.{4}|"
+    rb"(?:(?:index|chunk)_pos|(?:start|end)_time)=.{8}",
+    re.DOTALL,
+)
+"""Fields in the headers of all records but connections, whatever the lengths before them."""
 
 
 _Head = tuple[dict[bytes, bytes] | None, int, int]
@@ -82,9 +90,10 @@ class _LayoutReader:
         while position < self._length or position == len(MAGIC):
             header, start, stop = self._head(position)
             found, inside = None, header is not None and number(header, b"op") == _CHUNK
+            lost = False
             if header is None or not self._is_sound(header) or not self._is_record(stop, behind_chunk=inside):
                 found = self._next_record(position) if len(self.layout.gaps) < MOST_GAPS else None
-                if header is None or not self._is_sound(header):
+                if header is None or not self._is_sound(header) or (found or start) < start:
                     if position == self.layout.appended_at:
                         return
                     if found is None:
@@ -95,84 +104,117 @@ class _LayoutReader:
                     self._skip(position, found)
                     position = found
                     continue
-                stop = self._stop(header, start, stop, found)
-            self._record(number(header, b"op"), header, position, start, stop)
-            if stop == found:
-                self._miss_chunk(start, stop, self._heads(start, stop))
+                stop, lost = self._stop(header, start, stop, found)
+            if inside or not lost:
+                self._record(number(header, b"op"), header, position, start, stop)
+            if lost:
+                self._skip(position, stop, known=inside)
             position = stop
         if position > self._length or (self._index_at > self._length and not self._infos):
             self.layout.cut_at = self._length
 
-    def _stop(self, header: dict[bytes, bytes], start: int, stop: int, found: int | None) -> int:
-        """Where a record stops that has none behind it: by its header, or else where the next one is found if its
-        length is what is damaged."""
-        length = self._length_by_header(header)
-        if length is not None and self._is_record(start + length):
-            return start + length
-        if found is None or (stop < found and self._is_damaged_head(stop)):
-            return stop
-        self.layout.gaps.append((start, found))
-        return found
+    def _stop(self, header: dict[bytes, bytes], start: int, stop: int, found: int | None) -> tuple[int, bool]:
+        """Where a record stops that has none behind it, and whether more than its own bytes may lie up to there."""
+        end, in_chunk = self._end_by_content(header, start, max(stop, found or 0)), number(header, b"op") == _CHUNK
+        is_sure = in_chunk and header[b"compression"] != b"none"
+        is_sure |= number(header, b"op") != _BAG and end is not None and self._is_record(end, behind_chunk=in_chunk)
+        if end is not None and (is_sure or end in (stop, found)):
+            return end, False
+        return stop if found is None else found, found is not None
 
-    def _is_damaged_head(self, position: int) -> bool:
-        """Whether two of three signs are there of a header: its length, and length and name of its first field."""
-        data = self.at(position, 8 + 16)
-        header, first = (int.from_bytes(data[at : at + 4], "little") for at in (0, 4))
-        return (header <= _MAX_HEADER) + (first < _HEAD) + bool(_FIRST.match(data, 8)) >= 2
+    def _end_by_content(self, header: dict[bytes, bytes], start: int, most: int) -> int | None:
+        """Where the data of a record stop by its header, or by themselves; they are tried up to `most`."""
+        op = number(header, b"op")
+        if op in _ENTRY:
+            return start + _ENTRY[op] * number(header, b"count")
+        if op == _BAG:  # filled up with blanks
+            return most - len(self.at(start, most - start).lstrip())
+        if op != _CHUNK or header[b"compression"] == b"none":
+            return start + number(header, b"size") if op == _CHUNK else None
+        data = self.at(start, min(most - start, _MAX_CHUNK))
+        length = frame_length(header[b"compression"].decode("ascii", "replace"), data)
+        return None if length is None else start + length
 
-    def _skip(self, position: int, found: int) -> None:
-        """Take note of bytes without a record, and of the chunk that may lie in them."""
+    def _skip(self, position: int, found: int, known: bool = False) -> None:
+        """Take note of bytes without a record, and of the chunk that may lie in them. `known`: the first is a chunk
+        that is read."""
         self.layout.gaps.append((position, found))
-        named = _NAME.search(self.at(position, min(_HEAD, found - position)))
-        in_chunk = named is None or named[1] is not None
-        self._miss_chunk(position, found, self._heads(position, found), in_chunk)
-
-    def _miss_chunk(self, position: int, found: int, heads: list[int], in_chunk: bool = False) -> None:
-        """Doubt the chunk before damaged bytes, unless they begin in the next one, and take note of one in them."""
-        if self._indexing is not None and not in_chunk:
+        kinds = self._kinds_left(position, found)
+        kinds = kinds[1:] if known and kinds else kinds
+        if self._indexing is not None and (not kinds or kinds[0] != _CHUNK):
             self._indexing.doubtful = True
-        if in_chunk or _CHUNK in heads:
-            own = heads[heads.index(_CHUNK) + 1 :] if _CHUNK in heads else heads
-            self._indexing = Chunk(position, found, record=position, doubtful=bool(own))
+        if (kinds is None or _CHUNK in kinds) and not self._is_behind_chunks(position):
+            self._indexing = Chunk(position, found, record=position, doubtful=kinds != [_CHUNK])
             self.layout.missing.append(self._indexing)
 
-    def _heads(self, start: int, stop: int) -> list[int]:
-        """Kinds of the chunks and indexes in damaged bytes, by the names that are left of them."""
-        found: list[int] = []
-        self._search.first(_HEADS, start, lambda at: found.append(_CHUNK if self.at(at, 3) == b"com" else _INDEX), stop)
-        return found
+    def _is_behind_chunks(self, position: int) -> bool:
+        """Whether the bag's index lies before a position."""
+        chunks = self.layout.chunks
+        return (chunks[-1].record if chunks else 0) < self._index_at <= position
+
+    def _kinds_left(self, position: int, found: int) -> list[int] | None:
+        """Kinds of the records in damaged bytes, by what is left of their heads; None where anything may lie there."""
+        kinds: list[int] = []
+        if position == len(MAGIC) and not self.at(position + _HEAD, min(found - position - _HEAD, _MAX_HEADER)).strip():
+            return kinds  # the blanks of the bag's own header
+        while found - position >= _LEAST_CHUNK:
+            kind, ends = self._ends_left(position)
+            behind = (end for end in sorted(ends) if position < end < found and _VALUES.match(self.at(end + 8, _HEAD)))
+            end = found if found in ends else next(behind, None)
+            if end is None or len(kinds) > MOST_GAPS:
+                return None
+            kinds.append(kind)
+            position = end
+        return kinds
+
+    def _ends_left(self, position: int) -> tuple[int, set[int]]:
+        """Kind of a damaged record, and where it may stop by each of its lengths that damage may have left."""
+        head, end = self.at(position, _HEAD), 4
+        values: dict[bytes, bytes] = {}
+        while field := _VALUES.match(head, end + 4):
+            name, _, values[name] = field[0].partition(b"=")
+            end = field.end()
+        is_chunk = values.keys() <= _FIELDS[_CHUNK] | {b"op"}
+        starts = [position + 8 + int.from_bytes(head[:4], "little"), position + end + 4]
+        ends = {start + int.from_bytes(self.at(start - 4, 4), "little") for start in starts}
+        by_header = (number(values, b"size"), _ENTRY[_INDEX] * number(values, b"count"))
+        return _CHUNK if is_chunk else _INDEX, ends | {start + length for start in starts for length in by_header}
 
     def finish(self) -> None:
         """Hold what was found against the bag's index."""
         layout = self.layout
         found = {chunk.record: chunk for chunk in layout.chunks}
         skipped = {chunk.record: chunk for chunk in layout.missing}
-        listed = len(self._infos) == self._chunk_count
+        layout.missing, listed = [], len(self._infos) == self._chunk_count
+        others = (chunk for chunk in layout.chunks if chunk.record not in self._infos and not chunk.doubtful)
+        shifted = {(frozenset(chunk.counts.items()), chunk.last_ns) for chunk in others}  # by bytes inserted or lost
         for offset, info in sorted(self._infos.items()):
-            if (chunk := found.get(offset)) is not None:
+            if (chunk := found.get(offset)) is not None and not _is_another(chunk, info):
                 chunk.first_ns, chunk.last_ns = info.first_ns, info.last_ns
                 if chunk.counts and chunk.counts != info.counts and not chunk.doubtful:
                     chunk.doubtful = chunk.disputed = True
                 chunk.listed = info.counts
                 chunk.counts = chunk.counts or ({} if info.doubtful else info.counts)
-            elif self._is_chunk(offset):  # it was jumped over
+            elif chunk is None and self._is_chunk(offset):  # it was jumped over
                 header, start, stop = self._head(offset)
                 self._record(_CHUNK, header or {}, offset, start, stop)
                 layout.chunks[-1].counts = info.counts
+            elif (frozenset(info.counts.items()), info.last_ns) in shifted:
+                listed = False
             elif gaps := [start for start, stop in layout.gaps if start <= offset < stop]:  # else the index is damaged
-                own = skipped.pop(gaps[0], None)  # by the index records behind it, the last chunk in the gap
-                if own and own.counts and not own.doubtful and own.counts != info.counts:
-                    info.doubtful, self._index_sound = True, False
-                skipped[offset] = info
+                own = skipped.get(gaps[0])  # by the index records behind it, the last chunk in the gap
+                if own and own.counts and not own.doubtful:
+                    del skipped[gaps[0]]
+                    if own.counts != info.counts:
+                        info.doubtful, self._index_sound = True, False
+                layout.missing.append(info)
             else:
                 listed = False
         if self._index_sound and len(self._infos) == self._chunk_count:
             layout.recorded = dict(sum((Counter(info.counts) for info in self._infos.values()), Counter()))
-        layout.missing = [
-            chunk
-            for offset, chunk in sorted(skipped.items())
-            if offset in self._infos or not self._infos or (chunk.counts and not listed)
-        ]
+        if not self._infos or not listed:
+            layout.missing += skipped.values()
+        layout.gaps = []  # each has its chunk among the missing ones
         layout.in_order()
         ended = self._infos or 0 < self._index_at <= (layout.cut_at or 0)
         if layout.cut_at is not None and ended and not layout.missing:
@@ -198,13 +240,6 @@ class _LayoutReader:
 
     def _is_sound(self, header: dict[bytes, bytes]) -> bool:
         return header.keys() >= _FIELDS.get(number(header, b"op"), {b""})
-
-    def _length_by_header(self, header: dict[bytes, bytes]) -> int | None:
-        """Bytes of a record's data, where its header tells."""
-        op = number(header, b"op")
-        if op == _CHUNK:
-            return number(header, b"size") if header[b"compression"] == b"none" else None
-        return _ENTRY[op] * number(header, b"count") if op in _ENTRY else None
 
     def _is_record(self, position: int, behind_chunk: bool = True) -> bool:
         """Whether the head of a record lies here, or the end of the file. Connections lie in chunks too, but behind one
@@ -232,7 +267,7 @@ class _LayoutReader:
     def _record(self, op: int, header: dict[bytes, bytes], position: int, start: int, stop: int) -> None:
         if op == _CHUNK:
             kind = header[b"compression"].decode("ascii", "replace")
-            cut, stop = stop > self._length, min(stop, self._length)
+            cut, stop = stop > self._length, max(start, min(stop, self._length))
             size = stop - start if kind == "none" and not cut else number(header, b"size")
             self._indexing = Chunk(start, stop, kind, size, cut=cut, record=position)
             self.layout.chunks.append(self._indexing)
@@ -291,3 +326,8 @@ def time_ns(header: dict[bytes, bytes], name: bytes) -> int:
         return 0
     seconds, nanoseconds = struct.unpack("<II", value)
     return seconds * 1_000_000_000 + nanoseconds
+
+
+def _is_another(chunk: Chunk, info: Chunk) -> bool:
+    """Whether a chunk is not the one that the bag's index lists at its place: none of their times are the same."""
+    return bool(chunk.counts) and (chunk.last_ns < info.first_ns <= info.last_ns or chunk.first_ns > info.last_ns > 0)

@@ -30,6 +30,13 @@ _LONGEST = 2**28
 """Bytes of a message that is read: an image of as many pixels as are decoded, of four bytes each."""
 
 
+_BACK = (
+    "SELECT 1 FROM (SELECT rowid AS row, lag(rowid) OVER () AS before FROM messages NOT INDEXED) WHERE row <= before "
+    "LIMIT 1"
+)
+"""Finds a row behind one of a higher number: pages of the table lie in another order."""
+
+
 class _OrderError(sqlite3.DatabaseError):
     """Rows come again, or one of them has a wrong number."""
 
@@ -68,6 +75,8 @@ class SqliteBag:
             last = max((row[4] for row in found), default=0)
             if sum(row[1] for row in found) > last:  # rows are numbered from 1: damage made the tree a circle
                 raise sqlite3.DatabaseError("rows repeat")
+            if self._db.execute(_BACK).fetchone():
+                raise _OrderError("its row numbers do not increase")
             rows: Iterable[tuple] = [row[:4] for row in found]
         except _DAMAGE:
             rows = ((topic, 1, time_ns, time_ns) for _, topic, time_ns in self._salvaged("rowid, topic_id, timestamp"))
@@ -82,6 +91,8 @@ class SqliteBag:
             self._damaged = True
             detail = f"{name} is damaged: an index of its messages lists more of them."
             account.add("damaged_bytes", {"": missing}, (name, 0), [], detail)
+        if self._damaged and not by_id.total():  # the list of topics is, and so may be all
+            account.add("damaged_bytes", None, (name, 0), [], f"{name} is damaged: no message is found.")
         counts: Counter[Channel] = Counter()
         for topic, channel in self._topics.items():
             counts[channel] += by_id.pop(topic)
@@ -130,6 +141,7 @@ class SqliteBag:
             try:
                 for row in self._in_order(columns, topics, last):
                     if waiting:
+                        self._note_jump(last, last_ns, waiting, topics)
                         last, last_ns = waiting[0], _integer(waiting[2])
                         yield waiting
                     waiting = row
@@ -164,6 +176,13 @@ class SqliteBag:
                 self._holes[before] = last
             before_ns, last_ns = last_ns or _integer(found[2]), _integer(found[2])
             self._add_missing_rows(before, missing, (before_ns, last_ns), detail)
+
+    def _note_jump(self, last: int, last_ns: int, row: tuple, topics: list[int] | None) -> None:
+        """Account for rows that are jumped over, where all are asked for, as they are behind damage."""
+        if topics is None:
+            span = last_ns or _integer(row[2]), _integer(row[2])
+            detail = f"{self._name} is damaged: rows {last + 1} to {row[0] - 1} are not in their place."
+            self._add_missing_rows(last, row[0] - last - 1, span, detail)
 
     def _add_missing_rows(self, before: int, missing: int, span: tuple[int, int], detail: str) -> None:
         if missing:

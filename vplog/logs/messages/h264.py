@@ -23,10 +23,8 @@ class FrameNumbers:
 
     def __init__(self) -> None:
         self._bits = 0
-        """Bits of frame_num; 0 where they are of no use: no parameter set was read, or it allows gaps or has scaling
-        lists."""
-        self._separate = False
-        """Slices name their colour plane."""
+        """Bits of frame_num; 0 where they are of no use: no parameter set was read, it allows gaps, or has what is not
+        read."""
         self._last = -1
         """frame_num of the last reference frame, -1 before the first."""
 
@@ -50,8 +48,6 @@ class FrameNumbers:
         if not self._bits:
             return True
         bits.exp_golomb(3)  # first_mb_in_slice, slice_type, pic_parameter_set_id
-        if self._separate:
-            bits.read(2)
         number = bits.read(self._bits)
         known, expected = self._last >= 0 and not idr, (self._last + 1) % (1 << self._bits)
         sound = not known or number in (self._last, expected)
@@ -64,13 +60,12 @@ class FrameNumbers:
         profile = bits.read(8)
         bits.read(16)  # constraints, level
         bits.exp_golomb()  # seq_parameter_set_id
-        self._separate = False
         if profile in _HIGH_PROFILES:
             chroma = bits.exp_golomb()
-            self._separate = chroma == 3 and bool(bits.read(1))
+            separate = chroma == 3 and bits.read(1)
             bits.exp_golomb(2)  # bit depths of luma and chroma
             bits.read(1)  # lossless transform
-            if bits.read(1):  # scaling lists, which cameras do not send
+            if bits.read(1) or separate:  # scaling lists and colour planes of their own, which cameras do not send
                 self._bits = 0
                 return
         size = bits.exp_golomb() + 4

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
@@ -67,13 +66,7 @@ def member_of(store: Store, about: dict[str, Any]) -> Member:
     """A drive by its drive.json. Raises VplogError where its run folder is of another version or damaged."""
     drive = about["drive"]
     file, record = store.file(drive, "keyframes.parquet"), store.file(drive, "run.json")
-    header = tables.read_metadata(file)
-    try:
-        settings = json.loads(header.get("vplog.settings", "null"))
-    except ValueError:
-        settings = None
-    if not isinstance(settings, dict):
-        raise ResultError(f"{file} lacks its settings. Run `vplog batch` again with its log.")
+    settings = tables.read_table_metadata(file).settings
     pipeline = Pipeline.read(settings, str(file))
     topics = run_record.read_run_json(record).get("topics")
     made_from = {

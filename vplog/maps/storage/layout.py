@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import re
 import shutil
@@ -148,9 +147,8 @@ def renamed(record: dict[str, Any], drive: str) -> dict[str, Any]:
 
 def set_drive_id(path: Path, drive: str) -> None:
     """Give keyframes.parquet of a drive the ID that it has in the map. Raises ResultError."""
-    header = tables.read_metadata(path)
+    about = tables.read_table_metadata(path)
     keyframes, world_from_body = tables.read_keyframes(path)
-    about = tables.TableMetadata(json.loads(header["vplog.settings"]), header["vplog.library"])
     covariance = tables.read_keyframe_covariance(path)
     tables.write_keyframes(path, replace(keyframes, drive=drive), world_from_body, about, covariance)
 

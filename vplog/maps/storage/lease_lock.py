@@ -119,7 +119,7 @@ def _holder(found: bytes) -> dict[str, Any]:
     """The holder that a lock object names; empty where there is none."""
     try:
         holder = json.loads(found)
-    except ValueError:
+    except (ValueError, RecursionError):
         return {}
     return holder if isinstance(holder, dict) else {}
 
