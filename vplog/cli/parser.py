@@ -1,4 +1,4 @@
-"""What the command line understands: argparse with arguments anywhere among the options, whole option names and errors
+"""Grammar of the command line: argparse with arguments anywhere among the options, whole option names and errors
 that name the nearest choice; the kinds of arguments, and the options that several verbs share.
 """
 
@@ -27,7 +27,7 @@ words: list[str] = []
 """The words of the command line."""
 _ROLES = ("image", "depth", "right", "camera-info", "odometry", "gps", "imu", "mask")
 _DASHES = "\u2013\u2014\u2212"
-"""What text editors make of two hyphens."""
+"""Dashes that text editors replace two hyphens with."""
 _MOST = 10**9
 """Largest count an option may have: far above any drive, and whole in every number type."""
 
@@ -131,7 +131,7 @@ def _is_number(text: str) -> bool:
 
 
 def place(text: str) -> Path:
-    """What an argument names: a path, or what is read and written by URL (vplog/storage/remote_path.py)."""
+    """A path, or a URL that is read and written as one (vplog/storage/remote_path.py)."""
     if "://" not in text:
         return _path(text)
     from vplog.storage.remote_path import located

@@ -173,7 +173,7 @@ def score_closures(
 
 
 def count_closures(closures: Closures, judged: Judgement, place: PlaceCriterion) -> dict[str, Any]:
-    """What `ClosureScore` counts of the accepted closures of any ledger, of one drive or between two."""
+    """Counts of `ClosureScore` for the accepted closures of any ledger, of one drive or between two."""
     accepted = closures.accepted
     right, wrong = accepted & judged.right, accepted & judged.wrong
     here = accepted & judged.known

@@ -39,7 +39,7 @@ _USES = {
     "tum": ("distance_m", "heading_deg"),
     "gps": ("distance_m",),
 }
-"""What each kind of truth takes beside its name."""
+"""Options of each kind of truth."""
 
 
 @dataclass(frozen=True)

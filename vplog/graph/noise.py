@@ -190,7 +190,7 @@ def _drift_model(odometry: Odometry, keys: Ints, settings: NoiseSettings) -> Flo
 
 
 def _travelled(stamps: Ints, step: Floats, keys: Ints) -> Floats:
-    """What the steps (T-1,) between the samples add up to between the keyframes, (N-1,)."""
+    """(N-1,) sums between the keyframes of the steps (T-1,) between the samples."""
     since_start = stamps - stamps[0]
     return np.diff(np.interp(keys - stamps[0], since_start, np.concatenate([[0.0], np.cumsum(step)])))
 

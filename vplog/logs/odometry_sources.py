@@ -105,7 +105,7 @@ def score_source(
 
 @dataclass(frozen=True, eq=False)
 class SourceOdometry:
-    """What one source gives as odometry."""
+    """Odometry of one source."""
 
     odometry: Odometry | None
     frames: list[str]

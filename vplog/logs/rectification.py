@@ -62,7 +62,7 @@ class Pair:
     camera: Camera
     """The left one, rectified, with the baseline."""
     maps: tuple[Maps | None, Maps | None]
-    """What cv2.remap takes for left and right images; None where they are rectified as they come."""
+    """Maps of cv2.remap for left and right images; None where they are rectified already."""
 
     def rectify(self, image: Bytes, side: int) -> Bytes:
         """(H, W) or (H, W, 3) uint8 the left (0) or right (1) image on the common rows."""
@@ -196,7 +196,7 @@ def _coefficients(camera: Camera) -> Floats:
 
 
 def _maps(side: Side, rotation: Floats, matrix: Floats) -> Maps | None:
-    """What cv2.remap takes, None where rectification moves no pixel by more than _SAME_PX."""
+    """Maps of cv2.remap; None where rectification moves no pixel by more than _SAME_PX."""
     if side.rectified:
         return None
     camera = side.camera

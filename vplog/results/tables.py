@@ -449,7 +449,7 @@ def read_metadata(path: Path) -> dict[str, str]:
 
 
 def read_table_metadata(path: Path) -> TableMetadata:
-    """What a table was made with, by its header. Raises ResultError where that lacks the settings."""
+    """Settings and library of a table, from its header. Raises ResultError where that lacks the settings."""
     header = read_metadata(path)
     try:
         settings = json.loads(header.get("vplog.settings", "null"))

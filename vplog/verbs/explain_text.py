@@ -138,7 +138,7 @@ def _count(number: int, name: str, plural: str = "s") -> str:
 
 
 def _change(row: Row, pipeline: Pipeline) -> str:
-    """What would change the verdict."""
+    """The change that would lead to another verdict, in a sentence."""
     verdict, verify = Verdict(row["verdict"]), pipeline.verify
     metric = bool(row["landmarks"])
     needed = verify.epipolar.min_inliers
@@ -191,4 +191,4 @@ _CHANGES = {
     "direction_only": "Metres would need landmarks: keyframes around the match that moved further, a depth image or a "
     "stereo pair.",
 }
-"""What would change each verdict; `by_chance` where enough inliers for a pose may agree by chance."""
+"""The change that would lead to another verdict, by verdict; `by_chance` where enough inliers for a pose may agree by chance."""

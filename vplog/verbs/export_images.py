@@ -32,9 +32,9 @@ _WRITERS = {"colmap": colmap.write_colmap, "nerfstudio": colmap.write_nerfstudio
 FOLDERS = tuple(_WRITERS)
 """Formats that are a folder."""
 _RECORD = "export.json"
-"""What an export wrote, beside it."""
+"""Record of the files of an export, beside them."""
 _QUALITY = 95
-"""Of the JPEGs: what they lose is below the camera's noise."""
+"""JPEG quality: its loss is below the camera's noise."""
 
 
 def export_images(

@@ -11,7 +11,7 @@ import numpy as np
 from vplog.logs.messages.records import BadMessageError, FixMessage
 
 SENTENCES = ("GGA", "GNS", "RMC", "GLL")
-"""Those with a position, the one with most of altitude, quality and dilution first; a receiver sends several of them
+"""Sentences with a position, the one with most of altitude, quality and dilution first; a receiver sends several
 for each fix."""
 _FIELDS = {"GGA": (2, 15), "GNS": (2, 13), "RMC": (3, 10), "GLL": (1, 7)}
 """Where the latitude stands, and how many fields there are at least."""
@@ -62,7 +62,7 @@ def _number(text: str) -> float:
 
 
 def _degrees(text: str, side: str) -> float:
-    """Of `4807.038`, degrees and minutes, and N, S, E or W; NaN where it is empty."""
+    """Degrees of `4807.038`, degrees and minutes, and N, S, E or W; NaN where it is empty."""
     if not text:
         return math.nan
     point = text.index(".") if "." in text else len(text)
