@@ -379,7 +379,7 @@ class _Factor:
 
     @classmethod
     def of(cls, matrix: sparse.csr_array, poses: Ints) -> _Factor:
-        """Factors of a matrix with equally many rows for each pose but the held one; `poses` in order of elimination."""
+        """Factors of a matrix with equally many rows for each pose but the held one; `poses` in elimination order."""
         size = (len(matrix.indptr) - 1) // len(poses)
         order = (poses[:, None] * size + np.arange(size)).ravel()
         permuted = matrix[order][:, order].tocsc()

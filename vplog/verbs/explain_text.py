@@ -191,4 +191,4 @@ _CHANGES = {
     "direction_only": "Metres would need landmarks: keyframes around the match that moved further, a depth image or a "
     "stereo pair.",
 }
-"""The change that would lead to another verdict, by verdict; `by_chance` where enough inliers for a pose may agree by chance."""
+"""The change that would lead to another, by verdict; `by_chance` where enough inliers for a pose may be chance."""
