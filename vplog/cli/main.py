@@ -143,7 +143,7 @@ def _flush() -> None:
 
 
 def _interrupted(error: BaseException) -> NoReturn:
-    known = getattr(error, "__notes__", ["what was finished in the output folder stays"])
+    known = getattr(error, "__notes__", ["finished results in the output folder are kept"])
     print_status(f"interrupted; {known[-1]}")
     sys.exit(128 + (_ended.pop() if _ended else signal.SIGINT))
 
