@@ -208,9 +208,9 @@ def translated(error: BaseException) -> BaseException:
         (exceptions.NodeDiedError, "Its machine left the cluster. Look at `ray status`"),
         (exceptions.LocalRayletDiedError, "Ray was stopped on this machine. Start it again"),
         (exceptions.ObjectLostError, "What it gave back was lost along with a machine. Look at `ray status`"),
-        (exceptions.ObjectStoreFullError, "The cluster has no room for what it gives back"),
-        (exceptions.OutOfDiskError, "The cluster's disks have no room for what it gives back"),
-        (exceptions.RayError, f"Its worker was killed, as by a system that is out of memory ({type(error).__name__})"),
+        (exceptions.ObjectStoreFullError, "The cluster has no room for its result"),
+        (exceptions.OutOfDiskError, "The cluster's disks have no room for its result"),
+        (exceptions.RayError, f"Its worker was killed, perhaps because memory ran out ({type(error).__name__})"),
     ):
         if isinstance(error, kind):
             return BrokenExecutor(f"{text}, and run again.")

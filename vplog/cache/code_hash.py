@@ -51,7 +51,7 @@ def imported(modules: tuple[str, ...]) -> tuple[dict[str, Path], set[str]]:
         followed.add(module)
         path = _file(module)
         if path is None:
-            raise ValueError(f"{module} is no module of vplog")
+            raise ValueError(f"{module} is not a module of vplog")
         parents = accumulate(module.split(".")[:-1], "{}.{}".format)
         files |= {parent: file for parent in parents if (file := _file(parent)) is not None}
         files[module] = path

@@ -146,7 +146,7 @@ def _flush() -> None:
 
 def _interrupted(arguments: argparse.Namespace, error: BaseException) -> NoReturn:
     again = f". Go on with: vplog run --resume -o {shlex.quote(str(arguments.shown))}"
-    kept = f"what was finished in the output folder stays{again if getattr(arguments, 'resume', False) else ''}"
+    kept = f"finished results in the output folder are kept{again if getattr(arguments, 'resume', False) else ''}"
     known = getattr(error, "__notes__", [kept])
     print_status(without_secrets(f"interrupted; {known[-1]}", arguments.command))
     sys.exit(128 + (_ended.pop() if _ended else signal.SIGINT))

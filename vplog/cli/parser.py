@@ -97,7 +97,7 @@ class Parser(argparse.ArgumentParser):
             near = f" Did you mean {' or '.join(inner)}?"
         elif not near and os.path.exists(value):  # noqa: PTH110 (false for a name that is too long)
             near = f" To look into it: {self.prog} info {value}"
-        self.error(f"{value!r} is no verb of {self.prog}.{near or f' Verbs: {listed}.'}")
+        self.error(f"{value!r} is not a verb of {self.prog}.{near or f' Verbs: {listed}.'}")
 
     def _print_message(self, message: str, file: Any = None) -> None:
         """Before Python 3.11.4 a stream that nobody reads is an error here, and the status that of a crash."""

@@ -242,7 +242,7 @@ def _truth_notes(found: dict[str, Any]) -> list[str]:
             f"--truth-offset-s {truth['offset_s']:g}. Without that, figures and closures are judged at wrong times."
         )
     if truth is not None and truth["odometry"]:
-        notes.append("The odometry of this run is the truth itself: ATE, RPE and drift say nothing, closures do.")
+        notes.append("The odometry of this run is the truth itself: only the scores of its closures mean something.")
     if truth is not None and not truth["oriented"]:
         notes.append(
             "The truth has no orientations, so closures are judged by place, without heading. To judge their "

@@ -209,7 +209,7 @@ def closure_sentences(closures: dict[str, Any]) -> list[str]:
         f"between optical axes (precision {share['place_precision']})",
     ]
     for name, text in (
-        ("not_judged", "are not judged: the truth has a gap there, or is too coarse to tell"),
+        ("not_judged", "are not judged: the truth has a gap there, or is too coarse"),
         (
             "overconfident",
             "true ones are outside 99.9 % of their covariance: it, or the truth between two visits, is wrong",

@@ -134,7 +134,7 @@ def covariance_without_breaks(
         covariance[:, axis, axis] = modelled[:, axis, axis]
     if not known.all():
         names = ", ".join(_AXES[axis] for axis in np.flatnonzero(~known))
-        warnings.append(f"The odometry's covariance leaves {names} unknown, so the drift model stands in there.")
+        warnings.append(f"The odometry's covariance leaves {names} unknown; the drift model is used there.")
 
     # an edge reads the samples from the one at or before its start to the one at or after its end
     before = np.concatenate([[0], np.cumsum(~usable)])

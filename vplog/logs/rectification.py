@@ -103,7 +103,7 @@ def pair_of(left: Side, right: Side, right_from_left: Floats | None) -> Pair:
             "--right-topic"
         )
     if not _BASELINES_M[0] < baseline_m < _BASELINES_M[1]:
-        raise NoPairError(f"its distance of {baseline_m:.3g} m to the left camera is no plausible baseline")
+        raise NoPairError(f"its distance of {baseline_m:.3g} m to the left camera is not a plausible baseline")
     matrices = [p[:, :3] for p in projections]
     _check_rows(matrices, right)
     maps = tuple(_maps(side, r, k) for side, r, k in zip((left, right), rotations, matrices, strict=True))

@@ -79,9 +79,7 @@ def odometry_of(log: Log, topics: TopicChoice, steps: Steps) -> Odometry:
 def by_images(log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], *, execution: Execution) -> Odometry:
     """Visual odometry, its breaks noted. Raises LogError where tracking fails from the first frame to the last."""
     if unasked:
-        _log.warning(
-            "The log has no odometry, so that of its images is taken (visual odometry, as by --odometry visual)."
-        )
+        _log.warning("The log has no odometry, so visual odometry of its images is used (--odometry visual).")
     stamp_ns = log.stamps()
     odometry = visual_odometry(_decoded(log, stamp_ns, execution), log.camera())
     if odometry is None:

@@ -112,7 +112,7 @@ def staged_run(
                 with suppress(OSError):  # not there, or it holds what was kept of this and other runs
                     folder.rmdir()
                 if resumable and interrupted:
-                    error.add_note("no stage was finished, so nothing is kept. Give the same command again")
+                    error.add_note("no stage was finished, so nothing is kept. Run the same command again")
             raise
 
 

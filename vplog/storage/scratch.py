@@ -35,7 +35,7 @@ def own_folder() -> Path:
     except OSError as error:
         raise ResultError(f"Cannot make {folder}: {error.strerror}. Set TMPDIR to a folder with room.") from None
     if folder.is_symlink() or about.st_uid != os.getuid():
-        raise ResultError(f"{folder} belongs to somebody else. Set TMPDIR to a folder of your own.")
+        raise ResultError(f"{folder} belongs to another user. Set TMPDIR to a folder of your own.")
     return folder
 
 

@@ -296,9 +296,12 @@ def _about_gps(gps: Gps | None, found: LogInfo) -> dict[str, Any] | None:
 def _scale(camera: Camera | None, found: LogInfo) -> dict[str, str]:
     """Where the metres of a closure come from."""
     if camera is None:
-        return {"source": "none", "why": "There are no images."}
+        return {"source": "none", "why": "The log has no camera images."}
     if camera.matrix is None:
-        return {"source": "none", "why": "No calibration, so no closure gets a metric pose; --calibration gives one."}
+        return {
+            "source": "none",
+            "why": "No calibration, so no closure gets a metric pose; give one with --calibration.",
+        }
     if camera.baseline_m is not None:
         return {"source": "stereo", "why": f"The pair has a baseline of {camera.baseline_m:.3f} m."}
     unused = any(line.startswith("Depth is not used") for line in found.warnings)

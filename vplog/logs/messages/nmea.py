@@ -29,7 +29,7 @@ def fix_of(stamp_ns: int, frame: str, sentence: str) -> FixMessage | None:
     """
     text, star, checksum = sentence.strip().partition("*")
     if not text.startswith("$"):
-        raise BadMessageError("it is no NMEA sentence")
+        raise BadMessageError("it is not an NMEA sentence")
     if star and int(checksum, 16) != reduce(xor, text[1:].encode(), 0):
         raise BadMessageError("its NMEA checksum does not match")
     fields = text.split(",")
