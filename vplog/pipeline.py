@@ -51,7 +51,7 @@ class Pipeline(Settings):
     """Every setting of a run. A pipeline file holds only what differs."""
 
     keyframes: KeyframeSettings = KeyframeSettings()
-    """Which frames become nodes."""
+    """Selection of keyframes."""
     features: FeatureSettings = SiftSettings()
     """Local features of a frame."""
     stereo: StereoSettings = StereoSettings()

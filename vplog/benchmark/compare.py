@@ -59,7 +59,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class CompareOptions:
-    """How recognisers are compared."""
+    """Options of a comparison of recognisers."""
 
     library: Path | None = None
     """A drive, or a saved library; None for the map."""

@@ -1,4 +1,4 @@
-"""How results look on a terminal: text, tables, progress, and JSON for programs."""
+"""Results on a terminal: text, tables, progress, and JSON for programs."""
 
 from __future__ import annotations
 

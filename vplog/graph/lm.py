@@ -29,7 +29,7 @@ class LmSettings(Settings):
     max_iterations: int = Field(default=100, ge=1)
     """Steps after which it gives up; graphs of drives take 5-20."""
     tolerance: float = Field(default=1e-6, gt=0)
-    """It has converged when a step gains less than this share of the error."""
+    """Converged when a step gains less than this share of the error."""
 
     def __call__(self, graph: PoseGraph) -> Solution:
         """Solve. Raises GraphError where the graph is none or its poses are not determined."""

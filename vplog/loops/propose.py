@@ -1,4 +1,4 @@
-"""Which earlier keyframes each keyframe may be a return to, by place recognition."""
+"""Candidate closures: earlier keyframes that a keyframe may be a return to, by place recognition."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vplog.settings import Settings
 
 
 class ProposeSettings(Settings):
-    """Which earlier keyframes become candidates. The gaps count keyframes, whose spacing follows the drive's own scale:
+    """Selection of the candidates. The gaps count keyframes, whose spacing follows the drive's own scale:
     a car's is metres, a hand-held camera's centimetres."""
 
     per_query: int = Field(default=10, ge=1)

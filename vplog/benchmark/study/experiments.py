@@ -83,7 +83,7 @@ _CHANGED = ("r_at_1", "anr", "ap")
 
 @dataclass(frozen=True)
 class StudyOptions:
-    """Which experiments are done, and on what."""
+    """Choice of experiments and their data."""
 
     methods: Sequence[str] = METHODS
     sizes: Sequence[int] = (10, 20, 50, 100)

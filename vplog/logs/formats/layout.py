@@ -53,7 +53,7 @@ class Chunk:
     disputed: bool = False
     """Its own indexes and that of the bag count its messages differently."""
     damaged: bool = False
-    """Not all of it could be unpacked and read."""
+    """Some of it could not be unpacked and read."""
 
 
 @dataclass
