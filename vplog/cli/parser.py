@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import takewhile
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 
 STDOUT = Path("-")
-words: list[str] = []
-"""The words of the command line."""
 _ROLES = ("image", "depth", "right", "camera-info", "odometry", "gps", "imu", "mask")
 _DASHES = "\u2013\u2014\u2212"
 """Dashes that text editors replace two hyphens with."""
@@ -41,6 +39,7 @@ class Parser(argparse.ArgumentParser):
         self._family = [] if family is None else family
         self._family.append(self)
         self._intermixing, self._brief_usage = False, ""
+        self._words: Sequence[str] = ()
 
     def add_subparsers(self, **options: Any) -> Any:
         made_by: Any = partial(Parser, family=self._family)
@@ -50,6 +49,7 @@ class Parser(argparse.ArgumentParser):
         """A verb takes its arguments before, between and behind its options."""
         if self._intermixing or args is None:
             return super().parse_known_args(args, namespace)
+        self._words = args
         verbs = self._subparsers is not None
         self._refuse_unknown(args[:1] if verbs else takewhile("--".__ne__, args))
         if verbs or "--" in args:
@@ -108,7 +108,7 @@ class Parser(argparse.ArgumentParser):
         """The shortest usage, then what is wrong in one line; exit 2."""
         message = message.replace("ignored explicit argument", "takes no value, not")
         usage, end = self._brief_usage or self._required_usage(), "" if message.endswith((".", "?", "!")) else "."
-        wrong = f"{printable(without_secrets(message, words))}{end}"
+        wrong = f"{printable(without_secrets(message, self._words))}{end}"
         self.exit(2, f"{usage}{self.prog}: error: {wrong} All options: {self.prog} --help\n")
 
     def _required_usage(self) -> str:

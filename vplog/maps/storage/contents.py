@@ -281,8 +281,7 @@ class Store:
 
     def _write(self, name: str, record: dict[str, Any]) -> None:
         """Write JSON, or leave the file as it is where it holds the same: a finished map is not touched."""
-        # the keys of failures.json are drives, so it has no field for a checksum
-        if write_changed(self.root / name, record, checksum=name != "failures.json") and self.mirror is not None:
+        if write_changed(self.root / name, record) and self.mirror is not None:
             write_json(self.mirror, name)
 
 
