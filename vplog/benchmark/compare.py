@@ -73,7 +73,7 @@ class CompareOptions:
     """Folder of compare.json, answers, scores and figures; None writes nothing."""
     topics: logs.TopicChoice | None = None
     cache: CacheChoice = CacheChoice()
-    """Where features are kept for further calls."""
+    """Cache of features for further calls."""
 
 
 def compare(

@@ -19,7 +19,7 @@ _BETTER = 0.5
 _MOTIONS = 400
 """Motions that truth and odometry are compared on; six unknowns are well determined by a tenth of them."""
 _MOTION_SHARE = 20
-"""Each takes one part in 20 of the drive: the drift of the odometry over it is a twentieth of the drive's."""
+"""Motions take one part in 20 of the drive: the drift of the odometry over it is a twentieth of the drive's."""
 _PRIOR = 1e-3
 """Weight of no turn at all against the motions: it settles what they leave open, and nothing else."""
 _ROUNDS = 10

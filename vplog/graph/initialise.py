@@ -1,4 +1,4 @@
-"""Where to start a solve from."""
+"""Initial poses of a solve."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ class SourceOdometry:
 
     odometry: Odometry | None
     frames: list[str]
-    """From the one that stands still to the body."""
+    """Frames of the chain, from the fixed one to the body."""
     notes: Notes
     """On what was repaired or left out of it."""
     kind: str = "poses"

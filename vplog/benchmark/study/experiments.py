@@ -98,7 +98,7 @@ class StudyOptions:
     """Names of the experiments; None for all."""
     topics: TopicChoice | None = None
     cache: CacheChoice = CacheChoice()
-    """Where features are kept for further calls."""
+    """Cache of features for further calls."""
 
     def libraries(self, drive: int, size: int | None = None) -> list[Library]:
         """One for each seed."""

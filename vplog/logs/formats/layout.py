@@ -66,7 +66,7 @@ class Layout:
     recorded: dict[int, int] = field(default_factory=dict)
     """Messages per channel id by the file's statistics or its whole index; else empty."""
     gaps: list[tuple[int, int]] = field(default_factory=list)
-    """Where damage may begin, and where reading goes on."""
+    """First byte that may be damaged, and the byte at which reading resumes."""
     cut_at: int | None = None
     """Byte behind which nothing can be read, where messages may have been."""
     appended_at: int | None = None
