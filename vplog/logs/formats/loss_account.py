@@ -272,16 +272,28 @@ def sampled(log_ns: Collection[int]) -> list[int]:
     return [ordered[at] for at in (0, len(ordered) // 2, -1)] if ordered else []
 
 
-def main_span(times: Collection[int]) -> Span:
-    """Where most of these log times lie, without a day between two of them: damage may have put others anywhere."""
-    runs: list[list[int]] = [[0]] if not times else []
+def _runs(times: Collection[int]) -> list[list[int]]:
+    """The times in order, in runs without a day between two of them."""
+    runs: list[list[int]] = []
     for time_ns in sorted(times):
         if runs and time_ns - runs[-1][-1] <= _FARTHEST_NS:
             runs[-1].append(time_ns)
         else:
             runs.append([time_ns])
-    longest = max(runs, key=len)
+    return runs or [[0]]
+
+
+def main_span(times: Collection[int]) -> Span:
+    """Where most of these log times lie, without a day between two of them: damage may have put others anywhere."""
+    longest = max(_runs(times), key=len)
     return longest[0], longest[-1]
+
+
+def confirmed_span(times: Collection[int]) -> Span:
+    """From the first to the last of these log times, but for one alone a day from all others: damage put it there."""
+    runs = _runs(times)
+    several = [run for run in runs if run[0] < run[-1]] or [max(runs, key=len)]
+    return several[0][0], several[-1][-1]
 
 
 def merged(spans: list[Span]) -> list[Span]:
