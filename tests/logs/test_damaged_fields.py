@@ -507,3 +507,72 @@ def test_where_nothing_is_left_the_times_are_those_of_most_chunks(tmp_path: Path
     spans = [span for loss in notes.account.losses for span in loss.spans_ns]
     assert spans
     assert all(abs(ns - START_NS) < _FARTHEST_NS for span in spans for ns in span)
+
+
+@pytest.mark.parametrize("name", ["bag-unindexed", "bag-none-unindexed"])
+def test_a_damaged_field_name_of_an_index_is_no_lost_chunk(name: str, tmp_path: Path) -> None:
+    """Of a bag that no index lists the chunks of: what was read is what the damaged index counts."""
+    path = FORMATS[name].write(tmp_path)
+    whole, problems = path.read_bytes(), []
+    for field in (field for field in FIELDS[".bag"](whole) if field.name == "op4.header_length"):
+        for at in range(field.offset + 4, field.offset + 51):
+            path.write_bytes(whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :])
+            if found := problem(path, WRITTEN, FORMATS[name]._replace(counted=False), content=False):
+                problems.append(f"{at - field.offset} of {field.offset}: {found}")
+    assert not problems, f"{len(problems)}\n" + "\n".join(problems)
+
+
+def test_a_message_that_became_another_record_is_no_silent_loss(tmp_path: Path) -> None:
+    form = FORMATS["mcap-unchunked-no-summary"]
+    path = form.write(tmp_path)
+    whole = path.read_bytes()
+    for field in (field for field in FIELDS[".mcap"](whole) if field.name == "message.record_length"):
+        for opcode in range(16):
+            path.write_bytes(whole[: field.offset - 1] + bytes([opcode]) + whole[field.offset :])
+            assert problem(path, WRITTEN, form, content=False) == "", (field.offset, opcode)
+
+
+def test_index_entries_behind_bytes_that_are_gone_are_not_all(tmp_path: Path) -> None:
+    """With a chunk, its first message index went too."""
+    form = FORMATS["mcap-no-summary"]._replace(counted=False)
+    path = form.write(tmp_path)
+    whole = path.read_bytes()
+    indexes = [field.offset - 1 for field in FIELDS[".mcap"](whole) if field.name == "message_index.record_length"]
+    for start in chunk_starts(whole, ".mcap")[:-1]:
+        second = next(at for at in indexes if at > next(at for at in indexes if at > start))
+        path.write_bytes(whole[: start + 20] + whole[second:])
+        assert problem(path, WRITTEN, form, content=False) == ""
+
+
+@pytest.mark.parametrize("name", ["bag-none", "bag-lz4", "bag-bz2", "bag-none-unindexed", "bag-unindexed"])
+def test_a_chunk_that_ends_at_the_index_of_a_later_one_swallows_nothing(name: str, tmp_path: Path) -> None:
+    form = FORMATS[name]
+    path = form.write(tmp_path)
+    whole = path.read_bytes()
+    fields = list(FIELDS[".bag"](whole))
+    indexes = [field.offset for field in fields if field.name == "op4.header_length"]
+    lengths = [field for field in fields if field.name == "op5.data_length"]
+    for length, later in zip(lengths, lengths[2:], strict=False):
+        for end in [at for at in indexes if at > later.offset][:3]:
+            path.write_bytes(length.set(whole, end - length.offset - 4))
+            assert problem(path, WRITTEN, form) == "", (length.offset, end)
+
+
+@pytest.mark.parametrize("name", ["mcap-lz4", "mcap-no-summary", "mcap-unchunked", "bag-none", "bag-lz4", "db3"])
+def test_a_log_begins_and_ends_with_times_that_another_confirms(name: str, tmp_path: Path) -> None:
+    """A damaged time of a chunk or message, by years, is not that of the log."""
+    path = FORMATS[name].write(tmp_path)
+    whole = path.read_bytes()
+    log_ns = [time_ns for _, time_ns, _ in messages()]
+    order = "big" if path.suffix == ".db3" else "little"
+    forms = [time_ns.to_bytes(8, order) for time_ns in log_ns]
+    if path.suffix == ".bag":
+        forms = [b"".join((part.to_bytes(4, "little")) for part in divmod(time_ns, 10**9)) for time_ns in log_ns]
+    places = [at for at in range(len(whole) - 8) if whole[at : at + 8] in forms]
+    assert places
+    for at in places:
+        high = at if order == "big" else at + (3 if path.suffix == ".bag" else 7)
+        path.write_bytes(whole[:high] + bytes([whole[high] ^ 32]) + whole[high + 1 :])
+        container, _ = open_container(path, Notes())
+        contents = container.contents()
+        assert abs(contents.start_ns - START_NS) < _FARTHEST_NS > abs(contents.end_ns - START_NS), at

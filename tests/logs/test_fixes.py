@@ -90,6 +90,23 @@ def test_what_is_no_position_is_left_out_and_said(seed: int, case: tuple[dict[st
     assert says in said and "5 " in said
 
 
+@given(seeds, st.floats(0.1, 0.4))
+def test_fixes_that_jump_at_random_are_left_out(seed: int, share: float) -> None:
+    """Up to 40 %, by 11 km and more: those that no neighbour confirms are not taken for being in reach."""
+    rng = np.random.default_rng(seed)
+    fixes = drive(seed, 300)
+    wrong = rng.random(len(fixes)) < share
+    for row in np.flatnonzero(wrong).tolist():
+        off = rng.uniform(0.1, 2) * rng.choice([-1, 1])
+        fixes[row] = dataclasses.replace(fixes[row], latitude_deg=fixes[row].latitude_deg + off)
+    gps, said = track(fixes)
+    assert gps is not None
+    taken = np.isin([fix.stamp_ns for fix in fixes], gps.stamp_ns)
+    assert taken[wrong].sum() <= 2  # two may confirm each other by chance
+    assert taken[~wrong].mean() > 0.95
+    assert f"{300 - taken.sum()} of 300 fixes left out" in said or not wrong.any()
+
+
 def test_nothing_but_zeros_is_no_gps() -> None:
     gps, said = track([dataclasses.replace(fix, latitude_deg=0.0, longitude_deg=0.0) for fix in drive(1)])
     assert gps is None

@@ -38,7 +38,10 @@ _HIGHEST_M = 1e5
 _FASTEST_M_S = 100.0
 """m/s; ground robots and low flights are slower. Faster drives are measured by their own speed:"""
 _TIMES_USUAL = 10.0
-"""times the median speed between fixes, beyond which they jump."""
+"""times the usual speed between fixes, beyond which they jump."""
+_TIMES_HIGH = 2.0
+"""times the speed that nine of ten fixes that confirm each other do not exceed, up to which one that jumps off its
+neighbours is reached from those beyond."""
 
 
 class PoseTrack:
@@ -276,14 +279,16 @@ def _without_altitude(covariance: Floats) -> Floats:
 
 
 def _reachable(gps: Gps) -> np.ndarray:
-    """(T,) bool: fixes of the longest run without a jump, and of those from where it can be reached."""
+    """(T,) bool: fixes of the longest run without a jump, of those from where it can be reached, and those that no
+    neighbour confirms where they lie on the way between such runs."""
     place, seconds = local_enu(gps).enu_m, gps.stamp_ns / 1e9
     if len(place) < 2:
         return np.ones(len(place), bool)
     speed = np.linalg.norm(np.diff(place, axis=0), axis=1) / np.diff(seconds)
-    fastest = max(_FASTEST_M_S, _TIMES_USUAL * float(np.median(speed)))
+    fastest = max(_FASTEST_M_S, _TIMES_USUAL * _usual_speed_m_s(place, seconds))
     bounds = [0, *(np.flatnonzero(speed > fastest) + 1).tolist(), len(place)]
-    runs = [(a, b - 1) for a, b in pairwise(bounds)]
+    every = [(a, b - 1) for a, b in pairwise(bounds)]
+    runs = [(a, b) for a, b in every if a < b] or every
     first, last = main = max(runs, key=lambda run: (run[1] - run[0], -run[0]))
     reached = np.zeros(len(place), bool)
     for a, b in [main, *(run for run in runs[::-1] if run < main), *(run for run in runs if run > main)]:
@@ -291,4 +296,21 @@ def _reachable(gps: Gps) -> np.ndarray:
         if np.linalg.norm(place[near] - place[end]) <= fastest * abs(seconds[near] - seconds[end]):
             reached[a : b + 1] = True
             first, last = min(first, a), max(last, b)
+    sure, known = np.flatnonzero(reached), speed[reached[1:] & reached[:-1] & (speed <= fastest)]
+    usual = min(fastest, _TIMES_HIGH * float(np.quantile(known, 0.9))) if len(known) else 0.0
+    for alone in (a for a, b in every if a == b and runs is not every):
+        at = int(np.searchsorted(sure, alone))
+        beside = sure[max(at - 1, 0) : at + 1]
+        far = np.linalg.norm(place[beside] - place[alone], axis=1)
+        reached[alone] = bool((far <= usual * np.abs(seconds[beside] - seconds[alone])).all())
     return reached
+
+
+def _usual_speed_m_s(place: Floats, seconds: Floats) -> float:
+    """Median of the lowest speed between a fix and each of the two before and behind it: of half of the fixes wrong."""
+    lowest = np.full(len(place), np.inf)
+    for step in (1, 2):
+        speed = np.linalg.norm(place[step:] - place[:-step], axis=1) / (seconds[step:] - seconds[:-step])
+        lowest[step:] = np.minimum(lowest[step:], speed)
+        lowest[:-step] = np.minimum(lowest[:-step], speed)
+    return float(np.median(lowest))

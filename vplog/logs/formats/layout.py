@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from vplog.errors import plural
 from vplog.logs.formats.container import Contents, by_topic, topics_of
-from vplog.logs.formats.loss_account import main_span
+from vplog.logs.formats.loss_account import confirmed_span, main_span
 
 if TYPE_CHECKING:
     import re
@@ -26,6 +26,7 @@ _WINDOW = 4096
 """Bytes that are read at once: the head of a record, and those of the small ones behind it."""
 _MOST_TRIED = 500_000
 """Places that are looked at in one file, about a second's work; a stranger's file may be made of false ones."""
+_NO_CHANNEL = -1
 
 
 @dataclass(slots=True)
@@ -74,7 +75,7 @@ class Layout:
     index_cut_at: int | None = None
     """Byte behind which nothing can be read, where the messages had ended."""
     unknown_at: int | None = None
-    """The first record of an unknown kind that would be a message if that byte were damaged."""
+    """The first record that would be a message if the byte of its kind were damaged."""
     summary_definitions: list[tuple[int, bytes]] = field(default_factory=list)
     """Opcode and data of schemas and channels of a damaged summary, for those that no other place defines."""
 
@@ -150,9 +151,13 @@ class ChunkLosses:
         layout = self.layout
         return bool(layout.chunks[number].counts) and (bool(layout.recorded) or number + 1 < len(layout.chunks))
 
-    def add_chunk(self, chunk: Chunk, counts: Mapping[int, int], spans: list[Span], what: str) -> None:
-        """Messages by channel id that are lost of a damaged chunk; `what` ends the sentence about it."""
-        lost = topics_of(counts, self.channels) if chunk.counts else None
+    def add_chunk(self, chunk: Chunk, found: Mapping[int, int], spans: list[Span], what: str) -> None:
+        """What a damaged chunk lacks but for the messages found, by channel id; `what` ends the sentence about it."""
+        short = Counter(chunk.counts)
+        short.subtract(found)
+        if min(short.values(), default=0) < 0:  # damage gave messages the number of another channel
+            short = {_NO_CHANNEL: short.total()}
+        lost = topics_of(short, self.channels) if chunk.counts else None
         detail = f"{self.name} has a damaged chunk at byte {chunk.start}{what}."
         self.notes.account.add("damaged_chunk", lost, (self.name, chunk.start), spans, detail)
 
@@ -172,13 +177,14 @@ class ChunkLosses:
         for number in by_id.keys() & self.channels.keys():
             counts[self.channels[number]] += by_id[number]
         self._account_for(by_topic(counts), main_span(times), what)
-        return Contents(dict(sorted(counts.items())), min(times, default=0), max(times, default=0))
+        return Contents(dict(sorted(counts.items())), *confirmed_span(times))
 
     def _account_for(self, found: Mapping[str, int], span: Span, what: str) -> None:
-        """What was not found, of a file whose messages cover `span`, and how much of what was recorded that is."""
+        """Account for messages that a file recorded and that were not found; those that were found cover `span`."""
         layout, account, name = self.layout, self.notes.account, self.name
         recorded = topics_of(layout.recorded, self.channels)
         total = Counter(found)
+        layout.missing = [chunk for chunk in layout.missing if not self._is_read(chunk)]
         for chunk in layout.missing:
             counts = topics_of(chunk.counts, self.channels)
             when = (chunk.first_ns, chunk.last_ns) if chunk.last_ns else self.between(chunk.start, span)
@@ -189,7 +195,7 @@ class ChunkLosses:
             detail = f"{name} is damaged near byte {start}; reading resumes at byte {stop}."
             account.add("damaged_bytes", None, (name, -start), [self.between(start, span)], detail)
         if layout.unknown_at is not None and (not recorded or total.total() < sum(recorded.values())):
-            detail = f"{name} has a record of an unknown kind at byte {layout.unknown_at}."
+            detail = f"{name} has a record of unknown content at byte {layout.unknown_at}."
             account.add("damaged_bytes", None, (name, layout.unknown_at), [span], detail)
         self._add_end(sum(found.values()), [(span[1], span[1])])
         whole = layout.cut_at is None and not layout.gaps and all(chunk.counts for chunk in layout.missing)
@@ -198,6 +204,17 @@ class ChunkLosses:
         if unexplained and sum(recorded.values()) > total.total():  # else it names other topics
             detail = f"The {what} of {name} counts more messages than it holds."
             account.add("damaged_bytes", unexplained, (name, 0), [span], detail)
+
+    def _is_read(self, missing: Chunk) -> bool:
+        """Whether the index behind damaged bytes is that of the chunk before them, by its messages and their times."""
+        before = next((chunk for chunk in reversed(self.layout.chunks) if chunk.stop <= missing.start), None)
+        return (
+            before is not None
+            and missing.start < missing.stop
+            and missing.last_ns > 0
+            and before.first_ns <= missing.first_ns <= missing.last_ns <= before.last_ns
+            and Counter(missing.counts) <= Counter(before.counts)
+        )
 
     def between(self, position: int, span: Span) -> Span:
         """The time between the chunk before a damaged place and the one behind it; `span` is that of the file."""

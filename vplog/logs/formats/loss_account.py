@@ -1,4 +1,4 @@
-"""What of a log could not be used: counted by topic, placed in time by log times, in one sentence for each reason."""
+"""Messages of a log that could not be used: counted by topic, with log times, in one sentence for each reason."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Loss:
     spans_ns: tuple[Span, ...]
     """Log times of the first and last message of each run of lost ones, in order; empty where not known."""
     detail: str = ""
-    """What was found, in a sentence, the first time."""
+    """The first such loss in a sentence."""
 
 
 @dataclass
@@ -124,7 +124,7 @@ class LossAccount:
         return sorted(key for key in places if key[1] in wanted)
 
     def _copy(self) -> dict[tuple[str, str], dict[tuple[str, int], _Lost]]:
-        """What was found so far; workers that decode images may add to it meanwhile."""
+        """A copy of the losses so far; workers that decode images may add to it meanwhile."""
         return {key: places.copy() for key, places in self._found.copy().items()}
 
     def set_recorded(self, file: str, recorded: Mapping[str, int], start_ns: int, end_ns: int = 0) -> None:
@@ -270,16 +270,28 @@ def sampled(log_ns: Collection[int]) -> list[int]:
     return [ordered[at] for at in (0, len(ordered) // 2, -1)] if ordered else []
 
 
-def main_span(times: Collection[int]) -> Span:
-    """Where most of these log times lie, without a day between two of them: damage may have put others anywhere."""
-    runs: list[list[int]] = [[0]] if not times else []
+def _runs(times: Collection[int]) -> list[list[int]]:
+    """The times in order, in runs without a day between two of them."""
+    runs: list[list[int]] = []
     for time_ns in sorted(times):
         if runs and time_ns - runs[-1][-1] <= _FARTHEST_NS:
             runs[-1].append(time_ns)
         else:
             runs.append([time_ns])
-    longest = max(runs, key=len)
+    return runs or [[0]]
+
+
+def main_span(times: Collection[int]) -> Span:
+    """Where most of these log times lie, without a day between two of them: damage may have put others anywhere."""
+    longest = max(_runs(times), key=len)
     return longest[0], longest[-1]
+
+
+def confirmed_span(times: Collection[int]) -> Span:
+    """From the first to the last of these log times, but for one alone a day from all others: damage put it there."""
+    runs = _runs(times)
+    several = [run for run in runs if run[0] < run[-1]] or [max(runs, key=len)]
+    return several[0][0], several[-1][-1]
 
 
 def merged(spans: list[Span]) -> list[Span]:

@@ -46,7 +46,7 @@ class McapFile:
         self._doubtful: set[tuple[int, int]] = set()
         """Opcodes and ids of schemas and channels from damaged chunks, until a sound one repeats it."""
         self._unread: dict[int, str] = {}
-        """What is said of each chunk that was found damaged."""
+        """End of the sentence about each chunk that could not be unpacked, by its number."""
         self._layout = read_layout(self._file, length, self._define, self._name)
         self._losses = ChunkLosses(self._name, length, self._layout, self._channels, notes)
         self._local = not isinstance(path, RemotePath)
@@ -152,8 +152,7 @@ class McapFile:
         if damaged:
             last_ns = chunk.first_ns if reader.last_ns is None else reader.last_ns
             span = min(last_ns, chunk.last_ns), chunk.last_ns
-            short = {i: n - counts[i] for i, n in chunk.counts.items()}
-            self._losses.add_chunk(chunk, short, [span], "; the rest of it is left out")
+            self._losses.add_chunk(chunk, counts, [span], "; the rest of it is left out")
         self._losses.add_unknown(chunk, counts, damaged, [(chunk.first_ns, chunk.last_ns)])
         return damaged
 
@@ -185,7 +184,7 @@ class McapFile:
     def _add_unread(self, number: int) -> None:
         chunk = self._layout.chunks[number]
         span = chunk.first_ns, max(chunk.first_ns, chunk.last_ns)
-        self._losses.add_chunk(chunk, chunk.counts, [span], self._unread[number])
+        self._losses.add_chunk(chunk, {}, [span], self._unread[number])
 
     def _is_cached(self, number: int) -> bool:
         """Parts of what is not packed can be read again by themselves, unless each costs a request."""

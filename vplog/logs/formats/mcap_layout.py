@@ -95,6 +95,8 @@ class _LayoutReader:
         self.layout = Layout()
         self._indexed: dict[int, tuple[Chunk, dict[int, int]]] = {}
         """By offset: chunks as the summary's index lists them, and where the message index of each channel lies."""
+        self._unfit: list[tuple[int, int]] = []
+        """Offset and opcode of records of other lengths than their fields, which may have been messages."""
         self._chunked = False
         self._indexing: Chunk | None = None
         """The chunk whose message indexes come by."""
@@ -131,12 +133,15 @@ class _LayoutReader:
                 self.layout.cut_at = self._length
                 return
             data_ended = data_ended or opcode in (Opcode.DATA_END, Opcode.STATISTICS, Opcode.CHUNK_INDEX)
-            if opcode not in _SHAPES and opcode != Opcode.MESSAGE and self._is_message_head(position, opcode):
-                self.layout.unknown_at = self.layout.unknown_at or position
+            start = position + RECORD.size
+            if opcode != Opcode.MESSAGE and not self._chunked and self._length_by_fields(opcode, start) != stop - start:
+                self._unfit.append((position, opcode))
             before, position = position, stop
 
     def finish(self) -> None:
         """Hold the chunks that were found against those that the index at the end lists."""
+        if not self._chunked:
+            self.layout.unknown_at = next((at for at, opcode in self._unfit if self._is_message_head(at, opcode)), None)
         found = {chunk.record: chunk for chunk in self.layout.chunks if chunk.compression is not None}
         for offset, (listed, indexes) in sorted(self._indexed.items()):
             if (chunk := found.get(offset)) is not None:
@@ -329,7 +334,8 @@ class _LayoutReader:
             if chunks and chunks[-1].record >= 0 and chunks[-1].first_ns <= first_ns <= chunks[-1].last_ns:
                 self._indexing = chunks[-1]
             else:
-                self._indexing = Chunk(position, found)
+                is_whole = self._is_chunk(position, found - position - RECORD.size)
+                self._indexing = Chunk(position, found, doubtful=not is_whole)
                 self.layout.missing.append(self._indexing)
         if found - position >= (_LEAST_CHUNK if self._chunked else RECORD.size + _MESSAGE_HEAD.size):
             self.layout.gaps.append((position, found))  # else no message has room in it

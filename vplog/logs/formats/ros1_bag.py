@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from vplog.logs.formats.container import Block, Octets, Place
 
 _FIELDS = {MESSAGE: {b"conn", b"time"}, CONNECTION: {b"conn", b"topic"}}
-"""What the header of each kind of record in the chunks has."""
+"""Header fields of each kind of record in the chunks."""
 __all__ = ["MAGIC", "Ros1Bag"]
 
 
@@ -123,8 +123,7 @@ class Ros1Bag:
         span = [(min(last_ns, chunk.last_ns or last_ns), max(last_ns, chunk.last_ns))] if last_ns else []
         if damaged:
             chunk.damaged = True
-            short = {i: count - counts[i] for i, count in chunk.counts.items()}
-            self._losses.add_chunk(chunk, short, span, "; the rest of it is left out")
+            self._losses.add_chunk(chunk, counts, span, "; the rest of it is left out")
         self._losses.add_unknown(chunk, counts, damaged, span)
         return found
 
@@ -138,4 +137,4 @@ class Ros1Bag:
         chunk = self._layout.chunks[row]
         chunk.damaged = True
         span = [(chunk.first_ns, chunk.last_ns)] if chunk.last_ns else []
-        self._losses.add_chunk(chunk, chunk.counts, span, f", left out: {error}")
+        self._losses.add_chunk(chunk, {}, span, f", left out: {error}")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from vplog.errors import LogError
 from vplog.logs.formats.container import Channel, Contents, Message, Notes, by_topic, in_blocks
 from vplog.logs.formats.layout import ResyncSearch
-from vplog.logs.formats.loss_account import main_span
+from vplog.logs.formats.loss_account import confirmed_span, main_span
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 MAGIC = b"SQLite format 3\x00"
 _DAMAGE = (sqlite3.Error, OverflowError, UnicodeDecodeError)
-"""What reading a damaged file raises."""
+"""Exceptions that reading a damaged file raises."""
 _MOST_TRIED = 20_000
 """Rows that are looked for one by one behind damage: a second's work."""
 _MOST_MISSED = 2_000
@@ -99,7 +99,7 @@ class SqliteBag:
         if unknown := by_id.total():
             account.add("unknown_channel", {"": unknown}, (name, 0), [])
         account.set_recorded(name, {} if self._damaged else by_topic(counts), *log_span)
-        return Contents(dict(sorted(counts.items())), min(ends, default=0), max(ends, default=0))
+        return Contents(dict(sorted(counts.items())), *confirmed_span(ends))
 
     def _missing_by_index(self, rows: int) -> int:
         """Messages that an index of the table lists and the table, in which `rows` are found, has not."""

@@ -33,7 +33,7 @@ _CODECS = {
     "vp9": ("vp9", "VP9"),
     "av1": ("av1", "AV1"),
 }
-"""What a format's first word holds (`h264`, `libx264`, `hevc_nvenc`): FFmpeg's codec, and the name people know."""
+"""By a part of a format's first word (`h264`, `libx264`, `hevc_nvenc`): FFmpeg's codec, and its usual name."""
 NAMES = {**dict(_CODECS.values()), "vp8": "VP8"}
 """Of those that have a decoder of their own here."""
 _DECODERS = {"av1": ("libdav1d",), "vp9": ("libvpx-vp9", "vp9"), "vp8": ("libvpx", "vp8")}
@@ -59,7 +59,7 @@ _DELIMITER, _SEQUENCE_HEADER = b"\x12\x00", 1
 """The unit (OBU) that an AV1 packet may begin with, and the type of the one behind it at a key frame: AV1 bitstream
 5.3."""
 _UNREAD, PLAIN, _PARAMETERS, _KEY, WHOLE_KEY = range(5)
-"""What a packet is: not read; needs those before it; parameter sets alone; a key frame without, or with them."""
+"""Kinds of packets: not read; needs those before it; parameter sets alone; a key frame without, or with them."""
 
 
 def codec_of(encoding: str) -> str:
