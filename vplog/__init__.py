@@ -19,6 +19,8 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
+from vplog.version import __version__ as __version__
+
 TYPE_CHECKING = False  # for type checkers it is true, and typing takes most of the time of this import
 if TYPE_CHECKING:
     from vplog.api import (
@@ -45,7 +47,6 @@ if TYPE_CHECKING:
         VplogError,
     )
 
-__version__ = "0.1.0"
 __all__ = [
     "Answers", "GraphError", "LibraryError", "LogError", "Map", "NewerError", "ResultError", "RunFolder",
     "SettingsError", "TruthError", "VplogError", "batch", "compare", "evaluate", "localize", "open_log", "open_map",

@@ -220,7 +220,7 @@ _SENTENCES = {
     Verdict.INCONSISTENT: "The pose from query to match and the one from match to query do not agree.",
     Verdict.DIRECTION_ONLY: "Kept by the robust solve with rotation and direction only, without metres.",
     Verdict.REJECTED_BY_SOLVER: "Verified by geometry, but at odds with the other constraints of the robust solve.",
-    Verdict.NOT_SIGNIFICANT: "Verified by geometry, but likelier to be false than --false-rate allows.",
+    Verdict.NOT_SIGNIFICANT: "Verified by geometry, but more likely to be false than --false-rate allows.",
     Verdict.ACCEPTED_BY_DECISION: "A known inlier by decision: the robust solve kept it without a test.",
     Verdict.REJECTED_BY_DECISION: "Left out by decision, whatever geometry and the robust solve make of it.",
 }

@@ -124,7 +124,7 @@ _LIMITS = {
 
 
 def _allowed(node: dict[str, Any]) -> str:
-    """What a JSON schema allows, in words."""
+    """Values that a JSON schema allows, in words."""
     if "anyOf" in node:
         return " or ".join(_allowed(one) for one in node["anyOf"])
     if "enum" in node or "const" in node:

@@ -776,3 +776,21 @@ def test_an_interrupt_behind_another_error_is_one(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("vplog.verbs.info.preflight", stopped)
     told = verb("info", "drive.mcap")
     assert (told.code, "interrupted" in told.err) == (130, True)
+
+
+def test_an_early_interrupt_of_a_resumed_run_names_the_command(monkeypatch: pytest.MonkeyPatch, verb: Verb) -> None:
+    def stopped(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("vplog.verbs.resume.resume_request", stopped)
+    told = verb("run", "--resume", "-o", "my run")
+    assert (told.code, told.err.endswith("Go on with: vplog run --resume -o 'my run'\n")) == (130, True)
+
+
+@pytest.mark.parametrize("arguments", ["run {} -o OUT", "run LOG -o OUT --mask {}", "info LOG {}", "map info {}"])
+def test_no_secret_of_the_command_is_shown(verb: Verb, arguments: str) -> None:
+    """Of a URL with blanks too, which only the command tells from the sentence around it."""
+    url = "https://127.0.0.1:9/a b.mcap?name=a b&Signature=SECRET x"
+    told = verb(*(url if word == "{}" else word for word in arguments.split()))
+    assert told.code in (1, 2)
+    assert "SECRET" not in told.out + told.err

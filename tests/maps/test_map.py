@@ -20,6 +20,7 @@ from vplog.maps.storage.layout import drive_names
 from vplog.pipeline import load_pipeline
 from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record, tables
+from vplog.storage.json_records import CHECKSUM
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -185,3 +186,4 @@ def test_names_are_of_the_log_and_stay() -> None:
     assert named("a", "3", known, "y") == ["a-2"], "moved: known by its content"
     assert named("aa", "31", known, "zz") == ["a-3", "a"], "changed at its place, and a new one"
     assert named("b", "3", known, "y") == ["b"], "another name is another drive"
+    assert drive_names([CHECKSUM], ["1"], {}, [{}]) == [f"{CHECKSUM}-2"], "a field of failures.json"

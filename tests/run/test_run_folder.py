@@ -20,7 +20,7 @@ from tests.verbs.test_resume import OPTIONS, QUICK
 from vplog.demo import SMALL, make_drive
 from vplog.errors import LogError, ResultError, SettingsError
 from vplog.pipeline import Pipeline, load_pipeline
-from vplog.results.run_record import read_finished_run
+from vplog.results.run_record import read_finished_run, write_run_json
 from vplog.run import run_folder
 from vplog.run.provenance import head
 from vplog.run.reference_library import build_library
@@ -143,7 +143,9 @@ def test_runs_of_several_drives_hold_all_drives_of_the_run_before(log: Path, oth
     assert not (out / ".cache").exists()
     complete(out, log, force=True)
     assert tree(out).keys() == {"run.json", "b/notes.txt"}
-    complete(out, [log, other])
+    refused(out, [log, other], "is another log", joint=True)
+    refused(out, [log, other], "is another log")
+    complete(out, [log, other], force=True)
     complete(out, [other, log])
     refused(out, other, "another log")
 
@@ -233,6 +235,17 @@ def test_a_request_stays_while_it_is_gone_on_with(log: Path, tmp_path: Path) -> 
                 (out / ".cache" / "extract-0.stage").write_text("a result")
             raise KeyboardInterrupt
         assert (out / ".cache" / "run.json").exists()
+
+
+def test_a_run_killed_before_its_first_stage_and_interrupted_again_can_be_gone_on_with(
+    log: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    write_run_json(out / ".cache" / "run.json", {**head(Pipeline(), log, 1), "finished": False})
+    with pytest.raises(KeyboardInterrupt) as stopped, staged_run(out, head(Pipeline(), log, 1), [log]):
+        raise KeyboardInterrupt
+    assert stopped.value.__notes__ == [f"Go on with: vplog run --resume -o {out}"]
+    assert (out / ".cache" / "run.json").is_file()
 
 
 def test_a_log_that_changed_is_not_resumed(log: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:
@@ -326,11 +339,14 @@ def test_nothing_that_writes_a_file_replaces_a_log(finished: Path, drive: Drive,
 
 
 def test_libraries_and_demos_take_no_other_folder(drive: Drive, tmp_path: Path, verb: Callable[..., Said]) -> None:
-    for holds in ("files", "map", "study"):
+    """A file of the name of a record makes no library or study."""
+    for holds in ("files", "map", "study", "library"):
         out = tmp_path / holds
         OTHER_THINGS[holds](out)
         before = tree(out)
         assert "other things in it, not a library" in verb("library", drive.log, "-o", out, *OPTIONS).error
+        study = ("study", drive.log, "--truth", "odometry", "--min-gap", "5", "-o", out)
+        assert "other things in it, not a study" in verb(*study).error
         assert tree(out) == before
     run = tmp_path / "run"
     _holds("run.json", "library/library.json")(run)

@@ -90,6 +90,39 @@ with scratch("run") as folder:
     assert not list(own_folder().iterdir())
 
 
+def test_parts_of_a_file_whose_writers_were_killed_go_when_it_is_written_again(tmp_path: Path) -> None:
+    """Parts of living writers and files of other names stay."""
+    path = tmp_path / "result [1].mcap"
+    code = f"""
+import os, pathlib
+from vplog.storage.scratch import replacing
+with replacing(pathlib.Path({str(path)!r})) as stream:
+    stream.write(b"half")
+    stream.flush()
+    %s
+"""
+    for _ in range(2):
+        subprocess.run([sys.executable, "-c", code % "os.kill(os.getpid(), 9)"], check=False)
+    assert len(list(tmp_path.iterdir())) == 1
+    living = code % "print(flush=True); input()"
+    with subprocess.Popen([sys.executable, "-c", living], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        others = [
+            tmp_path / name for name in (".result [1].mcap.mine.part", ".result 1.mcap.7.part", "result [1].part")
+        ]
+        for other in others:
+            other.touch()
+        written = [*others, tmp_path / f".{path.name}.{process.pid}.part"]
+        assert all(one.exists() for one in written)
+        with replacing(path) as stream:
+            stream.write(b"whole")
+        assert sorted(tmp_path.iterdir()) == sorted([path, *written])
+        process.communicate(b"\n")
+    assert sorted(tmp_path.iterdir()) == sorted([path, *others])
+    assert path.read_bytes() == b"half"
+
+
 def test_a_folder_of_somebody_else_is_not_used(tmp_path: Path, machine: Path) -> None:
     (tmp_path / "theirs").mkdir()
     own = own_folder()

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 ENGINES = ("local", "ray")
 RETRIES = 2
 """More attempts at a drive whose worker died: one that dies three times will most likely die again."""
-_KILLED = "Its process was killed, as by a system that is out of memory. Free some or use fewer --jobs, and run again."
+_KILLED = "Its process was killed, perhaps because memory ran out. Free memory or use fewer --jobs, and run again."
 
 
 @dataclass(frozen=True)

@@ -149,7 +149,7 @@ def _check_answers(address: str) -> None:
     host, _, port = address.rpartition(":")
     if not host or not port.isdigit() or "//" in host:
         raise SettingsError(
-            f"--address {address} is no HOST:PORT of a Ray cluster. Give what `ray start --head` prints, or auto."
+            f"--address {address} is not a HOST:PORT of a Ray cluster. Give what `ray start --head` prints, or auto."
         )
     command = [sys.executable, "-m", "ray.scripts.scripts", "health-check", "--skip-version-check"]
     try:

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-import vplog
 from vplog.batch.ray_cluster import Head, connected, watched_head
 from vplog.batch.worker import Outcome, Task, compute_drive, made_by
 from vplog.errors import SettingsError, VplogError
@@ -24,6 +23,7 @@ from vplog.run.feature_extraction import Part, compute_part, missing_parts, part
 from vplog.run.provenance import library_of
 from vplog.storage.remote_path import located
 from vplog.storage.scratch import files_in, packed, pieces, scratch, unpacked, write_pieces
+from vplog.version import __version__
 
 if TYPE_CHECKING:
     from vplog.storage.scratch import Bytes
@@ -130,7 +130,7 @@ class RayEngine:
             )
         own, answers = made_by(), self._on_every_node(about_node)
         for answer in self._ray.wait(list(answers), num_returns=len(answers), timeout=_PROBE_S)[0]:
-            found, same = self._answer(answer), f"Install the same there: vplog {vplog.__version__}."
+            found, same = self._answer(answer), f"Install the same there: vplog {__version__}."
             if isinstance(found, self._ray.exceptions.RayTaskError):
                 raise SettingsError(f"{answers[answer]} cannot run vplog: {found.cause}. {same}")
             if isinstance(found, BaseException):  # it has just left
@@ -208,9 +208,9 @@ def translated(error: BaseException) -> BaseException:
         (exceptions.NodeDiedError, "Its machine left the cluster. Look at `ray status`"),
         (exceptions.LocalRayletDiedError, "Ray was stopped on this machine. Start it again"),
         (exceptions.ObjectLostError, "What it gave back was lost along with a machine. Look at `ray status`"),
-        (exceptions.ObjectStoreFullError, "The cluster has no room for what it gives back"),
-        (exceptions.OutOfDiskError, "The cluster's disks have no room for what it gives back"),
-        (exceptions.RayError, f"Its worker was killed, as by a system that is out of memory ({type(error).__name__})"),
+        (exceptions.ObjectStoreFullError, "The cluster has no room for its result"),
+        (exceptions.OutOfDiskError, "The cluster's disks have no room for its result"),
+        (exceptions.RayError, f"Its worker was killed, perhaps because memory ran out ({type(error).__name__})"),
     ):
         if isinstance(error, kind):
             return BrokenExecutor(f"{text}, and run again.")

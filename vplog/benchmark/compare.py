@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import vplog
 from vplog import logs
 from vplog.benchmark.answers import answers_table, file_stem, write_answers
 from vplog.benchmark.compare_figures import FIGURES, Figures
@@ -35,6 +34,7 @@ from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record
 from vplog.results.staging import check_contents, staged
 from vplog.storage.scratch import replacing
+from vplog.version import __version__
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -193,7 +193,7 @@ class _Drives:
         """compare.json, but for methods and warnings."""
         options, pairs = self.options, inputs.truth
         return {
-            "vplog": vplog.__version__,
+            "vplog": __version__,
             "query": str(self.query),
             "map": str(self.other),
             "min_gap": options.min_gap,

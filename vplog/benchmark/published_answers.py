@@ -98,5 +98,5 @@ def _score(cell: str, where: str) -> float:
     except ValueError:
         value = math.nan
     if not abs(value) <= np.finfo(np.float32).max:
-        raise SettingsError(f"{where}: {cell[:80]!r} is no score. {_FORMAT}")
+        raise SettingsError(f"{where}: {cell[:80]!r} is not a score. {_FORMAT}")
     return value

@@ -10,7 +10,7 @@ import numpy as np
 from vplog.data import Bytes, Floats, Ints, Reference
 from vplog.errors import LogError
 from vplog.execution.execution import Execution
-from vplog.masking import masked
+from vplog.geometry.masking import masked
 
 if TYPE_CHECKING:
     from vplog.benchmark.feature_cache import FeatureFolder

@@ -14,9 +14,7 @@ from importlib import metadata
 from itertools import accumulate
 from pathlib import Path
 
-import vplog
-
-_PACKAGE = Path(vplog.__file__).parent
+_PACKAGE = Path(__file__).parents[1]
 _PUBLISHED_AS = {"cv2": "opencv-python-headless", "faiss": "faiss-cpu", "yaml": "PyYAML", "google": "protobuf"}
 """Packages whose name on PyPI is not the one they are imported by; a search for others takes half a second."""
 
@@ -26,8 +24,8 @@ def code_of(*modules: str) -> dict[str, str]:
     """sha256 over the vplog files that these modules import, transitively and themselves included, as `code`; and the
     version of Python, the kind of machine, and the version of every other package that those files import.
 
-    What is imported for type checkers alone does not count, as it does not run. A package that is entered on the way
-    to one of its modules counts by its own file, not by all that it imports besides.
+    What is imported for type checkers alone does not count, as it does not run. A package below vplog that is entered
+    on the way to one of its modules counts by its own file, not by all that it imports besides.
     """
     own = tuple(module for module in modules if module.partition(".")[0] == "vplog")
     files, packages = imported(own)
@@ -45,7 +43,7 @@ def imported(modules: tuple[str, ...]) -> tuple[dict[str, Path], set[str]]:
     """Files by name of the vplog modules that these import, and the names of the packages of others."""
     files: dict[str, Path] = {}
     packages: set[str] = set()
-    waiting, followed = list(modules), set[str]()
+    waiting, followed = ["vplog", *modules], set[str]()
     while waiting:
         module = waiting.pop()
         if module in followed:
@@ -53,7 +51,7 @@ def imported(modules: tuple[str, ...]) -> tuple[dict[str, Path], set[str]]:
         followed.add(module)
         path = _file(module)
         if path is None:
-            raise ValueError(f"{module} is no module of vplog")
+            raise ValueError(f"{module} is not a module of vplog")
         parents = accumulate(module.split(".")[:-1], "{}.{}".format)
         files |= {parent: file for parent in parents if (file := _file(parent)) is not None}
         files[module] = path

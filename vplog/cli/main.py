@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -33,13 +34,13 @@ from vplog.cli.parser import (
     share,
     topic_options,
     topics_of,
-    words,
 )
 from vplog.cli.printing import Progress, print_json, print_result, print_status
 from vplog.cli.results import add_results
 from vplog.errors import LogError, VplogError, plural, was_interrupted
 from vplog.execution.cores import available, limited
 from vplog.execution.execution import Execution
+from vplog.storage.urls import without_secrets
 
 if TYPE_CHECKING:
     from vplog.logs import TopicChoice
@@ -61,8 +62,9 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # noqa: SIM115, PTH123 (of the process)
-    words[:] = sys.argv[1:] if argv is None else argv
+    words = sys.argv[1:] if argv is None else argv
     arguments = _parser().parse_args(words)
+    arguments.command = words
     arguments.shown = getattr(arguments, "output", None)  # a verb may write elsewhere first
     try:
         with _interrupted_by(signal.SIGTERM), _local_copies(arguments), limited(getattr(arguments, "threads", None)):
@@ -71,7 +73,7 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
     except BrokenPipeError:  # the reader of our output has gone; nothing is wrong
         sys.exit(0)
     except KeyboardInterrupt as error:
-        _interrupted(error)
+        _interrupted(arguments, error)
     except VplogError as error:
         _fail(arguments, str(error))
     except MemoryError:
@@ -83,7 +85,7 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
         )
     except Exception as error:  # a fault of ours: still one line, and how to see more
         if was_interrupted(error):
-            _interrupted(error)
+            _interrupted(arguments, error)
         text = " ".join(str(error).split())[:200]
         _fail(arguments, f"Internal error: {type(error).__name__}: {text}. See it with --debug.")
     sys.exit(0)
@@ -142,18 +144,21 @@ def _flush() -> None:
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def _interrupted(error: BaseException) -> NoReturn:
-    known = getattr(error, "__notes__", ["what was finished in the output folder stays"])
-    print_status(f"interrupted; {known[-1]}")
+def _interrupted(arguments: argparse.Namespace, error: BaseException) -> NoReturn:
+    again = f". Go on with: vplog run --resume -o {shlex.quote(str(arguments.shown))}"
+    kept = f"finished results in the output folder are kept{again if getattr(arguments, 'resume', False) else ''}"
+    known = getattr(error, "__notes__", [kept])
+    print_status(without_secrets(f"interrupted; {known[-1]}", arguments.command))
     sys.exit(128 + (_ended.pop() if _ended else signal.SIGINT))
 
 
 def _fail(arguments: argparse.Namespace, message: str) -> NoReturn:
     if arguments.debug:
-        sys.excepthook = printing.print_traceback
+        sys.excepthook = partial(printing.print_traceback, arguments.command)
         raise  # noqa: PLE0704 (called from an except block)
     _flush()
-    print_status(" ".join([f"error: {message}", *getattr(sys.exception(), "__notes__", [])]))
+    text = " ".join([f"error: {message}", *getattr(sys.exception(), "__notes__", [])])
+    print_status(without_secrets(text, arguments.command))
     sys.exit(1)
 
 

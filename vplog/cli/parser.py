@@ -1,4 +1,4 @@
-"""What the command line understands: argparse with arguments anywhere among the options, whole option names and errors
+"""Grammar of the command line: argparse with arguments anywhere among the options, whole option names and errors
 that name the nearest choice; the kinds of arguments, and the options that several verbs share.
 """
 
@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import takewhile
@@ -23,11 +23,9 @@ if TYPE_CHECKING:
 
 
 STDOUT = Path("-")
-words: list[str] = []
-"""The words of the command line."""
 _ROLES = ("image", "depth", "right", "camera-info", "odometry", "gps", "imu", "mask")
 _DASHES = "\u2013\u2014\u2212"
-"""What text editors make of two hyphens."""
+"""Dashes that text editors replace two hyphens with."""
 _MOST = 10**9
 """Largest count an option may have: far above any drive, and whole in every number type."""
 
@@ -41,6 +39,7 @@ class Parser(argparse.ArgumentParser):
         self._family = [] if family is None else family
         self._family.append(self)
         self._intermixing, self._brief_usage = False, ""
+        self._words: Sequence[str] = ()
 
     def add_subparsers(self, **options: Any) -> Any:
         made_by: Any = partial(Parser, family=self._family)
@@ -50,6 +49,7 @@ class Parser(argparse.ArgumentParser):
         """A verb takes its arguments before, between and behind its options."""
         if self._intermixing or args is None:
             return super().parse_known_args(args, namespace)
+        self._words = args
         verbs = self._subparsers is not None
         self._refuse_unknown(args[:1] if verbs else takewhile("--".__ne__, args))
         if verbs or "--" in args:
@@ -97,7 +97,7 @@ class Parser(argparse.ArgumentParser):
             near = f" Did you mean {' or '.join(inner)}?"
         elif not near and os.path.exists(value):  # noqa: PTH110 (false for a name that is too long)
             near = f" To look into it: {self.prog} info {value}"
-        self.error(f"{value!r} is no verb of {self.prog}.{near or f' Verbs: {listed}.'}")
+        self.error(f"{value!r} is not a verb of {self.prog}.{near or f' Verbs: {listed}.'}")
 
     def _print_message(self, message: str, file: Any = None) -> None:
         """Before Python 3.11.4 a stream that nobody reads is an error here, and the status that of a crash."""
@@ -108,7 +108,7 @@ class Parser(argparse.ArgumentParser):
         """The shortest usage, then what is wrong in one line; exit 2."""
         message = message.replace("ignored explicit argument", "takes no value, not")
         usage, end = self._brief_usage or self._required_usage(), "" if message.endswith((".", "?", "!")) else "."
-        wrong = f"{printable(without_secrets(message, words))}{end}"
+        wrong = f"{printable(without_secrets(message, self._words))}{end}"
         self.exit(2, f"{usage}{self.prog}: error: {wrong} All options: {self.prog} --help\n")
 
     def _required_usage(self) -> str:
@@ -131,7 +131,7 @@ def _is_number(text: str) -> bool:
 
 
 def place(text: str) -> Path:
-    """What an argument names: a path, or what is read and written by URL (vplog/storage/remote_path.py)."""
+    """A path, or a URL that is read and written as one (vplog/storage/remote_path.py)."""
     if "://" not in text:
         return _path(text)
     from vplog.storage.remote_path import located

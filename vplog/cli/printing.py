@@ -17,7 +17,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TextIO
 
-from vplog.cli.parser import words
 from vplog.errors import plural
 from vplog.storage.urls import printable, without_secrets
 
@@ -33,12 +32,14 @@ _UNMOVED_M = 1e-3
 def print_status(message: str) -> None:
     """A line on stderr, wrapped as those of results; a closed or full stderr is ignored."""
     with suppress(OSError):
-        text = printable(without_secrets(message, words))
+        text = printable(without_secrets(message))
         print(_wrapped(f"vplog: {text}", terminal_width(sys.stderr)), file=sys.stderr)
 
 
-def print_traceback(_: type[BaseException], error: BaseException, __: TracebackType | None) -> None:
-    """A traceback on stderr, which may name URLs as any other text."""
+def print_traceback(
+    words: Sequence[str], _: type[BaseException], error: BaseException, __: TracebackType | None
+) -> None:
+    """A traceback on stderr, which may name URLs as any other text, and those of the words of a command."""
     print(without_secrets("".join(traceback.format_exception(error)), words), end="", file=sys.stderr)
 
 
@@ -241,7 +242,7 @@ def _truth_notes(found: dict[str, Any]) -> list[str]:
             f"--truth-offset-s {truth['offset_s']:g}. Without that, figures and closures are judged at wrong times."
         )
     if truth is not None and truth["odometry"]:
-        notes.append("The odometry of this run is the truth itself: ATE, RPE and drift say nothing, closures do.")
+        notes.append("The odometry of this run is the truth itself: only the scores of its closures mean something.")
     if truth is not None and not truth["oriented"]:
         notes.append(
             "The truth has no orientations, so closures are judged by place, without heading. To judge their "

@@ -40,13 +40,13 @@ _TRUTH = "TUM file, the log's own GPS, or the truth that comes with it"
 _SOLVERS = ("gnc", "pcm", "dcs", "cauchy", "geman_mcclure", "lm")
 """The kinds of graph/solve.py, here too since that imports numpy."""
 _ALIGNMENTS = ("se3", "sim3", "origin")
-"""Those of evaluate/trajectory.py, here too since that imports numpy."""
+"""Alignments of evaluate/trajectory.py, here too since that imports numpy."""
 _MOST_OFFSET_S = 1e9
 """s; thirty years, from any clock that starts at zero to one of today."""
 _seconds = number(lambda value: abs(value) <= _MOST_OFFSET_S, f"between -{_MOST_OFFSET_S:g} and {_MOST_OFFSET_S:g}")
 _FOLDERS = ("colmap", "nerfstudio")
 _FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd", *_FOLDERS)
-"""Those of export.py, here too since that imports numpy."""
+"""Formats of export.py, here too since that imports numpy."""
 _BINARY = ("geoparquet", "rrd")
 
 

@@ -23,7 +23,7 @@ _MOTION_SHARE = 20
 _PRIOR = 1e-3
 """Weight of no turn at all against the motions: it settles what they leave open, and nothing else."""
 _ROUNDS = 10
-"""Of rotation and lever in turn: a lever of a motion's length takes so many to settle to a tenth of a degree."""
+"""Alternations of rotation and lever: a lever of a motion's length takes so many to settle to a tenth of a degree."""
 _LEAST_SHOWN = 0.02
 """Singular values of the lever's equations below this share of the largest are noise."""
 _NOISE_BOUND = 2.62
@@ -35,7 +35,7 @@ _WINDOW_NS = 1_000_000_000
 _CLOCK_MOTIONS, _LEAST_MOTIONS = 100, 20
 """Motions that clocks are compared on."""
 _LEAST_TURN_DEG = 5.0
-"""What the odometry must turn for a truth that never does to hold positions alone."""
+"""Least rotation of the odometry by which a truth that never turns is one of positions alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class BodyTruth:
     odometry: Trajectory | None = None
     """Moves the truth from sample to sample, in its metres; None interpolates on the geodesic."""
     frame: str = "body"
-    """What the truth is of: `body`, `camera`, or `estimated`, a point that was found from the odometry."""
+    """Frame of the truth: `body`, `camera`, or `estimated`, a point that was found from the odometry."""
     oriented: bool = True
     """Whether the truth has orientations, not positions alone."""
     noise: tuple[float, float] = (0.0, 0.0)
@@ -164,7 +164,7 @@ def _at(trajectory: Trajectory, stamp_ns: Ints) -> Floats:
 
 
 def _frame(true: Floats, moved: Floats, body_from_camera: Floats | None) -> tuple[str, Floats, float]:
-    """What the truth's poses (T, 4, 4) are of, by those of the odometry: a name, truth_from_body (4, 4), and the true
+    """Frame of the truth's poses (T, 4, 4), by those of the odometry: a name, truth_from_body (4, 4), and the true
     metres of one of the odometry's, which has no metres of its own where a single camera made it."""
     step = max(1, len(true) // _MOTION_SHARE)
     first = np.unique(np.linspace(0, len(true) - 1 - step, _MOTIONS).astype(np.int64))

@@ -173,7 +173,7 @@ def score_closures(
 
 
 def count_closures(closures: Closures, judged: Judgement, place: PlaceCriterion) -> dict[str, Any]:
-    """What `ClosureScore` counts of the accepted closures of any ledger, of one drive or between two."""
+    """Counts of `ClosureScore` for the accepted closures of any ledger, of one drive or between two."""
     accepted = closures.accepted
     right, wrong = accepted & judged.right, accepted & judged.wrong
     here = accepted & judged.known
@@ -209,7 +209,7 @@ def closure_sentences(closures: dict[str, Any]) -> list[str]:
         f"between optical axes (precision {share['place_precision']})",
     ]
     for name, text in (
-        ("not_judged", "are not judged: the truth has a gap there, or is too coarse to tell"),
+        ("not_judged", "are not judged: the truth has a gap there, or is too coarse"),
         (
             "overconfident",
             "true ones are outside 99.9 % of their covariance: it, or the truth between two visits, is wrong",

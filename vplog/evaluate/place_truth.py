@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog.data import Bools, Floats, Gps, Ints, Trajectory
-from vplog.errors import TruthError, nearest
+from vplog.errors import TruthError
 from vplog.evaluate import pairs
 from vplog.evaluate.image_names import folders_of, numbers_of, utm_of
 from vplog.evaluate.truth import local_enu, read_truth
@@ -39,7 +39,7 @@ _USES = {
     "tum": ("distance_m", "heading_deg"),
     "gps": ("distance_m",),
 }
-"""What each kind of truth takes beside its name."""
+"""Options of each kind of truth."""
 
 
 @dataclass(frozen=True)
@@ -250,10 +250,8 @@ def _takers(option: str) -> str:
 
 def _files(source: str) -> tuple[Trajectory, Trajectory]:
     """One TUM file for both drives, or one for each."""
-    if not Path(source).exists() and (near := nearest(source, [kind for kind in _USES if kind != "tum"])):
-        raise TruthError(f"--truth {shown(source)}: there is no such file.{near}")
     if Path(source).is_file() or "," not in source:
-        truth = read_truth(source)
+        truth = read_truth(source, [kind for kind in _USES if kind != "tum"])
         return truth, truth
     here, _, there = source.partition(",")
     return read_truth(here), read_truth(there)

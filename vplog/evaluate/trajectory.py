@@ -37,7 +37,7 @@ class Ate:
     alignment: str = "SE(3)"
     """`SE(3)` (Umeyama, rigid), `Sim(3)` (with scale) or `origin` (first poses made equal)."""
     scale: float = 1.0
-    """What the estimate was multiplied by; 1 but for Sim(3)."""
+    """Scale of the alignment, which multiplies the estimate; 1 but for Sim(3)."""
 
 
 @dataclass(frozen=True)

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from vplog.data import Floats, Gps, Ints, Trajectory
-from vplog.errors import TruthError
+from vplog.errors import TruthError, nearest
 from vplog.evaluate.trajectory import Ate, aligned_error
 from vplog.geometry import geodesy, se3
 from vplog.geometry.tum import read_tum
 from vplog.storage.remote_path import located
+from vplog.storage.urls import shown
 
 
-def read_truth(place: str | Path) -> Trajectory:
-    """A TUM file, here or by URL: world_from_body, s and m, in any order.
+def read_truth(place: str | Path, kinds: Iterable[str] = ("gps", "auto")) -> Trajectory:
+    """A TUM file, here or by URL: world_from_body, s and m, in any order. `kinds` are what may be meant by a name that
+    is no file.
 
     Raises TruthError with the first line that does not fit, SettingsError for a URL of no known kind.
     """
+    if not located(place).exists() and (near := nearest(str(place), kinds)):
+        raise TruthError(f"--truth {shown(str(place))}: there is no such file.{near}")
     return Trajectory(*read_tum(located(place), TruthError, "--truth"))
 
 

@@ -1,4 +1,4 @@
-"""How many threads there may be: the cores that this process may use, or fewer by the user's limit."""
+"""Number of threads: the cores that this process may use, or fewer by the user's limit."""
 
 from __future__ import annotations
 

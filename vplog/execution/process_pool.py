@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["OwnProcesses", "ProcessExpired"]
 
 _WORK = "vplog.batch.worker"
-"""What every process loads first."""
+"""Module that every process imports first."""
 
 
 class _Process(SpawnProcess):
@@ -109,7 +109,7 @@ class OwnProcesses:
 
 
 def _load() -> None:
-    """What a drive needs; and an end where the batch was killed: this must not go on beside the next one."""
+    """Import the code of a drive, and watch for the end of the batch: a worker must not go on beside the next one."""
     parent = multiprocessing.parent_process()
 
     def watch() -> None:

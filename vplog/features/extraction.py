@@ -11,7 +11,7 @@ import numpy as np
 from vplog.data import Features, Frame
 from vplog.errors import LogError
 from vplog.features.stereo_depth import StereoSettings, stereo_depth
-from vplog.masking import masked
+from vplog.geometry.masking import masked
 
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution

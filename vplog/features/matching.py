@@ -13,10 +13,10 @@ _EXACT = 1 << 24
 
 
 class MatchSettings(Settings):
-    """Which features of two images are taken for the same point."""
+    """Matching of the features of two images."""
 
     features: int = Field(default=1000, ge=1)
-    """How many features of each image are matched, the strongest ones; time grows with its square, and 1000 SIFT
+    """Number of features matched of each image, the strongest ones; time grows with its square, and 1000 SIFT
     already give hundreds of matches for a revisit."""
     ratio: float = Field(default=0.75, gt=0.0, le=1.0)
     """A match is kept when its distance is below this share of the second best's: Lowe 2004, section 7.1, fig. 11,

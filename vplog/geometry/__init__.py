@@ -1,1 +1,1 @@
-"""Poses and positions: SE(3), places on earth, trajectories as TUM files."""
+"""Poses and positions: SE(3), places on earth, trajectories as TUM files; and masked parts of images."""

@@ -175,7 +175,7 @@ def _check_poses(poses: Floats, name: str, dimension: int) -> None:
     bad = np.flatnonzero((off > 1e-5) | (np.linalg.det(rotation) < 0) | (poses[:, 3] != [0, 0, 0, 1]).any(1))
     if len(bad):
         where = name.format(row=bad[0])
-        raise GraphError(f"{where} is no rigid pose: R R^T is off the identity by {off[bad[0]]:.3g}.")
+        raise GraphError(f"{where} is not a rigid pose: R R^T is off the identity by {off[bad[0]]:.3g}.")
     far = np.flatnonzero((np.abs(poses[:, :3, 3]) > _FURTHEST_M).any(1))
     if len(far):
         where = name.format(row=far[0])

@@ -57,7 +57,7 @@ _ROUNDS = 4
 _MOST_LIFTED = 2_000
 """Poses up to which the staircase is climbed: a step takes tens of seconds at 5000."""
 _LOOSE = 1e-5
-"""The same on the way from a local minimum to another."""
+"""`_CONVERGED` of descents on the way from one local minimum to another."""
 _ROWS_MORE = 3
 """Rows beyond d that a way down is looked for in. With two, every closed path of frames can be drawn together, so that
 none is caught in turns too many; SE-Sync has needed no more on the public graphs."""
@@ -65,24 +65,24 @@ none is caught in turns too many; SE-Sync has needed no more on the public graph
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """What is known of a solution as the optimum of its kept edges."""
+    """Certificate of a solution as the global optimum of its inlier edges."""
 
     verdict: str
     """`certified`, `refused` or `not_tried`."""
     reason: str
-    """What that says, and what it does not say, in a few sentences."""
+    """Meaning and limits of the verdict, in a few sentences."""
     chi2: float | None = None
-    """Of the edges with isotropic noise, at the optimum that the solution leads to."""
+    """Chi-square of the edges with isotropic noise, at the optimum that the solution leads to."""
     smallest_eigenvalue: float | None = None
-    """Of the certificate matrix of rotations with the first pose held, the least of all parts."""
+    """Least eigenvalue of the certificate matrix of rotations with the first pose held, over all parts."""
     gap: float | None = None
     """Share of chi2 by which other poses can be better at most; 0 where no eigenvalue is negative."""
     moved_m: float | None = None
     """Largest distance in m from the solution to that optimum, both laid on the first pose."""
     lower_chi2: float | None = None
-    """Of the better poses that were found where it is refused."""
+    """Chi-square of the better poses that were found where it is refused."""
     better: Floats | None = None
-    """Those poses (N, 4, 4)."""
+    """(N, 4, 4) the better poses."""
 
     def record(self) -> dict[str, Any]:
         """The certificate as JSON has it, without poses."""
@@ -162,7 +162,7 @@ def solve_certified(graph: PoseGraph, solution: Solution) -> tuple[Solution, Cer
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """What is known of one connected part."""
+    """Certificate of one connected component."""
 
     certified: bool
     chi2: float
@@ -176,7 +176,7 @@ class _Part:
 
 
 def _certify_part(graph: PoseGraph, weight: Floats, search: bool) -> _Part:
-    """Of a connected graph at its solution, all edges (E,) being of positive weight."""
+    """Certificate of a connected graph at its solution, all edges (E,) being of positive weight."""
     problem, d, n = Problem.of(graph, weight), graph.dimension, len(graph.world_from_body)
     start = _as_point(graph.world_from_body, d)
     point, chi2 = descend(problem, start)
@@ -195,7 +195,7 @@ def _as_point(poses: Floats, d: int) -> Floats:
 
 
 def _suboptimality(n: int, d: int, eigenvalue: float) -> float:
-    """What other poses can gain at most where S, pose 0 held, has this least eigenvalue.
+    """Most that other poses can gain where S, pose 0 held, has this least eigenvalue.
 
     Laid on pose 0, two orthonormal frames are |R - R'|^2 <= 4 d apart.
     """
@@ -217,7 +217,7 @@ class Problem:
 
     @classmethod
     def of(cls, graph: PoseGraph, weight: Floats) -> Problem:
-        """Of a connected graph whose edges (E,) are of positive weight."""
+        """The problem of a connected graph whose edges (E,) are of positive weight."""
         d, n, count = graph.dimension, len(graph.world_from_body), len(graph.a)
         kappa, tau = (weight * precision for precision in precisions(graph))
         root = np.sqrt(np.column_stack([*[kappa] * d, tau]))[:, :, None]
@@ -341,7 +341,7 @@ def _generators(p: int, d: int) -> Floats:
 
 
 def _jacobian(point: Floats, d: int) -> list[sparse.csr_array]:
-    """Of each row of X, ((d + 1) n, k n): by the k turns and shifts of each pose."""
+    """Jacobian of each row of X, ((d + 1) n, k n): by the k turns and shifts of each pose."""
     p = point.shape[1]
     generators = _generators(p, d)
     turned = np.einsum("nij,kjl->nilk", point[:, :, :p], generators)[:, :, :d]
@@ -379,7 +379,7 @@ class _Factor:
 
     @classmethod
     def of(cls, matrix: sparse.csr_array, poses: Ints) -> _Factor:
-        """Of a matrix of as many rows for each pose, but the held one; `poses` are in order of their elimination."""
+        """Factors of a matrix with equally many rows for each pose but the held one; `poses` in elimination order."""
         size = (len(matrix.indptr) - 1) // len(poses)
         order = (poses[:, None] * size + np.arange(size)).ravel()
         permuted = matrix[order][:, order].tocsc()

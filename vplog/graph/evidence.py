@@ -319,7 +319,7 @@ def log_partition(sizes: list[int]) -> float:
 
 
 class Displacements:
-    """What K closures claim: that the world is displaced by D = X_a z X_b^-1 between two visits, X the odometry.
+    """Displacements D = X_a z X_b^-1 of the world between two visits that K closures claim, X the odometry.
 
     Two agree where D_i^-1 D_j is the identity but for the noise of both and of the odometry from a_i to a_j and from
     b_i to b_j (Mangelson et al., Pairwise Consistent Measurement Set Maximization, ICRA 2018, eq. 3).

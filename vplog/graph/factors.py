@@ -25,7 +25,7 @@ class Factors:
     piece: Ints
     """(N,) number of the piece of odometry that each pose is on, in order of their first poses."""
     eliminations: list[tuple[Bools, Elimination]] = field(default_factory=list, repr=False)
-    """Those made last, with the edges (E,) that each is of."""
+    """The last eliminations, with the edges (E,) of each."""
 
     @classmethod
     def of(cls, graph: PoseGraph) -> Factors:

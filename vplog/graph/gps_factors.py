@@ -264,7 +264,7 @@ def _check_enough(inlier: Floats) -> None:
     if inlier.sum() < _LEAST:
         raise GraphError(
             f"Only {int(inlier.sum())} of {len(inlier)} GPS fixes agree with the odometry and each other. "
-            "Run without --gps, or set gps.unknown_sigma_m to what the receiver does."
+            "Run without --gps, or set gps.unknown_sigma_m to the receiver's accuracy."
         )
 
 

@@ -89,7 +89,7 @@ class Joined:
     world_from_body: list[Floats]
     """Poses of each drive, in the frame of its map's first drive."""
     solved: dict[tuple[int, ...], Refined]
-    """What came of each map of several drives: its graph has their poses one after the other."""
+    """Solution of each map of several drives: its graph has their poses one after the other."""
     weight: list[Floats]
     """(L,) of each Between: 1 for the closures kept, 0 for all of those that do not hold."""
     residual: list[Floats]

@@ -105,7 +105,7 @@ class Positions:
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """What is minimised: the weighted edges (E,), under a robust loss and with positions where these are given."""
+    """Objective of the solve: the weighted edges (E,), under a robust loss and with positions where these are given."""
 
     factors: Factors
     weight: Floats

@@ -134,7 +134,7 @@ def covariance_without_breaks(
         covariance[:, axis, axis] = modelled[:, axis, axis]
     if not known.all():
         names = ", ".join(_AXES[axis] for axis in np.flatnonzero(~known))
-        warnings.append(f"The odometry's covariance leaves {names} unknown, so the drift model stands in there.")
+        warnings.append(f"The odometry's covariance leaves {names} unknown; the drift model is used there.")
 
     # an edge reads the samples from the one at or before its start to the one at or after its end
     before = np.concatenate([[0], np.cumsum(~usable)])
@@ -190,7 +190,7 @@ def _drift_model(odometry: Odometry, keys: Ints, settings: NoiseSettings) -> Flo
 
 
 def _travelled(stamps: Ints, step: Floats, keys: Ints) -> Floats:
-    """What the steps (T-1,) between the samples add up to between the keyframes, (N-1,)."""
+    """(N-1,) sums between the keyframes of the steps (T-1,) between the samples."""
     since_start = stamps - stamps[0]
     return np.diff(np.interp(keys - stamps[0], since_start, np.concatenate([[0.0], np.cumsum(step)])))
 

@@ -38,7 +38,7 @@ class _Edges(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    """What the edges are added up to, zero at first."""
+    """Sums over the edges, zero at first."""
 
     cost: Floats
     """(E,) half the chi-square."""
@@ -83,7 +83,7 @@ def edge_costs(graph: PoseGraph, weight: Floats, poses: Floats, edges: Ints | No
 
 
 def _terms(graph: PoseGraph, weight: Floats) -> tuple[Terms, _Edges]:
-    """What adds up the edges of the graph, and what it needs to know of them."""
+    """The compiled sum over edges for the dimension of the graph, and its edges as arrays."""
     planar = graph.dimension == 2
     information = graph.information[:, 2:5, 2:5] if planar else graph.information  # yaw, x, y
     given = (np.ascontiguousarray(one, np.float64) for one in (graph.a_from_b, information, weight))

@@ -39,7 +39,7 @@ _AS_CLAIMED = Sigmas()
 
 
 class RefineSettings(Settings):
-    """What is learned of the odometry from the constraints that were kept."""
+    """Noise and scale of the odometry, estimated from the inlier constraints."""
 
     noise: bool = True
     """Estimate by what factor the odometry's covariance is too large or too small."""
@@ -62,7 +62,7 @@ class Scale:
     """A factor of the metres of some edges."""
 
     of: str
-    """What they are of: "odometry" or "closures"."""
+    """Kind of the edges: "odometry" or "closures"."""
     edges: Bools
     """(E,)."""
     sigma: float
@@ -116,7 +116,7 @@ class Refined:
 
 
 def about_odometry(refined: Refined) -> dict[str, float]:
-    """What run.json says of it: factors of its claimed sigmas, and of its metres."""
+    """Record of the odometry in run.json: factors of its claimed sigmas, and of its metres."""
     sigmas = refined.sigmas
     return {
         "sigma_factor": sigmas.translation,

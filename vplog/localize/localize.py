@@ -13,8 +13,8 @@ from vplog.data import Camera, Features, Frame, Ints, Verdict
 from vplog.errors import LibraryError, LogError
 from vplog.features.extraction import describe
 from vplog.geometry import se3
+from vplog.geometry.masking import masked
 from vplog.loops.localize import Localization, localize
-from vplog.masking import masked
 from vplog.results.geo import on_earth
 from vplog.results.tables import POSE_COLUMNS
 from vplog.stages import EncodedFrame, FrameState, Log, StoredState
@@ -192,7 +192,7 @@ def _sentence(found: Localization, drive: str, keyframe: int) -> str:
     if found.verdict is Verdict.NO_CALIBRATION:
         return "The picture has no calibration, so it has no pose in metres. Give one with --calibration FILE."
     if found.place < 0:
-        return "No place of the map is like the picture."
+        return "No place of the map resembles the picture."
     if found.verdict is Verdict.INCONSISTENT:
         return "Two places that are far apart explain the picture equally well, so it is at neither."
     likeliest = f"Keyframe {keyframe} of {drive} comes closest, with {found.matches} matches."

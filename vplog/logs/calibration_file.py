@@ -35,7 +35,7 @@ def read_calibrations(path: Path) -> list[CalibratedCamera]:
     """The cameras of a file, in its order. Raises LogError where it is none of the known kinds."""
     try:
         if path.stat().st_size > _LARGEST:
-            raise LogError(f"{path} is larger than 1 MB, so it is no calibration. {_KINDS}.")
+            raise LogError(f"{path} is larger than 1 MB, so it is not a calibration. {_KINDS}.")
         return _cameras(path.name, path.read_bytes())
     except (OSError, UnicodeDecodeError) as error:
         why = (error.strerror or error) if isinstance(error, OSError) else "it is not text"

@@ -139,7 +139,7 @@ def body_from_camera(tree: FrameTree, body: str, frame: str, notes: Notes, ahead
     if found is not None:
         return found
     if ahead:
-        notes.add("No static transforms say where the camera is; it is taken to sit at the body and look ahead.")
+        notes.add("The log has no static transforms; the camera is assumed to be at the body's origin, looking ahead.")
         return _AHEAD.copy()
     if len(tree) or (body and frame):
         notes.add(

@@ -12,6 +12,7 @@ import numpy as np
 
 from vplog.data import Frame
 from vplog.errors import LogError, plural
+from vplog.geometry.masking import filled
 from vplog.logs.cameras import camera_from_image
 from vplog.logs.masks import resized_mask
 from vplog.logs.messages import pixels, video
@@ -19,7 +20,6 @@ from vplog.logs.messages.decode import decode
 from vplog.logs.messages.pixels import depth_m, levels_of, spread
 from vplog.logs.messages.records import BadMessageError, ImageMessage
 from vplog.logs.messages.video import VideoStream
-from vplog.masking import filled
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 _HALF = 127
-"""Of a mask of 0 and 255 that was resampled."""
+"""Threshold of a mask of 0 and 255 that was resampled."""
 _TRIED = 10
 """Images tried for the size of all, the first ones and as many spread over the drive: a video whose first key frame is
 damaged has none before the next."""
@@ -244,7 +244,7 @@ class ImageReader:
         self._container, self._image = container, image
         self._video = None if image is None or not codec else self._stream(image, codec, content)
         self.content = content if self._video is None else self._from_first_key(self._video, content, notes)
-        """What was read, without the images before a video's first key frame."""
+        """Content of the log, without the images before a video's first key frame."""
 
     def image(self, row: int) -> EncodedImage | DecodedImage:
         if self._image is None:

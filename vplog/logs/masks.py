@@ -94,7 +94,9 @@ class Masks:
                 f"{first.path.name} has {own[0]} x {own[1]} px and is resized to the images' {size[0]} x {size[1]}."
             )
         if missing := found.count(None):
-            notes.add(f"{self._path} has no mask for {plural(missing, 'image')} of {self._topic}; they count whole.")
+            notes.add(
+                f"{self._path} has no mask for {plural(missing, 'image')} of {self._topic}; these are used whole."
+            )
         if (share := 1 - float(used.mean())) > _INVERTED:
             notes.add(
                 f"{first.path.name} masks {share:.0%} of the images of {self._topic}; zero is masked: is it inverted?"

@@ -48,7 +48,7 @@ PROPERTIES = {
     "tf": "drifts as the estimator behind it does, wheels and cameras by about 0.5 to 2 % of the way",
     "twist": "drifts by about 1 to 5 % of the way; knows neither slip nor, without a gyroscope, small turns",
     "gps": "does not drift, and is off by metres at any time; knows neither roll and pitch nor a heading at rest",
-    "visual": "drifts by about 0.5 to 2 % of the way; ends where nothing is to be seen, and goes on as another piece",
+    "visual": "drifts by about 0.5 to 2 % of the way; breaks where images lack features, and goes on as another piece",
     "truth": "does not drift; an evaluation with it tells nothing about real odometry",
 }
 """The drift of each kind of source, and what it cannot know."""
@@ -105,7 +105,7 @@ def score_source(
 
 @dataclass(frozen=True, eq=False)
 class SourceOdometry:
-    """What one source gives as odometry."""
+    """Odometry of one source."""
 
     odometry: Odometry | None
     frames: list[str]
@@ -139,7 +139,7 @@ def _by_twists(
     if len(rows) < 2:
         return None
     moving, variances = twists[rows, :6], twists[rows, 6:]
-    text = f"{track.topic}: the odometry is its velocities, added up"
+    text = f"{track.topic}: the odometry is its velocities, integrated"
     gyro_ns, gyro = read.gyro.finish(notes)
     placed = tree.between(track.child or "base_link", read.gyro.frame) if len(gyro_ns) else None
     inside = np.asarray((gyro_ns >= stamp_ns[0]) & (gyro_ns <= stamp_ns[-1]))
@@ -149,7 +149,7 @@ def _by_twists(
     if placed is None and clean(read.gyro.frame) not in ("", track.child, "base_link"):
         notes.add(f"{read.gyro.topic}: its frame has no static transform; it is taken to be mounted as the body is.")
     turned = turned_by_gyro(stamp_ns, moving, gyro_ns, gyro, np.eye(4) if placed is None else placed)
-    bias = "its bias unknown, as nothing stands for a second"
+    bias = "its bias unknown, as the body never stands still for a second"
     bias = bias if turned.bias is None else f"less a bias of {np.degrees(turned.bias):.3f} deg/s at rest"
     notes.add(f"{text}; it turns by the gyroscope of {read.gyro.topic}, {bias}.")
     return dead_reckoned(turned.stamp_ns, turned.twists, np.full_like(turned.twists, np.nan))

@@ -60,7 +60,7 @@ class RecordedLog:
 
     @property
     def losses(self) -> list[Loss]:
-        """What could not be used so far, counted; complete once the log was read."""
+        """Losses counted so far; complete once the log was read."""
         return self.account.losses
 
     def info(self) -> LogInfo:

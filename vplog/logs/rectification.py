@@ -62,7 +62,7 @@ class Pair:
     camera: Camera
     """The left one, rectified, with the baseline."""
     maps: tuple[Maps | None, Maps | None]
-    """What cv2.remap takes for left and right images; None where they are rectified as they come."""
+    """Maps of cv2.remap for left and right images; None where they are rectified already."""
 
     def rectify(self, image: Bytes, side: int) -> Bytes:
         """(H, W) or (H, W, 3) uint8 the left (0) or right (1) image on the common rows."""
@@ -103,7 +103,7 @@ def pair_of(left: Side, right: Side, right_from_left: Floats | None) -> Pair:
             "--right-topic"
         )
     if not _BASELINES_M[0] < baseline_m < _BASELINES_M[1]:
-        raise NoPairError(f"its distance of {baseline_m:.3g} m to the left camera is no plausible baseline")
+        raise NoPairError(f"its distance of {baseline_m:.3g} m to the left camera is not a plausible baseline")
     matrices = [p[:, :3] for p in projections]
     _check_rows(matrices, right)
     maps = tuple(_maps(side, r, k) for side, r, k in zip((left, right), rotations, matrices, strict=True))
@@ -196,7 +196,7 @@ def _coefficients(camera: Camera) -> Floats:
 
 
 def _maps(side: Side, rotation: Floats, matrix: Floats) -> Maps | None:
-    """What cv2.remap takes, None where rectification moves no pixel by more than _SAME_PX."""
+    """Maps of cv2.remap; None where rectification moves no pixel by more than _SAME_PX."""
     if side.rectified:
         return None
     camera = side.camera

@@ -125,7 +125,7 @@ class Stamps:
             notes.add(f"{topic}: the log times jump in {times}; the header stamps do not, and are used.")
         for change in found.unclear_ns:
             notes.add(
-                f"{topic}: behind a gap the log times are {change / 1e9:+.3f} s further from the header stamps. Was a "
+                f"{topic}: after a gap the log times are {change / 1e9:+.3f} s further from the header stamps. Was a "
                 "clock set, or is the transport slower since? The stamps are not changed."
             )
         _lose("stray_stamp", topic, ~found.valid, log_ns[rows], notes)

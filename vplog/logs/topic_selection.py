@@ -120,7 +120,7 @@ class Selection:
     kind: str = ""
     """The one of SOURCES that is requested, `topic` of a topic or none at all, or empty."""
     geometry: dict[Channel, tuple[float, float]] = field(default_factory=dict)
-    """What linear and angular velocities of sources are multiplied by, where they are those of wheels."""
+    """Factors of the linear and angular velocities of sources that are wheel speeds."""
     imu: Channel | None = None
     """The IMU whose gyroscope turns velocities, where these are the odometry."""
     gps: Channel | None = None
@@ -133,7 +133,7 @@ class Selection:
 
     @property
     def parts(self) -> dict[Channel, str]:
-        """What each topic in use is used as, in the words of `vplog.data.Topic.part`."""
+        """Part of each topic in use, as in `vplog.data.Topic.part`."""
         named = ("image", "depth", "camera_info", "odometry", "gps", "right", "right_info", "imu", "mask")
         many = [(channel, name) for name in ("tf_static", "tf") for channel in getattr(self, name)]
         one = [(channel, name) for name in named if (channel := getattr(self, name)) is not None]
@@ -159,7 +159,7 @@ _NAMES = {
     "gps": "GPS", "imu": "IMU", "mask": "Image",
 }  # fmt: skip
 _ROLES = {"right": "image", "mask": "image"}
-"""What a topic of a part is taken for before parts are given out, where it is called otherwise."""
+"""Parts whose topics are candidates of another part until topics are assigned."""
 _PAIRS = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("infra1", "infra2"), ("cam0", "cam1"),
           ("image_0", "image_1"), ("image_2", "image_3"), ("rgb_0", "rgb_1"))  # fmt: skip
 """Words that tell the topics of a stereo pair apart: most drivers', RealSense's, EuRoC's, KITTI's and VSLAM-LAB's."""
@@ -270,7 +270,7 @@ def _sources(
 
 
 def _geometry(c: Candidate, choice: TopicChoice) -> tuple[float, float] | None:
-    """What the velocities of wheels are multiplied by, by the measures in `choice`; None where these are not given."""
+    """Factors of linear and angular wheel speeds, by the dimensions in `choice`; None where these are not given."""
     kind = short_type(c.channel.type)
     if kind not in GEOMETRY or any(getattr(choice, name) is None for name in GEOMETRY[kind]):
         return None

@@ -61,7 +61,7 @@ class NetworkInput(Settings):
         if {len(self.mean), len(self.std)} != {channels}:
             raise ValueError(f"mean and std must be of {channels} value(s) for colour {self.colour}")
         if not all(self.std):
-            raise ValueError("a std is 0, which divides")
+            raise ValueError("a std is 0, by which pixels are divided")
         if self.size is not None and not (min(self.size) >= 1 and self.size[0] * self.size[1] <= _MAX_PIXELS):
             raise ValueError(f"size {list(self.size)} must be height and width of at most {_MAX_PIXELS} px together")
         return self

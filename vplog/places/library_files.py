@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import pyarrow as pa
 
-import vplog
 from vplog.data import THUMBNAIL_SIDE, Features, Reference
 from vplog.errors import LibraryError, nearest_path
 from vplog.execution.execution import Execution
@@ -25,6 +24,7 @@ from vplog.storage.image_file import BadImageError, decode_image
 from vplog.storage.json_records import has_checksum, with_checksum
 from vplog.storage.parquet_limits import check_columns, check_file, check_version, open_table, read_table, write_table
 from vplog.storage.scratch import put_in_place, sync_all
+from vplog.version import __version__
 
 _FORMAT = 1
 """Version of library.json. A reader refuses a newer one."""
@@ -143,7 +143,7 @@ def save_references(
         _write(folder / "references.parquet", _REFERENCES, columns, compression="none")
         record = {
             "format": _FORMAT,
-            "vplog": vplog.__version__,
+            "vplog": __version__,
             "hash": digest or references_hash(references, settings),
             "references": len(references),
             "features": len(owners),

@@ -69,4 +69,4 @@ class OnnxState(VectorState):
 
     def describe(self, features: Features) -> NDArray[np.float16]:
         """Raises LibraryError: features are no image."""
-        raise LibraryError("A network looks at the image itself, and only its features are here. Give the log.")
+        raise LibraryError("A network needs the image itself, and only its features are given. Give the log.")

@@ -97,7 +97,7 @@ class VectorsState(VectorState):
 
     def describe(self, features: Features) -> NDArray[Any]:
         """Raises LibraryError: features have no vector."""
-        raise LibraryError("Vectors from a file belong to frames of a log, and only features are here. Give the log.")
+        raise LibraryError("Vectors from a file belong to frames of a log, and only features are given. Give the log.")
 
     def index(self, descriptors: Sequence[NDArray[Any]]) -> VectorIndex:
         similarity = products if self.settings.metric == "cosine" else nearness

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from vplog.data import Features, Ints
-from vplog.masking import masked
+from vplog.geometry.masking import masked
 from vplog.stages import FrameState, Log, PlaceState, StoredState
 
 if TYPE_CHECKING:

@@ -170,7 +170,7 @@ def _split(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counte
                     fixed += [(number, _id(path, number, word)) for word in line.split()[1:]]
                 elif tag[0] != "#":
                     if not _LEFT_OUT.match(tag):
-                        raise _at(path, number, f"{tag[:30]!r} is no g2o element")
+                        raise _at(path, number, f"{tag[:30]!r} is not a g2o element")
                     left_out[tag] += 1
     except OSError as error:
         raise GraphError(f"Cannot read {path}: {error.strerror or error}.") from None

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-import vplog
 from vplog.data import ACCEPTED, Camera, Closures, Floats, Gps, Ints, Keyframes, PoseGraph, Verdict
 from vplog.geometry import se3
 from vplog.results import foxglove, geo
@@ -25,6 +24,7 @@ from vplog.results.tables import TableMetadata, covariance_of
 from vplog.storage.image_file import image_size
 from vplog.storage.json_records import canonical_json
 from vplog.storage.scratch import replacing
+from vplog.version import __version__
 
 if TYPE_CHECKING:
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
@@ -129,7 +129,7 @@ def write_mcap(
     """
     with replacing(path) as stream:
         writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD, enable_data_crcs=True)
-        writer.start(profile="", library=f"vplog {vplog.__version__}")
+        writer.start(profile="", library=f"vplog {__version__}")
         header = {key.removeprefix("vplog."): text for key, text in metadata.record().items()}
         about = {name: canonical_json(value) for name, value in extras.about.items()}
         writer.add_metadata("vplog", {**header, "drive": keyframes.drive, **about})

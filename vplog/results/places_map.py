@@ -198,7 +198,7 @@ def read_places_header(path: Path) -> PlacesHeader:
 
 
 def places_by_drive(path: Path) -> dict[str, int]:
-    """How many places of each drive are in a map. Raises ResultError."""
+    """Number of places of each drive in a map. Raises ResultError."""
     found: dict[str, int] = {}
     with _reading(path), _opened(path, ["drive"]) as file:
         for batch in file.iter_batches(ROWS_PER_GROUP, columns=["drive"]):

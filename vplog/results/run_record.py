@@ -10,7 +10,7 @@ from typing import Any
 from vplog.errors import ResultError, nearest_path
 from vplog.results.staging import recover
 from vplog.storage.folders import check_regular
-from vplog.storage.json_records import has_checksum, plain, with_checksum
+from vplog.storage.json_records import CHECKSUM, has_checksum, with_checksum
 from vplog.storage.parquet_limits import check_file, check_version
 from vplog.storage.scratch import replacing
 
@@ -24,19 +24,19 @@ _MOST_DEPTH = 100
 """Values within values, of which ours have ten; Python follows a few hundred."""
 
 
-def write_run_json(path: Path, record: dict[str, Any], checksum: bool = True) -> None:
-    """Write a record of plain values, numpy scalars and paths; keys keep the order given, NaN becomes null. The folder
-    is made where it is not there."""
-    record = with_checksum(record) if checksum else plain(record)
-    text = json.dumps(record, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+def write_run_json(path: Path, record: dict[str, Any]) -> None:
+    """Write a record of plain values, numpy scalars and paths, with its checksum. Keys keep the order given, NaN
+    becomes null. The folder is made where it is not there."""
+    text = json.dumps(with_checksum(record), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     with replacing(path, parents=True) as stream:
         stream.write(text.encode())
 
 
 def is_ours(path: Path) -> bool:
-    """Whether a file is a sound record that vplog wrote: others may have one of the same name."""
+    """Whether a file is a sound record that vplog wrote, by fields that only vplog writes: others may have one of the
+    same name."""
     try:
-        return "vplog" in read_run_json(path)
+        return "vplog" in read_run_json(path) or CHECKSUM.encode() in path.read_bytes()
     except ResultError:
         return False
 

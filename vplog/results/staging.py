@@ -147,7 +147,7 @@ def _stale(committed: Path) -> list[str]:
     except (ValueError, RecursionError):
         names = None
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ResultError(f"{path} is no list of names, so vplog did not write it. Move {committed} out of the way.")
+        raise ResultError(f"{path} is not a list of names, so vplog did not write it. Move {committed} out of the way.")
     return names
 
 

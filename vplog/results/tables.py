@@ -19,7 +19,6 @@ from typing import Any, TypeVar
 import numpy as np
 import pyarrow as pa
 
-import vplog
 from vplog.data import Closures, EdgeKind, Floats, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory, Verdict
 from vplog.errors import ResultError, nearest
 from vplog.geometry import se3
@@ -33,6 +32,7 @@ from vplog.storage.parquet_limits import (
     write_table,
 )
 from vplog.storage.scratch import replacing
+from vplog.version import __version__
 
 T = TypeVar("T", bound=StrEnum)
 
@@ -56,7 +56,7 @@ class TableMetadata:
         return {
             "vplog.settings": canonical_json(self.settings),
             "vplog.library": self.library,
-            "vplog.version": vplog.__version__,
+            "vplog.version": __version__,
         }
 
 
@@ -449,7 +449,7 @@ def read_metadata(path: Path) -> dict[str, str]:
 
 
 def read_table_metadata(path: Path) -> TableMetadata:
-    """What a table was made with, by its header. Raises ResultError where that lacks the settings."""
+    """Settings and library of a table, from its header. Raises ResultError where that lacks the settings."""
     header = read_metadata(path)
     try:
         settings = json.loads(header.get("vplog.settings", "null"))

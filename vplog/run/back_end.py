@@ -115,7 +115,7 @@ def _apart(broken: Ints, keyframes: Keyframes, graph: PoseGraph, solution: Solut
         return []
     seconds = (keyframes.stamp_ns[broken[open_] + 1] - keyframes.stamp_ns[0]) / 1e9
     return [
-        f"No closure leads across {int(open_.sum())} of {len(broken)} breaks of the odometry, the first at "
+        f"{int(open_.sum())} of {len(broken)} breaks of the odometry have no closure across them, the first at "
         f"{seconds[0]:.1f} s: the poses after it are not known relative to those before it."
     ]
 

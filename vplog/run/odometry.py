@@ -13,7 +13,7 @@ from vplog.cache.codecs import json_codec
 from vplog.cache.steps import Steps, step
 from vplog.data import Camera, Frame, Keyframes, Odometry
 from vplog.errors import LogError
-from vplog.masking import masked
+from vplog.geometry.masking import masked
 from vplog.run.feature_extraction import image_topics
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.run.visual_odometry.visual import visual_odometry
@@ -79,9 +79,7 @@ def odometry_of(log: Log, topics: TopicChoice, steps: Steps) -> Odometry:
 def by_images(log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], *, execution: Execution) -> Odometry:
     """Visual odometry, its breaks noted. Raises LogError where tracking fails from the first frame to the last."""
     if unasked:
-        _log.warning(
-            "The log has no odometry, so that of its images is taken (visual odometry, as by --odometry visual)."
-        )
+        _log.warning("The log has no odometry, so visual odometry of its images is used (--odometry visual).")
     stamp_ns = log.stamps()
     odometry = visual_odometry(_decoded(log, stamp_ns, execution), log.camera())
     if odometry is None:

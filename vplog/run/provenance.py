@@ -10,13 +10,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import vplog
 from vplog import logs
 from vplog.cache.input_hashes import bytes_of, files_of, stat_signature
 from vplog.errors import LogError, ResultError
 from vplog.results import run_record
 from vplog.storage.json_records import canonical_json
 from vplog.storage.remote_path import local_copy, located, original, reason
+from vplog.version import __version__
 
 if TYPE_CHECKING:
     from vplog.settings import Settings
@@ -96,7 +96,7 @@ def head(
     files = [str(file.resolve()) for file in files_of(path)]
     return {
         "format": run_record.FORMAT,
-        "vplog": vplog.__version__,
+        "vplog": __version__,
         "log": files[0],
         **({"parts": files} if len(files) > 1 else {}),
         "log_stat": stat_of(files_of(path)),

@@ -17,7 +17,7 @@ from vplog.data import Bytes, Ints, Keyframes, Reference
 from vplog.errors import LibraryError, SettingsError
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
-from vplog.masking import masked
+from vplog.geometry.masking import masked
 from vplog.places.coverage import (
     STRONGEST,
     Coverage,
@@ -164,13 +164,14 @@ def build_library(
 def _library_in(out: Path, opened: Sequence[Log] | None) -> list[str]:
     """The files of a library in a folder that a new one may replace: one of these logs, or any. Raises SettingsError
     where it may not."""
-    check_contents(out, "a library", (out / "library.json").is_file())
-    check_regular(out, "library.json")
+    names = ["library.json", "features.parquet", "references.parquet"]
     if out.absolute().name == "library" and (out.absolute().parent / "run.json").is_file():
         raise SettingsError(f"{out} is the library of the run in {out.absolute().parent}. Choose another with -o.")
+    check_contents(out, "a library", all((out / name).is_file() for name in names))
+    check_regular(out, "library.json")
     if opened is not None and (out / "library.json").is_file():
         _check_same_logs(out, opened)
-    return ["library.json", "features.parquet", "references.parquet"]
+    return names
 
 
 def _check_same_logs(out: Path, opened: Sequence[Log]) -> None:

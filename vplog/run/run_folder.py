@@ -94,7 +94,8 @@ def staged_run(
         return _results_in(out, library, drives, resumable)
 
     with staged(out, check_folder) as made, stands_for(made, out):
-        before = set() if request.is_file() else set(folder.rglob(f"*{ENDING}"))
+        resumed = request.is_file()
+        before = set() if resumed else set(folder.rglob(f"*{ENDING}"))
         try:
             if resumable:
                 folder.mkdir(exist_ok=True)
@@ -103,15 +104,15 @@ def staged_run(
         except BaseException as error:
             cached = set(folder.rglob(f"*{ENDING}")) - before if resumable else ()
             interrupted = was_interrupted(error)
-            again = cached and (interrupted or isinstance(error, OSError | MemoryError | ResultError))
-            if cached:
-                error.add_note(f"{_kept(out, cached)}{f' Go on with: {_resume(out)}' if again else ''}")
+            again = bool(cached or resumed) and (interrupted or isinstance(error, OSError | MemoryError | ResultError))
+            if notes := [_kept(out, cached)] * bool(cached) + [f"Go on with: {_resume(out)}"] * again:
+                error.add_note(" ".join(notes))
             if not again:
                 request.unlink(missing_ok=True)  # resumed, it would fail again
                 with suppress(OSError):  # not there, or it holds what was kept of this and other runs
                     folder.rmdir()
                 if resumable and interrupted:
-                    error.add_note("no stage was finished, so nothing is kept. Give the same command again")
+                    error.add_note("no stage was finished, so nothing is kept. Run the same command again")
             raise
 
 
@@ -159,34 +160,39 @@ def _check_same_logs(out: Path, files: Sequence[Path]) -> None:
         )
     if record and record.get("finished") is False:  # as older versions left it
         record, unfinished = None, unfinished or record
-    if not {log.resolve() for log in _logs_in(unfinished)} <= {file.resolve() for file in files}:
+    if unfinished and not _has_paths(unfinished, files, several="logs" in unfinished):
         raise SettingsError(
             f"{out} keeps an unfinished run of {_named(unfinished)}, not of {given}. Go on with that: {_resume(out)}. "
             "Or choose another folder with -o, or drop it with --force."
         )
     drives = [_read(out / name / "run.json") or record for name in _drives_in(record or {})]
     for one in drives or [record]:
-        if one and not _is_of(one, files):
+        if one and not _is_of(one, files, several=bool(drives)):
             raise SettingsError(
                 f"{out} is the run of {_named(one)}, and {given} is another log, or has changed since. Choose another "
                 "folder with -o, or replace that run with --force."
             )
 
 
-def _is_of(record: dict[str, Any], files: Sequence[Path]) -> bool:
-    """Whether the log of a finished run is among these, by its content. That is read only where paths, lengths and
-    times leave it open."""
+def _is_of(record: dict[str, Any], files: Sequence[Path], several: bool) -> bool:
+    """Whether the log of a finished run is this one, or among those of `several` drives, by its content. That is read
+    only where paths, lengths and times leave it open."""
     known, about, content = _logs_in(record), record.get("log_stat"), record.get("inputs")
     about, content = (one if isinstance(one, dict) else {} for one in (about, content))
-    same_paths = {log.resolve() for log in known} <= {file.resolve() for file in files}
+    same_paths = _has_paths(record, files, several)
     if same_paths and provenance.stat_of(known) == about:
         return True
-    for tried in [known] if same_paths else [files, *([file] for file in files if len(files) > 1)]:
+    for tried in [known] if same_paths else [files, *([file] for file in files if several)]:
         if not content or bytes_of(tried) != about.get("bytes", bytes_of(tried)):
             continue
         if sorted(hash_inputs(tried).values()) == sorted(map(str, content.values())):
             return True
     return False
+
+
+def _has_paths(record: dict[str, Any], files: Sequence[Path], several: bool) -> bool:
+    known, given = {log.resolve() for log in _logs_in(record)}, {file.resolve() for file in files}
+    return known <= given if several else known == given
 
 
 def _run_json(out: Path) -> dict[str, Any] | None:

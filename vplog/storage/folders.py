@@ -17,7 +17,7 @@ _KINDS = {
     stat.S_IFLNK: "link", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket", stat.S_IFCHR: "device", stat.S_IFBLK: "device",
 }  # fmt: skip
 _LOGS = (b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd")
-"""What recorded drives begin with, those that zstd packed too."""
+"""Magic numbers of recorded drives, zstd's too."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PICTURES = (b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"GIF8", b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51", b"\x1a\x45\xdf\xa3")
 """JPEG, TIFF, GIF, JPEG 2000 and Matroska."""
@@ -80,7 +80,7 @@ def check_regular(folder: Path, record: str = "") -> None:
 
 
 def _kind(entry: os.DirEntry[str]) -> str:
-    """What a file that is not regular is; empty where it went away."""
+    """Kind of a file that is not regular; empty where it was deleted meanwhile."""
     try:
         return _KINDS.get(stat.S_IFMT(entry.stat(follow_symlinks=False).st_mode), "")
     except FileNotFoundError:

@@ -29,7 +29,7 @@ _METADATA = "http://metadata.google.internal"
 _PROBE_S = 10.0
 """For one request of some hundred bytes."""
 _METADATA_S = 2.0
-"""It is on the machine itself: google-auth waits 3 s."""
+"""s; the metadata server is on the machine itself: google-auth waits 3 s."""
 _RETRY_S = 20
 """Retries end after this; a request without an answer is ended by the client after 120 s."""
 _REASON = re.compile(

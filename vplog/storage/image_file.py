@@ -42,7 +42,7 @@ _TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
 _TIFF_SIDES, _TIFF_SHORT = (256, 257), 3
 """Tags of width and height, and the type of 16 bits: TIFF 6.0, section 2 and 3."""
 _SIMPLEJPEG_ERRORS = (ValueError, KeyError)
-"""What simplejpeg raises; a KeyError where the header names a sampling of colours that it does not know."""
+"""Exceptions of simplejpeg; a KeyError where the header names a sampling of colours that it does not know."""
 _PNM_HEAD = 4096
 """Bytes in which a PNM file must have named its size; comments may stand before it."""
 _PNG_SAMPLES = {0: (1, (1, 2, 4, 8, 16)), 2: (3, (8, 16)), 3: (1, (1, 2, 4, 8)), 4: (2, (8, 16)), 6: (4, (8, 16))}

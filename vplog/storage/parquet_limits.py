@@ -245,7 +245,7 @@ def _check(needed: int, path: Path) -> None:
 
 
 def _row_bytes(kind: pa.DataType) -> int:
-    """What a row of a type takes at least, a null too."""
+    """Least bytes of a row of a type, a null too."""
     if pa.types.is_struct(kind):
         return sum(_row_bytes(part.type) for part in kind)
     if pa.types.is_fixed_size_list(kind):

@@ -57,7 +57,7 @@ def located(text: str | Path | RemotePath) -> Path:
 
 
 def address(path: Path) -> str:
-    """What opens a path from another process: a URL with its query, which is not to be stored or shown."""
+    """Text that opens a path in another process: a URL with its query, which is not to be stored or shown."""
     return path.url if isinstance(path, RemotePath) else str(path)
 
 
@@ -136,7 +136,7 @@ class RemotePath:
         return Stat(self._length)
 
     def version(self) -> str:
-        """What changes when the object does, without reading it: its length and time, or the server's tag."""
+        """A text that changes with the object, without reading it: its length and time, or the server's tag."""
         if self._is_http:
             return f"length {self._length}, {self._head.get('ETag') or self._head.get('Last-Modified') or 'no tag'}"
         return f"length {self._length}, time {self._info.mtime_ns}"
@@ -162,7 +162,7 @@ class RemotePath:
         return self.read_bytes().decode(encoding)
 
     def iterdir(self) -> Iterator[RemotePath]:
-        """What is right below, in order of names. HTTP servers do not list: nothing."""
+        """Entries right below, in order of names; none of an HTTP server, which does not list."""
         for name in () if self._is_http else sorted(names_below(self)):
             yield self / name
 
@@ -257,7 +257,7 @@ class _Ranges(io.RawIOBase):
 
 
 def names_below(path: RemotePath) -> dict[str, bool]:
-    """What is right below a prefix of an object store, and whether that has objects below, by which gs:// alone tells
+    """Names right below a prefix of an object store, and whether each has objects below, by which gs:// alone tells
     folders. Raises OSError."""
     from pyarrow.fs import FileSelector, FileType
 

@@ -8,6 +8,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from glob import escape
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
@@ -34,7 +35,7 @@ def own_folder() -> Path:
     except OSError as error:
         raise ResultError(f"Cannot make {folder}: {error.strerror}. Set TMPDIR to a folder with room.") from None
     if folder.is_symlink() or about.st_uid != os.getuid():
-        raise ResultError(f"{folder} belongs to somebody else. Set TMPDIR to a folder of your own.")
+        raise ResultError(f"{folder} belongs to another user. Set TMPDIR to a folder of your own.")
     return folder
 
 
@@ -60,10 +61,16 @@ def scratch(name: str, among: Path | None = None) -> Iterator[Path]:
 
 
 def _sweep(among: Path) -> None:
-    for path in among.glob("*/.lock"):
-        with suppress(OSError), path.open() as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # OSError where its process lives
-            shutil.rmtree(path.parent, ignore_errors=True)
+    for path in filter(_is_left, among.glob("*/.lock")):
+        shutil.rmtree(path.parent, ignore_errors=True)
+
+
+def _is_left(path: Path) -> bool:
+    """Whether the process that locked a file has ended."""
+    with suppress(OSError), path.open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # OSError where its process lives
+        return True
+    return False
 
 
 @contextmanager
@@ -95,8 +102,9 @@ def replacing(path: Path, parents: bool = False) -> Iterator[BinaryIO]:
     """A binary stream that becomes `path` when the block ends well; what was there before stays until then. With
     `parents` the folders above it are made.
 
-    The bytes go to a hidden file beside it, are synced, then renamed. A link stays one: what it points to is replaced.
-    A device or a pipe is written into. Raises ResultError where the folder cannot be written or the disk is full.
+    The bytes go to a hidden file beside it, are synced, then renamed; such files of processes that were killed are
+    removed. A link stays one: what it points to is replaced. A device or a pipe is written into. Raises ResultError
+    where the folder cannot be written or the disk is full.
     """
     if not path.name:
         raise ResultError("The name of a file to write is empty. Give one with -o.")
@@ -109,16 +117,27 @@ def replacing(path: Path, parents: bool = False) -> Iterator[BinaryIO]:
             path.parent.mkdir(parents=True, exist_ok=True)
         path = path.resolve() if path.is_symlink() else path
         check_replaceable(path)
+        _sweep_parts(path)
         part = path.with_name(f".{path.name}.{os.getpid()}.part")
         try:
-            with part.open("wb") as stream:
-                yield stream
-            put_in_place(part, path)
+            with part.open("wb") as lock:
+                with suppress(OSError):  # a file system without locks
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                with part.open("wb") as stream:
+                    yield stream
+                put_in_place(part, path)
         finally:
             part.unlink(missing_ok=True)
     except OSError as error:
         reason = error.strerror or str(error).splitlines()[0]
         raise ResultError(f"Cannot write {path}: {reason}. Free space or choose another folder with -o.") from None
+
+
+def _sweep_parts(path: Path) -> None:
+    begin, end = f".{path.name}.", ".part"
+    for part in path.parent.glob(f"{escape(begin)}*{end}"):
+        if part.name[len(begin) : -len(end)].isdecimal() and _is_left(part):
+            part.unlink(missing_ok=True)
 
 
 def put_in_place(part: Path, path: Path) -> None:
@@ -167,16 +186,9 @@ def write_pieces(folder: Path, name: str, parts: Iterator[Bytes]) -> None:
     """A file of a folder from its pieces. Raises ResultError."""
     if not is_below(name):
         raise ResultError(f"A worker gave back a file named {name!r}, which is not inside its folder.")
-    path = folder / name
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        whole = path.with_name(f".{path.name}.{os.getpid()}.part")
-        with whole.open("wb") as stream:
-            for part in parts:
-                stream.write(part.data)
-        put_in_place(whole, path)
-    except OSError as error:
-        raise ResultError(f"Cannot write {path}: {error.strerror}.") from None
+    with replacing(folder / name, parents=True) as stream:
+        for part in parts:
+            stream.write(part.data)
 
 
 def packed(folder: Path) -> dict[str, Bytes]:

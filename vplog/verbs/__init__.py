@@ -1,1 +1,1 @@
-"""What each command line verb does, without its printing."""
+"""Verbs of the command line, without their printing."""

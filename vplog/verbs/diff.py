@@ -1,4 +1,4 @@
-"""What differs between two runs of one drive: settings, closures, trajectories, scores, stages; and limits of that."""
+"""Differences of two runs of one drive: settings, closures, trajectories, scores, stages; and limits of them."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ def explain(
     log: Path | None = None,
     words_only: bool = False,
 ) -> dict[str, Any]:
-    """What happened to one closure of the run in `folder`: its row, sentences, and what the picture shows.
+    """Explanation of one closure of the run in `folder`: its row, sentences, and the content of the picture.
 
     `closure` is its row of the ledger, or the rows or stamps in ns of its query and match; None is the one that the
     solved trajectory is furthest from, in sigma.
@@ -113,7 +113,7 @@ def _counts(view: View) -> dict[str, Any]:
 def _boxes(
     row: dict[str, Any], folder: Path, record: dict[str, Any], pipeline: Pipeline
 ) -> tuple[list[SharedBoxes], str]:
-    """What both views share on the library's references, or why that is not known."""
+    """Boxes that both views share on the library's references, or why they are not known."""
     if not row["shared_references"]:
         return [], f"{pipeline.places.kind} names no reference that both views share"
     try:

@@ -97,10 +97,12 @@ def _geometry(row: Row) -> str:
         turn = geometry.rotation(np.array([row["qx"], row["qy"], row["qz"], row["qw"]]))
         turned = f"is turned by {np.degrees(geometry.angle(turn)):.1f} degrees"
         if row["scale"] == "none":
-            sentences.append(f"By it keyframe {row['query']} {turned}; its direction is known, its distance is not.")
+            sentences.append(
+                f"By this pose keyframe {row['query']} {turned}; its direction is known, its distance is not."
+            )
         else:
             sentences.append(
-                f"By it keyframe {row['query']} lies {np.linalg.norm(moved):.2f} m from keyframe {row['match']} "
+                f"By this pose keyframe {row['query']} lies {np.linalg.norm(moved):.2f} m from keyframe {row['match']} "
                 f"(x {moved[0]:+.2f}, y {moved[1]:+.2f}, z {moved[2]:+.2f} in its body frame) and {turned}."
             )
             sentences += [_certainty(row["covariance"]), _SCALE[row["scale"]]]
@@ -109,7 +111,7 @@ def _geometry(row: Row) -> str:
 
 def _certainty(covariance: list[float] | None) -> str:
     if covariance is None:
-        return "In some direction nothing constrains it."
+        return "Some direction of it is unconstrained."
     matrix = np.reshape(covariance, (6, 6))
     turn, shift = (np.sqrt(max(np.linalg.eigvalsh(part)[-1], 0.0)) for part in (matrix[:3, :3], matrix[3:, 3:]))
     return f"Its standard deviation in the worst direction is {shift:.3f} m and {np.degrees(turn):.2f} degrees."
@@ -138,7 +140,7 @@ def _count(number: int, name: str, plural: str = "s") -> str:
 
 
 def _change(row: Row, pipeline: Pipeline) -> str:
-    """What would change the verdict."""
+    """The change that would lead to another verdict, in a sentence."""
     verdict, verify = Verdict(row["verdict"]), pipeline.verify
     metric = bool(row["landmarks"])
     needed = verify.epipolar.min_inliers
@@ -191,4 +193,4 @@ _CHANGES = {
     "direction_only": "Metres would need landmarks: keyframes around the match that moved further, a depth image or a "
     "stereo pair.",
 }
-"""What would change each verdict; `by_chance` where enough inliers for a pose may agree by chance."""
+"""The change that would lead to another, by verdict; `by_chance` where enough inliers for a pose may be chance."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from vplog.results.report.page import Tracks
 
 FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd")
-"""Those that are one file; two more are a folder."""
+"""Formats that are one file; two more are a folder."""
 
 
 def export(

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-import vplog
 from vplog import logs
 from vplog.data import Bytes, Features, Ints, Structure
 from vplog.features.extraction import describe
@@ -22,6 +21,7 @@ from vplog.results.staging import check_contents, staged
 from vplog.run.provenance import reopened
 from vplog.storage.folders import check_regular, is_below
 from vplog.storage.scratch import files_in, scratch
+from vplog.version import __version__
 
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution
@@ -32,9 +32,9 @@ _WRITERS = {"colmap": colmap.write_colmap, "nerfstudio": colmap.write_nerfstudio
 FOLDERS = tuple(_WRITERS)
 """Formats that are a folder."""
 _RECORD = "export.json"
-"""What an export wrote, beside it."""
+"""Record of the files of an export, beside them."""
 _QUALITY = 95
-"""Of the JPEGs: what they lose is below the camera's noise."""
+"""JPEG quality: its loss is below the camera's noise."""
 
 
 def export_images(
@@ -58,7 +58,7 @@ def export_images(
             )
         images = colmap.PosedImages(names, camera, world_from_camera, found, _colours(made / "images", names, found))
         written = [path.relative_to(made) for path in _WRITERS[kind](made, images)]
-        run_record.write_run_json(made / _RECORD, {"vplog": vplog.__version__, "format": 1, "files": files_in(made)})
+        run_record.write_run_json(made / _RECORD, {"vplog": __version__, "format": 1, "files": files_in(made)})
     return [str(out / path) for path in written]
 
 

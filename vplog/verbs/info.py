@@ -63,7 +63,7 @@ _PART_WORDS = {
 
 @dataclass(frozen=True, eq=False)
 class Preflight:
-    """What was found."""
+    """Findings of `vplog info`."""
 
     record: dict[str, Any]
     """Plain values, as `vplog info --json` prints them."""
@@ -98,7 +98,7 @@ def _working_command(path: Path, topics: TopicChoice, found: Preflight) -> str |
 
 
 def _inspect(path: Path, topics: TopicChoice) -> Preflight:
-    """What is there with these topics, whose `command` runs on it where nothing is in the way."""
+    """Findings with these topics; `command` runs on the log where there is no problem."""
     log = logs.open(path, topics)
     found = log.info()
     problems: list[str] = []
@@ -176,7 +176,7 @@ def _small(image: Bytes) -> Bytes:
 def _keyframes(
     log: Log, stamp_ns: Ints, odometry: Odometry | None, problems: list[str]
 ) -> tuple[int | None, list[str]]:
-    """How many keyframes a run would take with the default settings, and which frames it would leave out."""
+    """Number of keyframes of a run with the default settings, and warnings of the frames that it would leave out."""
     if not len(stamp_ns):
         return None, []
     if odometry is None or len(odometry.stamp_ns) < 2:
@@ -296,9 +296,12 @@ def _about_gps(gps: Gps | None, found: LogInfo) -> dict[str, Any] | None:
 def _scale(camera: Camera | None, found: LogInfo) -> dict[str, str]:
     """Where the metres of a closure come from."""
     if camera is None:
-        return {"source": "none", "why": "There are no images."}
+        return {"source": "none", "why": "The log has no camera images."}
     if camera.matrix is None:
-        return {"source": "none", "why": "No calibration, so no closure gets a metric pose; --calibration gives one."}
+        return {
+            "source": "none",
+            "why": "No calibration, so no closure gets a metric pose; give one with --calibration.",
+        }
     if camera.baseline_m is not None:
         return {"source": "stereo", "why": f"The pair has a baseline of {camera.baseline_m:.3f} m."}
     unused = any(line.startswith("Depth is not used") for line in found.warnings)
@@ -325,7 +328,7 @@ def _gaps(found: LogInfo, stamp_ns: Ints, odometry: Odometry | None, gps: Gps | 
 
 
 def preflight_lines(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """What of a record would be used, a name and a line each."""
+    """Name and text of each line: the parts of the log that a run would use."""
     camera, frames, odometry, gps = (found[name] for name in ("camera", "frames", "odometry", "gps"))
     if camera is not None:
         matrix = camera["matrix"]

@@ -27,7 +27,7 @@ class Optimised:
     file: GraphFile
     solution: Solution
     record: dict[str, Any]
-    """What `--json` prints."""
+    """Output of `--json`."""
 
 
 def optimize(path: Path, out: Path, method: str = "gnc", certify: bool = False) -> Optimised:

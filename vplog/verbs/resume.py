@@ -43,7 +43,7 @@ def resume_request(out: Path, given: Sequence[Path] = ()) -> ResumeRequest:
     recover(out)
     file = out / REQUEST if (out / REQUEST).is_file() else out / "run.json"  # there older versions had it
     if not file.is_file():
-        raise ResultError(f"Nothing to resume: {out} has no run.json. Begin a run: vplog run LOG -o {out}")
+        raise ResultError(f"Nothing to resume: {out} has no run.json. Start a run: vplog run LOG -o {out}")
     account = run_record.read_run_json(file)
     if account.get("finished") is not False:
         raise ResultError(f"Nothing to resume: the run in {out} is finished. Without --resume it is run again.")

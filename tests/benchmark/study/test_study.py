@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -18,7 +17,7 @@ from vplog.errors import TruthError
 from vplog.evaluate.place_truth import TruthChoice
 from vplog.pipeline import Pipeline
 from vplog.places.bobb import BobbSettings
-from vplog.results.run_record import read_run_json
+from vplog.results.run_record import read_run_json, write_run_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -154,11 +153,11 @@ def test_bytes_do_not_depend_on_threads_and_the_interrupted_goes_on(
     (outs[0] / "study.json").unlink()
     key = next(iter(trials))
     trials[key]["r_at_1"] = -1.0
-    (outs[0] / "trials.json").write_text(json.dumps(trials))
+    write_run_json(outs[0] / "trials.json", trials)
     again = verb(*arguments, "-o", outs[0], "--only", "pairs").json["experiments"]["pairs"]
     assert min(row["r_at_1"] for row in again["rows"]) == -1.0
     (outs[1] / "study.json").unlink()
-    (outs[1] / "trials.json").write_text('{"' + key + '": {"r_at_1": "many"}, "b": 3}')
+    write_run_json(outs[1] / "trials.json", {key: {"r_at_1": "many"}, "b": 3})
     anew = verb(*arguments, "-o", outs[1], "--only", "pairs").json["experiments"]["pairs"]
     assert anew["rows"] == records[1]["experiments"]["pairs"]["rows"]
     # other inputs: what was found by the earlier ones is gone, with its figures

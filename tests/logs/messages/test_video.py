@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import builtins
+import re
+from contextlib import suppress
 from fractions import Fraction
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -213,6 +215,48 @@ def test_a_missing_packet_gives_no_wrong_picture(codec: str, b_frames: int) -> N
         assert set(order[:missing]) <= set(right)
         later = missing // GROUP * GROUP + GROUP + b_frames  # where the next key frame is, and what refers back over it
         assert set(order[later:]) <= set(right)
+
+
+def signed(value: int) -> str:
+    """The bits of se(v), ITU-T H.264 9.1.1."""
+    code = f"{2 * value if value > 0 else 1 - 2 * value:b}"
+    return (len(code) - 1) * "0" + code
+
+
+DEFAULT_4X4 = (-2, 7, 0, 7, 0, 0, 8, 0, 0, 0, 4, 0, 0, 5, 0, 5)
+"""Differences between the scales of Default_4x4_Intra (ITU-T H.264, table 7-3), from 8 on."""
+SCALING_LISTS = f"11{''.join(map(signed, DEFAULT_4X4))}001{signed(-8)}001{signed(-8)}0"
+"""The flag of scaling lists in a parameter set (7.3.2.1.1), and eight lists with the defaults of the standard: one in
+full, two that end at once, which names the default, and five that fall back."""
+
+
+def with_scaling_lists(payload: bytes) -> bytes:
+    """The packet with lists in its sequence parameter set, where x264 writes them to that of its pictures alone, which
+    goes before."""
+    head, separator, rest = payload.partition(b"\x00\x00\x01\x67")
+    parameters, behind, rest = rest.partition(b"\x00\x00\x00\x01")
+    if not separator:
+        return payload
+    bits = "".join(f"{byte:08b}" for byte in parameters.replace(b"\x00\x00\x03", b"\x00\x00"))
+    at = 24 + len("1010110")  # set 0, 4:2:0, 8 bits, lossy
+    assert bits[24 : at + 1] == "10101100"
+    bits = (bits[:at] + SCALING_LISTS + bits[at + 1 :]).rstrip("0")
+    bits += -len(bits) % 8 * "0"
+    parameters = bytes(int(bits[i : i + 8], 2) for i in range(0, len(bits), 8))
+    escaped = re.sub(rb"\x00\x00(?=[\x00-\x03])", b"\x00\x00\x03", parameters)
+    return head + separator + escaped + behind + rest
+
+
+@pytest.mark.parametrize("missing", [GROUP + 3, 2 * GROUP + 7])
+def test_a_missing_packet_of_a_stream_with_scaling_lists_gives_no_wrong_picture(missing: int) -> None:
+    payloads = [with_scaling_lists(payload) for payload in packets("h264", 0, "cqm=jvt")]
+    assert payloads != [*packets("h264", 0, "cqm=jvt")]
+    video, shown = stream("h264", payloads[:missing] + payloads[missing + 1 :]), []
+    for row, number in enumerate([*range(missing), *range(missing + 1, COUNT)]):
+        with suppress(BadMessageError):
+            assert close(video.frame(row), number), number
+            shown.append(number)
+    assert shown == [*range(missing), *range(missing // GROUP * GROUP + GROUP, COUNT)]
 
 
 @pytest.mark.parametrize("profile", ["baseline", "main", "high", "high10"])

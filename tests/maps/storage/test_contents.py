@@ -162,17 +162,20 @@ def test_every_flip_in_a_run_folder_is_found_by_the_check(root: Path, verb: Verb
     assert "Traceback" not in said.err
 
 
-@pytest.mark.parametrize("name", ["map.json", "drive.json", "run.json", "joint.json"])
+@pytest.mark.parametrize("name", ["map.json", "drive.json", "run.json", "joint.json", "failures.json"])
 def test_no_flip_in_a_record_is_silent(root: Path, tmp_path: Path, name: str) -> None:
-    """A drive whose record is damaged is left out; a damaged map.json or joint.json is one line."""
+    """A drive whose record is damaged is left out, what failed is not known; a damaged map.json or joint.json is one
+    line."""
     here = copied(root, tmp_path / "map")
+    Store(here).write_failures({"bad": {"log": "/logs/bad.mcap", "error": "It broke."}})
     write_joint(here, {"groups": [], "alone": sorted(DRIVES), "apart": {}, "keys": {}})
-    [path] = here.glob(name) if name in ("map.json", "joint.json") else here.glob(f"runs/drive=walk/{name}")
+    [path] = here.glob(f"runs/drive=walk/{name}") if name in ("drive.json", "run.json") else here.glob(name)
 
     def read() -> tuple[Any, ...]:
         with map_store.reading(here) as store:
             drives = {drive: store.read(drive, record_of) for drive in store.drives()}
-            return store.head(), read_joint(here).get("alone"), drives
+            failed = store.failures_damage.partition(",")[0] or store.failures()
+            return store.head(), read_joint(here).get("alone"), failed, drives
 
     def record_of(folder: Path) -> Any:
         record = drive_record(folder)
@@ -180,12 +183,13 @@ def test_no_flip_in_a_record_is_silent(root: Path, tmp_path: Path, name: str) ->
         return named, run_record.read_run_json(folder / "run.json")
 
     whole, wanted = path.read_bytes(), read()
-    without_walk = (*wanted[:2], {drive: about for drive, about in wanted[2].items() if drive != "walk"})
+    without_walk = (*wanted[:3], {drive: about for drive, about in wanted[3].items() if drive != "walk"})
+    without_failures = (*wanted[:2], f"{here}/failures.json is damaged", wanted[3])
     for seed in range(200):
         flip(path, seed)
         try:
             found = read()
-            assert found in (wanted, without_walk)
+            assert found in (wanted, without_walk, without_failures)
         except ResultError as error:
             assert str(path) in str(error)
             assert "\n" not in str(error)

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import vplog
 from vplog import logs
 from vplog.benchmark.compare import check_truth, every_image, protocol, same_drive
 from vplog.benchmark.feature_cache import FeatureFolder
@@ -32,11 +31,12 @@ from vplog.cache.input_hashes import hash_inputs
 from vplog.errors import ResultError, SettingsError, TruthError, nearest
 from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, open_truth
 from vplog.execution.execution import Execution, logged_warnings
-from vplog.results.run_record import read_run_json, write_run_json
+from vplog.results.run_record import is_ours, read_run_json, write_run_json
 from vplog.results.staging import check_contents, staged
 from vplog.storage.folders import check_regular
 from vplog.storage.json_records import canonical_json, plain
 from vplog.storage.urls import shown
+from vplog.version import __version__
 
 if TYPE_CHECKING:
     from vplog.pipeline import Pipeline
@@ -99,7 +99,7 @@ def study(
             {**common, "code": code_of(*_SCORES)}, out / "trials.json", scratch, folders, execution,
         )  # fmt: skip
         account = {
-            "vplog": vplog.__version__,
+            "vplog": __version__,
             "drives": [
                 {"name": name, "log": str(path), "frames": len(log.stamps()), "hash": digest}
                 for name, path, log, digest in zip(names, drives, opened, hashes, strict=True)
@@ -175,7 +175,7 @@ def _finished(folder: Path, inputs: str) -> dict[str, Any]:
 def _figures_in(out: Path) -> list[str]:
     """Results of an earlier study in `out`, which a new one replaces. Raises SettingsError where it holds other
     things."""
-    check_contents(out, "a study", any((out / name).exists() for name in ("study.json", "trials.json")))
+    check_contents(out, "a study", any(is_ours(out / name) for name in ("study.json", "trials.json")))
     check_regular(out)
     return [escape(file) for _, one in _experiments(_read(out)) for file in one["figures"]]
 

@@ -92,7 +92,7 @@ def _panel(front: Floats, begun: int, end: int, scale: Floats, low: int, high: i
 
 @numba.njit(cache=True, nogil=True)
 def _take_panel_away(front: Floats, begun: int, end: int, low: int, high: int) -> None:
-    """What rows begun:end of R, complete, say about rows low:high below them."""
+    """Subtract the outer products of the complete rows begun:end of R from rows low:high."""
     length = len(front)
     share = np.empty(AT_ONCE)
     for left in range(low, length, STRIP):

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from vplog.data import Floats, Int32s, Ints
 
     Listed = tuple[Ints, Ints, Ints]
-    """What `by_supernode` returns."""
+    """Result of `by_supernode`."""
 
 
 class Blocks(NamedTuple):

@@ -70,7 +70,7 @@ class Elimination:
 
     @cached_property
     def subtrees(self) -> Subtrees:
-        """What of it can be worked on side by side."""
+        """Subtrees that can be eliminated in parallel."""
         return Subtrees.of(self.form)
 
 

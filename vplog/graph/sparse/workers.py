@@ -27,7 +27,7 @@ class Workers:
             self._pool.shutdown()
 
     def each(self, work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """What `work` returns for each of these arguments, in their order; begun in that order, too."""
+        """Results of `work` for each tuple of arguments, begun and returned in their order."""
         if self._pool is None or len(tasks) < 2:
             return [work(*task) for task in tasks]
         return [future.result() for future in [self._pool.submit(work, *task) for task in tasks]]

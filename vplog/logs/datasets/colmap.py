@@ -116,7 +116,7 @@ def _text(path: Path) -> list[_Image]:
         try:
             found.append(_Image(_inside(fields[9], path), fields[8], tuple(map(float, fields[1:8]))))
         except ValueError:
-            raise LogError(f"{path}:{number} is no image of a COLMAP model. Copy it again.") from None
+            raise LogError(f"{path}:{number} is not an image of a COLMAP model. Copy it again.") from None
     return _checked(found, path)
 
 
@@ -138,7 +138,7 @@ def _binary(path: Path) -> list[_Image]:
             found.append(_Image(_inside(data[at + 64 : end].decode(), path), str(camera), tuple(pose)))
             at = min(end + 9 + 24 * points, len(data))
     except (struct.error, ValueError):
-        raise LogError(f"{path} ends within an image, or is no COLMAP model. Copy it again.") from None
+        raise LogError(f"{path} ends within an image, or is not a COLMAP model. Copy it again.") from None
     return _checked(found, path)
 
 

@@ -21,7 +21,7 @@ def roots_of(path: Path) -> list[Path]:
 
 
 def find_roots(path: Path) -> list[Path]:
-    """Those of a folder, or else of the folders right below it. Raises OSError."""
+    """Roots of data sets in a folder, or else in the folders right below it. Raises OSError."""
     return roots_of(path) or [root for folder in below(path) for root in roots_of(folder)]
 
 

@@ -55,7 +55,7 @@ class DataSet:
     """`kitti`, `euroc`, `tum-rgbd`, `vslam-lab`, `colmap`, `utm-images` or `video`."""
     streams: list[Stream]
     truth: Trajectory | Gps | None = None
-    """Of the body where it has poses."""
+    """Poses of the body, or fixes."""
     remarks: list[str] = field(default_factory=list)
     names: dict[int, str] = field(default_factory=dict)
     """File of each image by its stamp, of pictures that are known by name."""

@@ -69,7 +69,7 @@ def _stamp_ns(path: Path, text: str, unit_ns: int) -> int:
             return stamp_ns
     except InvalidOperation:
         pass
-    raise LogError(f"{path}: {text[:40]!r} is no stamp. Copy the data set again.")
+    raise LogError(f"{path}: {text[:40]!r} is not a stamp. Copy the data set again.")
 
 
 def numbers_of(path: Path, rows: list[list[str]], first: int, count: int) -> Floats:

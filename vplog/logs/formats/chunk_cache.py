@@ -148,7 +148,7 @@ class Chunks:
 
 
 def reader_at(file: BinaryIO, local: bool) -> Callable[[int, int], bytes]:
-    """What reads `length` bytes from `start` on of a file: of a local one in several threads at once."""
+    """A function (start, length) that reads bytes of a file; of a local one, from several threads at once."""
     if local and hasattr(os, "pread"):
         number = file.fileno()
 

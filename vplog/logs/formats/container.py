@@ -1,4 +1,4 @@
-"""What every kind of file offers: raw messages by topic in file order, and any one of them again by its place."""
+"""Interface of every kind of file: raw messages by topic in file order, and any one of them again by its place."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def _joined(messages: list[Message]) -> Block:
 
 @dataclass(frozen=True)
 class Contents:
-    """What is in a container: its channels with their counts, in order of their names."""
+    """Channels of a container with their message counts, in order of names, and its log times."""
 
     counts: dict[Channel, int]
     start_ns: int

@@ -180,7 +180,7 @@ class ChunkLosses:
         return Contents(dict(sorted(counts.items())), *confirmed_span(times))
 
     def _account_for(self, found: Mapping[str, int], span: Span, what: str) -> None:
-        """What was not found, of a file whose messages cover `span`, and how much of what was recorded that is."""
+        """Account for messages that a file recorded and that were not found; those that were found cover `span`."""
         layout, account, name = self.layout, self.notes.account, self.name
         recorded = topics_of(layout.recorded, self.channels)
         total = Counter(found)

@@ -1,4 +1,4 @@
-"""What of a log could not be used: counted by topic, placed in time by log times, in one sentence for each reason."""
+"""Messages of a log that could not be used: counted by topic, with log times, in one sentence for each reason."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Loss:
     spans_ns: tuple[Span, ...]
     """Log times of the first and last message of each run of lost ones, in order; empty where not known."""
     detail: str = ""
-    """What was found, in a sentence, the first time."""
+    """The first such loss in a sentence."""
 
 
 @dataclass
@@ -124,7 +124,7 @@ class LossAccount:
         return sorted(key for key in places if key[1] in wanted)
 
     def _copy(self) -> dict[tuple[str, str], dict[tuple[str, int], _Lost]]:
-        """What was found so far; workers that decode images may add to it meanwhile."""
+        """A copy of the losses so far; workers that decode images may add to it meanwhile."""
         return {key: places.copy() for key, places in self._found.copy().items()}
 
     def set_recorded(self, file: str, recorded: Mapping[str, int], start_ns: int, end_ns: int = 0) -> None:

@@ -83,7 +83,7 @@ class ChunkReader:
         return self._block(b"".join(parts))
 
     def _block(self, data: bytes) -> Block:
-        """What was found, without the message before damage: its length may be what is damaged."""
+        """The messages found, without the one before damage: its length may be what is damaged."""
         if self.position < self.end and not self._cut and self._ids and self._ids.pop() in self._used:
             self._rows.pop()
         return block_of(data, self._rows)

@@ -47,7 +47,7 @@ class McapFile:
         self._doubtful: set[tuple[int, int]] = set()
         """Opcodes and ids of schemas and channels from damaged chunks, until a sound one repeats it."""
         self._unread: dict[int, str] = {}
-        """What is said of each chunk that was found damaged."""
+        """End of the sentence about each chunk that could not be unpacked, by its number."""
         self._layout = read_layout(self._file, length, self._define, self._name)
         self._losses = ChunkLosses(self._name, length, self._layout, self._channels, notes)
         self._local = not isinstance(path, RemotePath)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from vplog.logs.formats.container import Block, Octets, Place
 
 _FIELDS = {MESSAGE: {b"conn", b"time"}, CONNECTION: {b"conn", b"topic"}}
-"""What the header of each kind of record in the chunks has."""
+"""Header fields of each kind of record in the chunks."""
 __all__ = ["MAGIC", "Ros1Bag"]
 
 

@@ -33,7 +33,7 @@ _FIELDS = {
     _CHUNK_INFO: {b"ver", b"chunk_pos", b"start_time", b"end_time", b"count"},
     CONNECTION: {b"conn", b"topic"},
 }
-"""What the header of each kind of record outside the chunks has."""
+"""Header fields of each kind of record outside the chunks."""
 _ENTRY = {_INDEX: 12, _CHUNK_INFO: 8}
 """Bytes of each of the `count` entries of a record: time and offset of a message; a connection and its count."""
 _RECORD_START = re.compile(

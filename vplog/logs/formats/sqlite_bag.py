@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 MAGIC = b"SQLite format 3\x00"
 _DAMAGE = (sqlite3.Error, OverflowError, UnicodeDecodeError)
-"""What reading a damaged file raises."""
+"""Exceptions that reading a damaged file raises."""
 _MOST_TRIED = 20_000
 """Rows that are looked for one by one behind damage: a second's work."""
 _MOST_MISSED = 2_000

@@ -13,7 +13,7 @@ _HIGH_PROFILES = (100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135)
 _HEAD = 64
 """Bytes of a slice that are looked at; its frame_num lies within the first ten."""
 _PARAMETERS = 4096
-"""Bytes of a parameter set that are looked at; usual ones have some tens."""
+"""Bytes of a parameter set that are looked at; with all scaling lists it has a few hundred."""
 _SLICE, _IDR, _SPS = 1, 5, 7
 """nal_unit_type, table 7-1."""
 
@@ -23,8 +23,9 @@ class FrameNumbers:
 
     def __init__(self) -> None:
         self._bits = 0
-        """Bits of frame_num; 0 where they are of no use: no parameter set was read, it allows gaps, or has what is not
-        read."""
+        """Bits of frame_num; 0 where they are of no use: no parameter set was read, or it allows gaps."""
+        self._colour_planes = False
+        """Each slice is of one colour plane, which it names before frame_num."""
         self._last = -1
         """frame_num of the last reference frame, -1 before the first."""
 
@@ -48,6 +49,7 @@ class FrameNumbers:
         if not self._bits:
             return True
         bits.exp_golomb(3)  # first_mb_in_slice, slice_type, pic_parameter_set_id
+        bits.read(2 if self._colour_planes else 0)
         number = bits.read(self._bits)
         known, expected = self._last >= 0 and not idr, (self._last + 1) % (1 << self._bits)
         sound = not known or number in (self._last, expected)
@@ -60,14 +62,15 @@ class FrameNumbers:
         profile = bits.read(8)
         bits.read(16)  # constraints, level
         bits.exp_golomb()  # seq_parameter_set_id
+        self._colour_planes = False
         if profile in _HIGH_PROFILES:
             chroma = bits.exp_golomb()
-            separate = chroma == 3 and bits.read(1)
+            self._colour_planes = chroma == 3 and bits.read(1) == 1
             bits.exp_golomb(2)  # bit depths of luma and chroma
             bits.read(1)  # lossless transform
-            if bits.read(1) or separate:  # scaling lists and colour planes of their own, which cameras do not send
-                self._bits = 0
-                return
+            if bits.read(1):
+                for size in [16] * 6 + [64] * (6 if chroma == 3 else 2):
+                    bits.skip_scaling_list(size)
         size = bits.exp_golomb() + 4
         order = bits.exp_golomb()  # pic_order_cnt_type
         if order == 0:
@@ -103,3 +106,11 @@ class _Bits:
                 zeros += 1
             value = (1 << zeros) - 1 + self.read(zeros)
         return value
+
+    def skip_scaling_list(self, size: int) -> None:
+        """Behind the flag that it is there, 7.3.2.1.1.1: differences of se(v) until the next scale is 0."""
+        scale = 8 * self.read(1)
+        while scale and size:
+            code = self.exp_golomb()
+            scale = (scale + (code + 1 >> 1 if code & 1 else -(code >> 1))) % 256
+            size -= 1

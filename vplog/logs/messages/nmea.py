@@ -11,7 +11,7 @@ import numpy as np
 from vplog.logs.messages.records import BadMessageError, FixMessage
 
 SENTENCES = ("GGA", "GNS", "RMC", "GLL")
-"""Those with a position, the one with most of altitude, quality and dilution first; a receiver sends several of them
+"""Sentences with a position, the one with most of altitude, quality and dilution first; a receiver sends several
 for each fix."""
 _FIELDS = {"GGA": (2, 15), "GNS": (2, 13), "RMC": (3, 10), "GLL": (1, 7)}
 """Where the latitude stands, and how many fields there are at least."""
@@ -29,7 +29,7 @@ def fix_of(stamp_ns: int, frame: str, sentence: str) -> FixMessage | None:
     """
     text, star, checksum = sentence.strip().partition("*")
     if not text.startswith("$"):
-        raise BadMessageError("it is no NMEA sentence")
+        raise BadMessageError("it is not an NMEA sentence")
     if star and int(checksum, 16) != reduce(xor, text[1:].encode(), 0):
         raise BadMessageError("its NMEA checksum does not match")
     fields = text.split(",")
@@ -62,7 +62,7 @@ def _number(text: str) -> float:
 
 
 def _degrees(text: str, side: str) -> float:
-    """Of `4807.038`, degrees and minutes, and N, S, E or W; NaN where it is empty."""
+    """Degrees of `4807.038`, degrees and minutes, and N, S, E or W; NaN where it is empty."""
     if not text:
         return math.nan
     point = text.index(".") if "." in text else len(text)

@@ -33,7 +33,7 @@ _CODECS = {
     "vp9": ("vp9", "VP9"),
     "av1": ("av1", "AV1"),
 }
-"""What a format's first word holds (`h264`, `libx264`, `hevc_nvenc`): FFmpeg's codec, and the name people know."""
+"""By a part of a format's first word (`h264`, `libx264`, `hevc_nvenc`): FFmpeg's codec, and its usual name."""
 _NAMES = dict(_CODECS.values())
 _DECODERS = {"av1": "libdav1d", "vp9": "libvpx-vp9"}
 """FFmpeg's decoder where that of the codec's own name does not do: its `av1` is for graphics cards alone, and its `vp9`
@@ -57,7 +57,7 @@ _DELIMITER, _SEQUENCE_HEADER = b"\x12\x00", 1
 """The unit (OBU) that an AV1 packet may begin with, and the type of the one behind it at a key frame: AV1 bitstream
 5.3."""
 _UNREAD, _PLAIN, _PARAMETERS, _KEY, _WHOLE_KEY = range(5)
-"""What a packet is: not read; needs those before it; parameter sets alone; a key frame without, or with them."""
+"""Kinds of packets: not read; needs those before it; parameter sets alone; a key frame without, or with them."""
 
 
 def codec_of(encoding: str) -> str:

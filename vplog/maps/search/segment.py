@@ -191,7 +191,7 @@ def _header(text: bytes) -> _Header:
     try:
         return _Header.model_validate(header)
     except ValidationError:
-        raise ResultError("Its header lacks a value, or has one that cannot be.") from None
+        raise ResultError("Its header lacks a value, or has an impossible one.") from None
 
 
 def _shapes(header: _Header, places: int) -> Sequence[tuple[str, tuple[int, ...]]]:

@@ -12,7 +12,6 @@ from urllib.parse import unquote
 
 import pyarrow as pa
 
-import vplog
 from vplog.errors import LibraryError, NewerError, ResultError, nearest_path
 from vplog.maps.geo_bounds import earth_from_record, earth_of_run
 from vplog.maps.storage.damage import DamagedDriveError, check_run_tables, damaged_files, reading_drive
@@ -21,6 +20,7 @@ from vplog.maps.storage.upload import send_rest, write_json
 from vplog.results import run_record
 from vplog.storage.folders import regular_files
 from vplog.storage.parquet_limits import check_version, read_footer
+from vplog.version import __version__
 
 if TYPE_CHECKING:
     from vplog.maps.storage.remote_map import Mirror
@@ -273,7 +273,7 @@ class Store:
 
     def write_head(self, head: Head) -> None:
         """Write map.json, unless it holds that already."""
-        record = {"format": FORMAT, "vplog": vplog.__version__, "library": head.library, "settings": head.settings}
+        record = {"format": FORMAT, "vplog": __version__, "library": head.library, "settings": head.settings}
         self._write("map.json", record)
 
     def write_failures(self, failures: dict[str, dict[str, Any]]) -> None:
@@ -281,8 +281,7 @@ class Store:
 
     def _write(self, name: str, record: dict[str, Any]) -> None:
         """Write JSON, or leave the file as it is where it holds the same: a finished map is not touched."""
-        # the keys of failures.json are drives, so it has no field for a checksum
-        if write_changed(self.root / name, record, checksum=name != "failures.json") and self.mirror is not None:
+        if write_changed(self.root / name, record) and self.mirror is not None:
             write_json(self.mirror, name)
 
 

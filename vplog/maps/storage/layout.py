@@ -16,7 +16,7 @@ from urllib.parse import quote
 from vplog.cache.code_hash import code_of
 from vplog.errors import NewerError, ResultError
 from vplog.results import run_record, tables
-from vplog.storage.json_records import canonical_json, plain
+from vplog.storage.json_records import CHECKSUM, canonical_json, plain
 
 FORMAT = run_record.FORMAT
 """Version of this layout. A reader refuses a newer one."""
@@ -70,7 +70,7 @@ def checked_record(record: dict[str, Any], folder: Path) -> dict[str, Any]:
     return record
 
 
-def write_changed(path: Path, record: dict[str, Any], checksum: bool = True) -> bool:
+def write_changed(path: Path, record: dict[str, Any]) -> bool:
     """Write a record; False where the file holds it already, which is left as it is. Raises ResultError."""
     try:
         if path.is_file() and run_record.read_run_json(path) == plain(record):
@@ -79,7 +79,7 @@ def write_changed(path: Path, record: dict[str, Any], checksum: bool = True) -> 
         raise
     except ResultError:  # damaged
         pass
-    run_record.write_run_json(path, record, checksum=checksum)
+    run_record.write_run_json(path, record)
     return True
 
 
@@ -118,7 +118,7 @@ def drive_names(names: list[str], logs: list[str], known: dict[str, dict[str, An
                     taken.add(drive)
     for at, name in enumerate(names):
         if at not in result:
-            result[at] = numbered(name, name, taken | known.keys())
+            result[at] = numbered(name, name, taken | known.keys() | {CHECKSUM})  # failures.json has drives for fields
             taken.add(result[at])
     return [result[at] for at in range(len(names))]
 

@@ -10,7 +10,7 @@ import pytest
 from vplog.data import Camera, Frame
 from vplog.features.extraction import describe
 from vplog.features.sift import SiftSettings, thumbnail_of_image
-from vplog.masking import filled, masked
+from vplog.geometry.masking import filled, masked
 from vplog.places.patches import describe_patches
 
 if TYPE_CHECKING:
