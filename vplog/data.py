@@ -155,7 +155,7 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """Where the windows of an image are found on the references that explain it."""
+    """Boxes of an image's windows on the references that explain it."""
 
     references: Ints
     """(J,) best first; fewer where fewer references share anything."""
@@ -394,7 +394,7 @@ class OdometrySource:
     topic: str
     type: str
     frames: list[str]
-    """From the one that stands still to the body; empty names where it names none."""
+    """Frames of the chain, from the fixed one to the body; empty names where it names none."""
     count: int
     rate_hz: float | None
     """Poses a second that differ from the one before; None of a single pose."""

@@ -51,7 +51,7 @@ class Pipeline(Settings):
     """Every setting of a run. A pipeline file holds only what differs."""
 
     keyframes: KeyframeSettings = KeyframeSettings()
-    """Which frames become nodes."""
+    """Selection of keyframes."""
     features: FeatureSettings = SiftSettings()
     """Local features of a frame."""
     stereo: StereoSettings = StereoSettings()
@@ -139,7 +139,7 @@ def pipeline_schema() -> dict[str, Any]:
 
 
 def pipeline_folder() -> Path:
-    """Where the named pipelines are: inside the installed package, or beside it in a checkout."""
+    """Folder of the named pipelines: inside the installed package, or beside it in a checkout."""
     package = Path(__file__).parent
     inside = package / "pipelines"
     return inside if inside.is_dir() else package.parent / "pipelines"

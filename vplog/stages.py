@@ -101,7 +101,7 @@ class PlaceState(Protocol):
 
     @property
     def arrow_type(self) -> pa.DataType:
-        """How one place is stored in a table."""
+        """Arrow type of one place in a table."""
         ...
 
     @property
@@ -185,7 +185,7 @@ class CodedState(PlaceState, Protocol):
 
     @property
     def pairing(self) -> Any:
-        """Which codes of two places are compared."""
+        """Codes of two places that are compared."""
         ...
 
     def overlaps(self) -> data.Bytes:

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
+import signal
 from typing import TYPE_CHECKING, Any
 
 import pyarrow.parquet as pq
 import pytest
 
 from tests.maps.runs import LIBRARY, OTHER_LIBRARY, make_map, put, seeds
+from tests.maps.storage.test_map_store import forked
+from tests.maps.test_remove import steps
 from vplog.errors import ResultError
 from vplog.maps.merge import merge_maps
 from vplog.maps.storage import layout, map_store
@@ -86,6 +90,41 @@ def test_a_merge_that_was_stopped_goes_on_to_the_same_end(tmp_path: Path, monkey
     drives = list(map_store.Store(whole).drives())
     assert drives == list(map_store.Store(part).drives()) == ["walk", "walk-2", "walk-3", "walk-4"]
     assert [digests(part, drive) for drive in drives] == [digests(whole, drive) for drive in drives]
+
+
+def test_a_merge_killed_anywhere_has_each_drive_whole_or_not_at_all(tmp_path: Path) -> None:
+    """And goes on to the same end; the drives of the target stay as they were."""
+    source, whole, step = make_map(tmp_path / "source", {"walk": 1, "ride": 2}), tmp_path / "whole", 0
+    for drive in ("walk", "ride"):
+        (source / "joins" / f"drive={drive}").mkdir(parents=True)
+        (source / "joins" / f"drive={drive}" / "features.parquet").write_text(drive)
+    make_map(whole, {"walk": 3})
+    merge_maps([source], whole)
+    wanted = {drive: digests(whole, drive) for drive in map_store.Store(whole).drives()}
+    outcomes = set[int]()
+    for step in (*range(1, 40), *range(40, 1000, 7)):
+        target = make_map(tmp_path / f"{step}", {"walk": 3})
+
+        def work(target: Path = target, step: int = step) -> None:
+            with pytest.MonkeyPatch.context() as patch:
+                steps(patch, [step], lambda: os.kill(os.getpid(), signal.SIGKILL))
+                merge_maps([source], target)
+
+        ended = forked(work)
+        with map_store.reading(target) as store:
+            found = {drive: digests(target, drive) for drive in store.drives()}
+            assert not store.damaged
+        assert found.items() <= wanted.items()
+        assert "walk" in found
+        outcomes.add(len(found))
+        merge_maps([source], target)
+        assert {drive: digests(target, drive) for drive in map_store.Store(target).drives()} == wanted
+        assert not list(target.rglob("*.part"))
+        assert {path.read_text() for path in (target / "joins").rglob("*.parquet")} == {"walk", "ride"}
+        if ended == 0:
+            break
+    assert outcomes == {1, 2, 3}
+    assert step > 30
 
 
 def test_a_merge_that_was_stopped_while_it_copied_leaves_no_half_drive(

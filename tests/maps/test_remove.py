@@ -51,7 +51,7 @@ def files(root: Path) -> dict[str, bytes]:
 
 
 def steps(patch: pytest.MonkeyPatch, left: list[int], end: Callable[[], None]) -> None:
-    """End at the n-th change of the disk that a removal makes."""
+    """End at the n-th change of the disk that a removal or a merge makes."""
 
     def stepping(function: Any) -> Any:
         def step(*arguments: Any, **named: Any) -> Any:
@@ -63,7 +63,7 @@ def steps(patch: pytest.MonkeyPatch, left: list[int], end: Callable[[], None]) -
         return step
 
     for owner, name in ((Path, "rename"), (Path, "replace"), (Path, "unlink"), (Path, "mkdir"), (os, "fsync"),
-                        (os, "unlink"), (os, "rmdir"), (shutil, "rmtree")):  # fmt: skip
+                        (os, "link"), (os, "unlink"), (os, "rmdir"), (shutil, "rmtree")):  # fmt: skip
         patch.setattr(owner, name, stepping(getattr(owner, name)))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -19,15 +20,17 @@ from tests.results.example import COUNT, METADATA, make_run
 from tests.results.test_tables import write_all
 from vplog.cache.codecs import closures_codec
 from vplog.cache.stage_cache import DamagedError, content_of, digest_of, sealed
-from vplog.data import Features, Reference
+from vplog.data import Features, Gps, Reference
 from vplog.errors import ResultError, VplogError
 from vplog.maps.search.index import update_index
 from vplog.maps.search.segment import open_segment
 from vplog.maps.storage.map_store import Store
 from vplog.places.bobb import BobbSettings
 from vplog.places.library_files import load_references, save_references
-from vplog.results import feature_table, geo, places_map, tables
+from vplog.results import feature_table, geo, mcap_read, places_map, tables
 from vplog.results.geo import Earth
+from vplog.results.landmark_table import LandmarkTable, write_landmarks
+from vplog.results.mcap import McapExtras, write_mcap
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -55,6 +58,14 @@ def read_kept(path: Path) -> Any:
         kept.close()
 
 
+def read_landmarks(path: Path) -> Any:
+    table = LandmarkTable(path, "state")
+    try:
+        return table.scale, plain(table.camera), [plain(table[row]) for row in range(len(table))]
+    finally:
+        table.close()
+
+
 def write_tables(folder: Path) -> dict[Path, list[Read]]:
     """Every table that vplog writes, with all that reads it."""
     keyframes, closures, edges, trajectory, descriptors = write_all(folder)
@@ -69,6 +80,8 @@ def write_tables(folder: Path) -> dict[Path, list[Read]]:
     places_map.write_map(exported, [folder / "run"])
     kept, joins, answers = folder / "features.parquet", folder / "joins.parquet", folder / "placed.parquet"
     feature_table.write_features(kept, 5, features, 20, "state")
+    landmarks, own = folder / "landmarks.parquet", replace(features(0), depth_m=np.linspace(1, 9, 20, dtype=np.float32))
+    write_landmarks(landmarks, [(own, np.full(20, 0.1))], RUN.camera, "depth", "state")
     tables.write_joins(joins, [(RUN.keyframes, RUN.keyframes, RUN.closures)], METADATA)
     rows = np.arange(9, dtype=np.int32)
     values = [rows, rows.astype(np.int64), rows, ["a"] * 9, rows, rows.astype(np.int64), rows.astype(np.float32), rows]
@@ -83,6 +96,7 @@ def write_tables(folder: Path) -> dict[Path, list[Read]]:
         descriptors: [tables.read_descriptors, tables.read_stamps, tables.descriptors_type],
         joins: [tables.read_joins, tables.read_metadata],
         kept: [read_kept],
+        landmarks: [read_landmarks],
         exported: [
             lambda path: list(places_map.read_drives(path, KIND)),
             places_map.read_places_header,
@@ -182,6 +196,21 @@ def test_the_checksums_take_little(tmp_path: Path, name: str) -> None:
     pq.write_table(pq.read_table(path), tmp_path / "bare", compression="zstd", row_group_size=tables.ROWS_PER_GROUP)
     pages = 2 * pq.ParquetFile(path).metadata.num_columns
     assert size - (tmp_path / "bare").stat().st_size <= 6 * pages + 16
+
+
+def test_no_flip_in_what_is_read_of_an_mcap_is_silent(tmp_path: Path) -> None:
+    """In names of topics and in indexes too, which no checksum of a chunk covers."""
+    path, stamp_ns = tmp_path / "result.mcap", RUN.keyframes.stamp_ns
+    degrees = np.full(len(stamp_ns), 48.0)
+    gps = Gps(stamp_ns, degrees, degrees, degrees, np.full((len(stamp_ns), 3, 3), np.nan))
+    extras = McapExtras(
+        RUN.camera, image=lambda row: bytes([row]) * 50, image_size=(64, 48), references={3: b"reference" * 9},
+        pictures={0: b"closure" * 20}, gps=gps,
+    )  # fmt: skip
+    write_mcap(path, RUN.keyframes, RUN.solution.world_from_body, RUN.graph, RUN.closures, METADATA, extras)
+    readers = (mcap_read.read_pictures, mcap_read.read_fixes, mcap_read.read_camera_pose)
+    for number, read in enumerate((*readers, lambda path: list(mcap_read.read_images(path)))):
+        assert silent(path, read, number) == []
 
 
 def test_no_flip_in_a_part_of_an_index_is_silent(tmp_path: Path) -> None:

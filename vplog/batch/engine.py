@@ -27,7 +27,7 @@ _KILLED = "Its process was killed, perhaps because memory ran out. Free memory o
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """How the drives of a batch are computed. The content of the map depends on `join` alone."""
+    """Execution of the drives of a batch. The content of the map depends on `join` alone."""
 
     jobs: int | None = None
     """Drives at once: one on this machine where not given, over Ray as many as it has cores for."""

@@ -219,7 +219,7 @@ def translated(error: BaseException) -> BaseException:
 
 @dataclass(frozen=True)
 class RemoteOutcome(Outcome):
-    """How an attempt ended on another machine."""
+    """Outcome of an attempt on another machine."""
 
     files: Files = ()
     """Name of every file of the run folder, drive.json last, and its pieces in the object store."""

@@ -53,7 +53,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How an attempt at a drive ended."""
+    """Outcome of an attempt at a drive."""
 
     error: str = ""
     """One line; none where all went well."""

@@ -59,7 +59,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class CompareOptions:
-    """How recognisers are compared."""
+    """Options of a comparison of recognisers."""
 
     library: Path | None = None
     """A drive, or a saved library; None for the map."""
@@ -73,7 +73,7 @@ class CompareOptions:
     """Folder of compare.json, answers, scores and figures; None writes nothing."""
     topics: logs.TopicChoice | None = None
     cache: CacheChoice = CacheChoice()
-    """Where features are kept for further calls."""
+    """Cache of features for further calls."""
 
 
 def compare(

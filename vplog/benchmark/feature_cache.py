@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CacheChoice:
-    """Where features are kept between calls."""
+    """Options of the cache of features between calls."""
 
     folder: Path | None = None
     """None for the user's cache."""

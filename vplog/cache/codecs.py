@@ -1,4 +1,4 @@
-"""How the results of stages become bytes for the stage cache, and back: Arrow tables, and JSON for plain values.
+"""Serialisation of the results of stages for the stage cache: Arrow tables, and JSON for plain values.
 
 Reading checks what it reads, as of any file: what does not fit raises ValueError, and nothing larger than the bytes
 given is made.
@@ -30,7 +30,7 @@ _NUMBERS = "iuf"
 
 @dataclass(frozen=True)
 class Codec(Generic[T]):
-    """How a value becomes bytes, and back."""
+    """Serialisation of a value."""
 
     to_bytes: Callable[[T], bytes]
     from_bytes: Callable[[bytes], T]

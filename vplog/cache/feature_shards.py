@@ -22,7 +22,7 @@ class _Row(NamedTuple):
 
     stamp_ns: int
     offset: int
-    """From the end of the head."""
+    """Offset from the end of the head, in bytes."""
     features: int
     width: int
     height: int
@@ -50,7 +50,7 @@ class Extracted:
         self.stamp_ns: list[int] = []
         """Stamps of the keyframes that were decoded."""
         self.lost: list[str] = []
-        """Why each of the others was not."""
+        """Reasons of the frames that were not decoded."""
         self.undecodable: list[tuple[str, int]] = []
         """Topic and stamp of each message whose image does not decode, those beside a sound one among them."""
         self.cpu_ms: list[float] = []

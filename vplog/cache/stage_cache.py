@@ -105,7 +105,7 @@ def _check(stream: BinaryIO, length: int, key: str | None) -> None:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Which files a drive is."""
+    """Identity of the files of a drive."""
 
     signature: dict[str, str]
     """Lengths and times, by full path."""

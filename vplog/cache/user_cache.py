@@ -19,10 +19,8 @@ DEFAULT_GB = 20.0
 60,000 images, and little of today's disks."""
 _LEFT_OVER_S = 86_400.0
 """Age of a half-written file of a process that was killed: no download takes a day."""
-
-
 _OURS = re.compile(r"\.?([a-z]+-)?[0-9a-f]{32}([0-9a-f]{32})?(\..*)?")
-"""Names of what is kept: by a hash. All else in the folders of a cache that a user named is the user's."""
+"""Names of cache entries, which are hashes. All else in the folders of a cache that a user named is the user's."""
 
 
 def max_bytes(max_gb: float | None) -> int:

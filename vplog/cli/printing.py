@@ -1,4 +1,4 @@
-"""How results look on a terminal: text, tables, progress, and JSON for programs."""
+"""Results on a terminal: text, tables, progress, and JSON for programs."""
 
 from __future__ import annotations
 
@@ -173,9 +173,9 @@ def print_joint(out: Path, record: dict[str, Any]) -> None:
     for number, found in enumerate(record["maps"]):
         several = f" in one frame, map{number}.g2o" if len(found["drives"]) > 1 else " by itself"
         print_line(f"{out}:", f"{', '.join(found['drives'])}{several}")
-    for tie in record["joins"]:
-        text = f"{plural(tie['kept'], 'closure')} of {plural(tie['candidates'], 'candidate')}"
-        print_line("", f"{tie['query_drive']} to {tie['match_drive']}: {text}")
+    for pair in record["joins"]:
+        text = f"{plural(pair['kept'], 'closure')} of {plural(pair['candidates'], 'candidate')}"
+        print_line("", f"{pair['query_drive']} to {pair['match_drive']}: {text}")
     warn(record["warnings"])
     totals, named = record["totals"], shlex.quote(str(out))
     print_line("took", f"{totals['seconds']:.1f} s, {totals['peak_memory_mb']:.0f} MB")

@@ -31,6 +31,7 @@ from vplog.cli.printing import (
     print_optimised,
     print_result,
 )
+from vplog.errors import ResultError, SettingsError
 from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
@@ -89,7 +90,6 @@ def report(arguments: argparse.Namespace) -> None:
 
 def diff(arguments: argparse.Namespace) -> None:
     """Compare two runs of one drive: settings, closures, trajectories, scores and times."""
-    from vplog.errors import ResultError
     from vplog.verbs.diff import check_limits, exceeded
     from vplog.verbs.diff import diff as diff_runs
 
@@ -108,12 +108,8 @@ def export(arguments: argparse.Namespace) -> None:
     from vplog.verbs.export import export as export_run
 
     if arguments.output is STDOUT and arguments.format in _FOLDERS:
-        from vplog.errors import SettingsError
-
         raise SettingsError(f"{arguments.format} is a folder, which stdout does not take. Name one with -o.")
     if arguments.output.is_dir() and arguments.format not in _FOLDERS:
-        from vplog.errors import SettingsError
-
         raise SettingsError(f"{arguments.output} is a folder, and {arguments.format} a file. Name one with -o.")
     with _file_or_stdout(arguments, arguments.format in _BINARY) as path, Progress(arguments) as progress:
         execution = Execution(arguments.threads, progress)

@@ -19,7 +19,7 @@ _BETTER = 0.5
 _MOTIONS = 400
 """Motions that truth and odometry are compared on; six unknowns are well determined by a tenth of them."""
 _MOTION_SHARE = 20
-"""Each takes one part in 20 of the drive: the drift of the odometry over it is a twentieth of the drive's."""
+"""Motions take one part in 20 of the drive: the drift of the odometry over it is a twentieth of the drive's."""
 _PRIOR = 1e-3
 """Weight of no turn at all against the motions: it settles what they leave open, and nothing else."""
 _ROUNDS = 10
@@ -169,14 +169,12 @@ def _frame(true: Floats, moved: Floats, body_from_camera: Floats | None) -> tupl
     step = max(1, len(true) // _MOTION_SHARE)
     first = np.unique(np.linspace(0, len(true) - 1 - step, _MOTIONS).astype(np.int64))
     a, b = (se3.between(poses[first], poses[first + step]) for poses in (true, moved))
-    weight = _weights(b)
-    apart, scale = _disagreement(a, b, np.eye(4), _weights(a))
-    best, least = ("body", np.eye(4), scale), _BETTER * apart
-    others = [("estimated", _hand_eye(a, b, weight))]
+    weight, frames = _weights(a), [("body", np.eye(4)), ("estimated", _hand_eye(a, b, _weights(b)))]
     if body_from_camera is not None:
-        others.insert(0, ("camera", se3.inverse(body_from_camera)))
-    for name, truth_from_body in others:
-        apart, scale = _disagreement(a, b, truth_from_body, _weights(a))
+        frames.insert(1, ("camera", se3.inverse(body_from_camera)))
+    best, least = ("body", np.eye(4), 1.0), np.inf
+    for name, truth_from_body in frames:
+        apart, scale = _disagreement(a, b, truth_from_body, weight)
         if apart < least:
             best, least = (name, truth_from_body, scale), _BETTER * apart
     return best

@@ -45,7 +45,7 @@ _OPEN = 1e-12
 
 @dataclass(frozen=True)
 class PoseBounds:
-    """How far a closure's pose may be from the truth's."""
+    """Bounds on the error of a true closure's pose."""
 
     translation_m: float
     rotation_deg: float = _ROTATION_DEG

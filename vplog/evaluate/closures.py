@@ -30,7 +30,7 @@ _NEAR = 5
 
 @dataclass(frozen=True)
 class PlaceCriterion:
-    """When two frames show one place."""
+    """Criterion by which two frames show one place."""
 
     distance_m: float = DISTANCE_M
     heading_deg: float = HEADING_DEG
@@ -87,7 +87,7 @@ class ClosureScore:
     same_place: int
     """Accepted closures between frames of one place."""
     place_precision: float | None
-    """These as a share of the accepted ones."""
+    """`same_place` as a share of the accepted closures."""
     revisits: int
     """Keyframes that have an older keyframe at the same place."""
     revisits_found: int

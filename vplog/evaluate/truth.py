@@ -22,9 +22,10 @@ def read_truth(place: str | Path, kinds: Iterable[str] = ("gps", "auto")) -> Tra
 
     Raises TruthError with the first line that does not fit, SettingsError for a URL of no known kind.
     """
-    if not located(place).exists() and (near := nearest(str(place), kinds)):
+    path = located(place)
+    if not path.exists() and (near := nearest(str(place), kinds)):
         raise TruthError(f"--truth {shown(str(place))}: there is no such file.{near}")
-    return Trajectory(*read_tum(located(place), TruthError, "--truth"))
+    return Trajectory(*read_tum(path, TruthError, "--truth"))
 
 
 def local_enu(gps: Gps) -> tuple[Ints, Floats]:

@@ -1,4 +1,4 @@
-"""How work is executed: on how many threads, and where progress and warnings go."""
+"""Execution of work: number of threads, progress and warnings."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from vplog.settings import Settings
 
 
 class StereoSettings(Settings):
-    """Which features of two rectified images are one point."""
+    """Stereo matching of the features of two rectified images."""
 
     rows_px: float = Field(default=2.0, gt=0)
     """Most px that a point may lie above or below its match: rectification leaves half a px, and each feature has as

@@ -375,7 +375,7 @@ class _Factor:
 
     lu: SuperLU
     order: Ints
-    """In which its rows are eliminated."""
+    """Elimination order of its rows."""
 
     @classmethod
     def of(cls, matrix: sparse.csr_array, poses: Ints) -> _Factor:

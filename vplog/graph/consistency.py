@@ -55,7 +55,7 @@ def residual_before(graph: PoseGraph, chain: OdometryChain | None = None) -> Flo
 
 @dataclass(frozen=True, eq=False)
 class OdometryChain:
-    """Where the odometry alone leads, and how far it may be off between any two poses."""
+    """Poses by the odometry alone, and its covariance between any two of them."""
 
     poses: Floats
     """(N, 4, 4)."""

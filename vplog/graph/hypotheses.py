@@ -116,13 +116,13 @@ def _searched(graph: PoseGraph, gnc: GncSettings, loops: Ints, chain: OdometryCh
         if _is_new(likely, tried):
             found += _from_start(graph, gnc, sigmas, likely)
             tried += [one.weight[loops] > 0 for one in found[-2:]]
-            best = max(found, key=lambda one: one.log_evidence, default=None)
-            if best is not None and best.weight.all() and max(best.sigmas) <= _AS_CLAIMED:  # all agree
-                if not best.sigmas.differ(Sigmas(), math.log(_AS_CLAIMED)):
-                    return found
-                found.append(_improved(graph, best))
-                if found[-1].weight.all():  # and better than claimed, without any of them likelier to be false
-                    return found
+    best = max(found, key=lambda one: one.log_evidence, default=None)
+    if best is not None and best.weight.all() and max(best.sigmas) <= _AS_CLAIMED:  # all agree, from every start
+        if not best.sigmas.differ(Sigmas(), math.log(_AS_CLAIMED)):
+            return found
+        found.append(_improved(graph, best))
+        if found[-1].weight.all():  # and better than claimed, without any of them likelier to be false
+            return found
     of_families = []
     sigmas = likely_modes[0][0]
     starts = [sigmas, Sigmas()] if sigmas.differ(Sigmas(), math.log(_AS_CLAIMED)) else [sigmas]

@@ -1,4 +1,4 @@
-"""Where to start a solve from."""
+"""Initial poses of a solve."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _LOST_RAD = np.pi / 3.0
 """Noise of the heading, rad, beyond which the chain's whole circles may be wrong: half a circle is three sigmas."""
 _HELD = 1e6
-"""How much more firmly than by any edge the first pose is held."""
+"""Information of the first pose's prior, as a multiple of the largest of any edge."""
 
 
 def relaxed(factors: Factors, weight: Floats, chain: Floats) -> Floats | None:

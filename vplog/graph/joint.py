@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class JoinSettings(Settings):
-    """When closures between two drives are enough to put them into one map."""
+    """Closures between two drives that are enough to put them into one map."""
 
     least_closures: int = Field(default=3, ge=1)
     """Closures between two drives that the solve must keep, each at a place of its own in both. Nothing but another
@@ -95,7 +95,7 @@ class Joined:
     residual: list[Floats]
     """(L,) sigma of each Between after the solve, NaN where it does not hold."""
     apart: dict[int, str]
-    """Why the solve did not keep enough closures of a Between."""
+    """Reason, by Between, that the solve did not accept enough of its closures."""
 
 
 def join(

@@ -28,14 +28,14 @@ _DAMPING = 1e-5
 """First damping of Levenberg-Marquardt, and the factor by which it changes: as GTSAM."""
 _DAMPING_CHANGE = 10.0
 _MOST_DAMPING = 1e5
-"""Where it gives up, as GTSAM."""
+"""Damping at which it gives up, as in GTSAM."""
 _ROWS = 1 << 14
 """Poses that a thread moves at once, some megabytes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Where a least squares descent ended."""
+    """Result of a least squares descent."""
 
     world_from_body: Floats
     iterations: int

@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from vplog.data import Solution
+from vplog.errors import plural
 from vplog.graph.build import checked
 from vplog.graph.consistency import residual_sigma
 from vplog.graph.factors import Factors
@@ -28,7 +29,7 @@ class LmSettings(Settings):
     max_iterations: int = Field(default=100, ge=1)
     """Steps after which it gives up; graphs of drives take 5-20."""
     tolerance: float = Field(default=1e-6, gt=0)
-    """It has converged when a step gains less than this share of the error."""
+    """Converged when a step gains less than this share of the error."""
 
     def __call__(self, graph: PoseGraph) -> Solution:
         """Solve. Raises GraphError where the graph is none or its poses are not determined."""
@@ -56,7 +57,7 @@ def as_solution(graph: PoseGraph, weight: Floats, fit: Fit, found: str) -> Solut
         error_after=half_chi2(graph, weight, fit.world_from_body),
         iterations=fit.iterations,
         converged=fit.converged,
-        reason=f"{found} {end} after {fit.iterations} step{'' if fit.iterations == 1 else 's'}.",
+        reason=f"{found} {end} after {plural(fit.iterations, 'step')}.",
     )
 
 

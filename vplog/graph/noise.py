@@ -1,4 +1,4 @@
-"""How far an odometry edge between two keyframes may be wrong."""
+"""Covariance of the odometry edges between keyframes."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def modes(graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) -> 
 
 
 def agreement(graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) -> Bools:
-    """Which closures (K,) are true by the most likely sigmas."""
+    """(K,) bool: closures that are true by the most likely sigmas."""
     return modes(graph, loops, chain)[0][1]
 
 

@@ -65,7 +65,7 @@ def _without(graph: PoseGraph, edge: int) -> PoseGraph:
 
 def _mean(poses: Floats) -> tuple[Floats, Floats]:
     """(4, 4) median of (K, 4, 4) poses that are near each other, and their standard deviations (6,) about it."""
-    away = se3.log(se3.between(poses[:1], poses))
-    middle = np.median(away, axis=0)
-    spread = np.sqrt(((away - middle) ** 2).mean(axis=0))
+    offset = se3.log(se3.between(poses[:1], poses))
+    middle = np.median(offset, axis=0)
+    spread = np.sqrt(((offset - middle) ** 2).mean(axis=0))
     return poses[0] @ se3.exp(middle[None])[0], np.maximum(spread, _LEAST)

@@ -47,7 +47,7 @@ class RefineSettings(Settings):
     """Estimate by what factor metres are too short: the odometry's by GPS, the closures' by the odometry. Closures tell
     nothing of the odometry's metres: where the two differ, a shared error of depth is likelier, and does less harm."""
     scale_sigma: float = Field(default=0.02, gt=0)
-    """How far the odometry's scale is expected from 1: wheel and visual odometry lose 1-2 % of the way."""
+    """Prior standard deviation of the odometry's scale about 1: wheel and visual odometry lose 1-2 % of the way."""
     closure_scale_sigma: float = Field(default=0.05, gt=0)
     """How far the scale of closures with metres of their own is expected from 1: 5 % are a millimetre of a stereo
     pair's baseline, or a depth camera's error at 4 m."""
@@ -66,7 +66,7 @@ class Scale:
     edges: Bools
     """(E,)."""
     sigma: float
-    """How far from 1 it is expected."""
+    """Prior standard deviation about 1."""
     significance: float
     """Sigmas that it must be from 1 to be applied."""
     value: float = 1.0

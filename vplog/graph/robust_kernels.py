@@ -33,7 +33,7 @@ class KernelSettings(Settings):
     max_iterations: int = Field(default=100, ge=1)
     """Steps after which it gives up."""
     tolerance: float = Field(default=1e-6, gt=0)
-    """It has converged when a step gains less than this share of the error."""
+    """Converged when a step gains less than this share of the error."""
 
 
 def solve_robustly(graph: PoseGraph, settings: KernelSettings, kernel: Callable[[float], Any]) -> Solution:

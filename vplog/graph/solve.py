@@ -41,7 +41,7 @@ OptimiserSettings = Annotated[
 
 
 class Decision(NamedTuple):
-    """Which closures are true."""
+    """Selection of the true closures."""
 
     graph: PoseGraph
     """With the sigmas that are claimed, no closure's far below those of the others."""

@@ -130,7 +130,7 @@ def _most_factors(graph: PoseGraph) -> list[float]:
 
 
 def extrapolated(first: Sigmas, second: Sigmas, third: Sigmas) -> Sigmas:
-    """Where three estimates in a row lead to: Aitken's delta-squared process in their logarithms, bounded."""
+    """Limit that three successive estimates lead to: Aitken's delta-squared process in their logarithms, bounded."""
     steps = np.diff(np.log(np.array([first, second, third])), axis=0)
     ratio = np.divide(steps[1], steps[0], out=np.zeros(len(first)), where=np.abs(steps[0]) > _STILL)
     ratio = np.clip(ratio, 0.0, _MOST_RATIO)

@@ -54,7 +54,7 @@ class LocalizedPicture:
         return self.found.world_from_camera is not None
 
     def record(self) -> dict[str, Any]:
-        """As plain values."""
+        """The answer as plain values for JSON."""
         pose, covariance = self.found.world_from_camera, self.found.covariance
         values: dict[str, Any] = {}
         if pose is not None and covariance is not None:

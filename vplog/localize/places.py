@@ -56,7 +56,7 @@ class Landmarked(NamedTuple):
     world_from_body: Floats
     """(N, 4, 4)."""
     earth: Earth | None
-    """Where that frame is on earth."""
+    """Pose of that frame on earth."""
     table: LandmarkTable
 
     def landmarks(self, row: int, settings: VerifySettings) -> KeyframeLandmarks:

@@ -30,17 +30,17 @@ class Content:
     stamp_ns: Ints
     """(F,) of the images, increasing."""
     places: list[Place]
-    """Where they lie."""
+    """Places of the images in the container."""
     stream: list[Place]
-    """Where all messages of the images' topic lie, in the order of the file: a video decodes in that order alone."""
+    """Places of all messages of the images' topic, in the order of the file: a video decodes in that order alone."""
     stream_rows: Ints
     """(F,) which of them the images are."""
     depth_places: list[Place | None]
-    """Where the depth image of each lies."""
+    """Place of the depth image of each."""
     right_places: list[Place | None]
-    """Where the right image of each lies."""
+    """Place of the right image of each."""
     mask_places: list[Place | None]
-    """Where the mask of each lies."""
+    """Place of the mask of each."""
     calibrations: list[CalibrationMessage]
     """Calibrations that are set and differ from the one before: the first is the camera's, a later one that of images
     behind its stamp."""

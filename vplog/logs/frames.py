@@ -242,7 +242,7 @@ class ImageReader:
     def __init__(self, container: Container, image: Channel | None, codec: str, content: Content, notes: Notes) -> None:
         """`codec` is FFmpeg's decoder where the topic of the images is a video, else empty."""
         self._container, self._image = container, image
-        self._video = None if image is None or not codec else self._stream(image, codec, content)
+        self._video = None if image is None or not codec else self._stream(image, codec, content, notes)
         self.content = content if self._video is None else self._from_first_key(self._video, content, notes)
         """Content of the log, without the images before a video's first key frame."""
 
@@ -306,7 +306,7 @@ class ImageReader:
             raise failures[0]
         return None
 
-    def _stream(self, image: Channel, codec: str, content: Content) -> VideoStream:
+    def _stream(self, image: Channel, codec: str, content: Content, notes: Notes) -> VideoStream:
         places, images = content.stream, {*content.stream_rows.tolist()}
 
         def payload(row: int) -> bytes | None:
@@ -317,7 +317,9 @@ class ImageReader:
                 return bytes(image_in(image, message).data)
             return b""
 
-        return VideoStream(codec, image.topic, payload, len(places))
+        advice = ", or choose another topic with --image-topic"
+        decoder = partial(video.new_decoder, codec, image.topic, notes.add, advice)
+        return VideoStream(codec, payload, len(places), decoder)
 
     def _from_first_key(self, video: VideoStream, content: Content, notes: Notes) -> Content:
         first = video.first_key()

@@ -57,7 +57,7 @@ class Images:
     stream: list[Place] = field(default_factory=list)
     """Places of all messages, the empty and damaged ones too."""
     rows: list[int] = field(default_factory=list)
-    """Which of `stream` the places are."""
+    """Rows of `stream` that the places are."""
 
     def add(self, block: Block, row: int, position: int) -> None:
         """Add a message of a block. Raises BadMessageError."""

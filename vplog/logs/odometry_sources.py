@@ -1,4 +1,4 @@
-"""Which source of a log is the drive's odometry: the evidence on each, and the score by which the best is taken.
+"""Choice of a drive's odometry among the sources of its log: evidence on each, and the score that ranks them.
 
 A score is a product of factors, 1 where there is no evidence against a source. Type, frames and name
 are guesses, so they mostly leave more than half; measured evidence (coverage, rate, jumps) may leave next to nothing.
@@ -109,7 +109,7 @@ class SourceOdometry:
 
     odometry: Odometry | None
     frames: list[str]
-    """From the one that stands still to the body."""
+    """Frames of the chain, from the fixed one to the body."""
     notes: Notes
     """On what was repaired or left out of it."""
     kind: str = "poses"

@@ -117,7 +117,7 @@ class RecordedLog:
         return self._content.gps
 
     def truth(self) -> Trajectory | Gps | None:
-        """That of the data set, else the poses of a topic that is called ground truth."""
+        """Ground truth of the data set, else the poses of a topic that is called ground truth."""
         if self._contents.truth is not None or not self._truth_name:
             return self._contents.truth
         chosen = select(self._candidates, TopicChoice(odometry=self._truth_name), self._path.name)

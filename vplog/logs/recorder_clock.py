@@ -46,9 +46,9 @@ class _Drop:
     back_ns: int
     """By how much the log times go back: less than the clock was set back by, as time passed."""
     elapsed_ns: int
-    """How much, by the header stamps or the period."""
+    """Time between the two messages in ns, by the header stamps or the period."""
     moved_ns: int
-    """How much, by the motion over the step; 0 where it does not tell."""
+    """Time between them in ns by the motion over the step; 0 if unknown."""
     overlap: int
     """Turns from one side to the other beyond those of neighbours."""
     continuous: bool

@@ -1,4 +1,4 @@
-"""Which topic of a log plays which part.
+"""Selection of the topic of each part of a log.
 
 An image topic is depth where its encoding is 16UC1, 16SC1, 32FC1 or 64FC1, or compressedDepth, or mono16 under a name
 with `depth`; 16UC1 without px that lack a measurement is a thermal camera's, where its name says so or no camera shares

@@ -11,7 +11,7 @@ from vplog.settings import Settings
 
 
 class CalibrationSettings(Settings):
-    """How the camera's rotations are compared with the odometry's.
+    """Comparison of the camera's rotations with the odometry's.
 
     A relative error of the focal length makes every rotation between two views wrong by the same factor and leaves
     small residuals, so only another sensor detects it. It is not corrected: it widens the closures' covariance.

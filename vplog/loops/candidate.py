@@ -32,24 +32,24 @@ _BISECTIONS = 20
 
 
 class VerifySettings(Settings):
-    """How a proposed closure is checked."""
+    """Verification of a proposed closure."""
 
     min_matches: int = Field(default=25, ge=0)
     """Feature matches below which a candidate is rejected before its pose is estimated. Of the 20 inliers required a
     fifth has no landmark, and two images of different places share 16 by chance, seldom 25."""
     matching: MatchSettings = MatchSettings()
-    """Which features are taken for the same point."""
+    """Feature matching."""
     landmarks: LandmarkSettings = LandmarkSettings()
-    """How the map frame's features get their 3D position."""
+    """Triangulation of the map frame's features."""
     calibration: CalibrationSettings = CalibrationSettings()
-    """How far a calibrated camera's rotations and stamps are trusted."""
+    """Trust in a calibrated camera's rotations and stamps."""
     metric: MetricSettings = MetricSettings()
-    """When a pose is accepted, for a calibrated camera."""
+    """Acceptance of a pose, for a calibrated camera."""
     both_ways: bool = True
     """Whether an accepted pose is verified in reverse too, the match in the query's landmarks: the
     two must agree within their joint noise, and make one closure together."""
     epipolar: EpipolarSettings = EpipolarSettings()
-    """When two images agree, for an uncalibrated camera."""
+    """Acceptance of two images, for an uncalibrated camera."""
 
 
 def lenient(settings: VerifySettings) -> VerifySettings:

@@ -33,7 +33,7 @@ MOST_APART = 8
 
 
 class FalseRateSettings(Settings):
-    """Which share of the closures used may be false."""
+    """Bound on the share of the accepted closures that may be false."""
 
     rate: float | None = Field(default=None, gt=0, lt=1)
     """Expected share of false closures of a drive among those that are given to the solver; the least sure ones are

@@ -23,7 +23,7 @@ FeaturesOf = Callable[[int], Features]
 
 
 class LandmarkSettings(Settings):
-    """How the features of a map frame get their 3D position."""
+    """3D positions of the features of a map frame."""
 
     neighbours: int = Field(default=2, ge=1, le=20)
     """Keyframes before and after the map frame that its features are triangulated with."""

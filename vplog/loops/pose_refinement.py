@@ -54,9 +54,8 @@ class Matches:
 def agreement(match_from_query: Floats, matches: Matches) -> tuple[Floats, Floats]:
     """Squared Mahalanobis distances (K,) of the image errors of matches: with the landmarks' covariance, and without
     it. NaN behind the query."""
-    return _agreement(
-        se3.inverse(match_from_query), matches.points, matches.covariance, matches.rays, matches.noise
-    )  # fmt: skip
+    query_from_match = se3.inverse(match_from_query)
+    return _agreement(query_from_match, matches.points, matches.covariance, matches.rays, matches.noise)
 
 
 def fit(match_from_query: Floats, matches: Matches) -> tuple[Floats, Floats, float]:

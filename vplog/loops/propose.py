@@ -1,4 +1,4 @@
-"""Which earlier keyframes each keyframe may be a return to, by place recognition."""
+"""Candidate closures: earlier keyframes that a keyframe may be a return to, by place recognition."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vplog.settings import Settings
 
 
 class ProposeSettings(Settings):
-    """Which earlier keyframes become candidates. The gaps count keyframes, whose spacing follows the drive's own scale:
+    """Selection of the candidates. The gaps count keyframes, whose spacing follows the drive's own scale:
     a car's is metres, a hand-held camera's centimetres."""
 
     per_query: int = Field(default=10, ge=1)
@@ -22,12 +22,12 @@ class ProposeSettings(Settings):
     """A match is at least this many keyframes earlier, but never more than a quarter of the drive: until then much of
     the view is still the same, and a closure adds nothing to odometry."""
     gap_steps: float = Field(default=30.0, ge=0)
-    """And at least this many times the drive's median keyframe spacing earlier along the path, so that standing still
+    """Also at least this many times the drive's median keyframe spacing earlier along the path, so that standing still
     makes no closures, however long it takes."""
     gap_s: float = Field(default=0.0, ge=0, le=1e9)
-    """And at least this many seconds earlier; 0 leaves it to the other gaps."""
+    """Also at least this many seconds earlier; 0 leaves it to the other gaps."""
     gap_m: float = Field(default=0.0, ge=0)
-    """And at least this many metres of path earlier; 0 leaves it to the other gaps."""
+    """Also at least this many metres of path earlier; 0 leaves it to the other gaps."""
     suppress: int = Field(default=1, ge=0)
     """Candidates within this many keyframes of a better one of the same query are left out: they show what it shows."""
 

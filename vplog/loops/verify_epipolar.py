@@ -17,7 +17,7 @@ _MODELS = 3
 
 
 class EpipolarSettings(Settings):
-    """When two uncalibrated images are accepted as views of one place."""
+    """Acceptance of two uncalibrated images as views of one place."""
 
     min_inliers: int = Field(default=20, ge=8)
     """Matches that must agree; a line is a weak test, so no fewer than for a pose."""

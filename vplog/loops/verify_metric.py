@@ -39,7 +39,7 @@ _SINGULAR = 1e12
 
 
 class MetricSettings(Settings):
-    """When a pose between two keyframes is accepted, and how certain it is."""
+    """Acceptance of a pose between two keyframes, and its covariance."""
 
     min_inliers: int = Field(default=20, ge=6)
     """Matches that must agree with the pose; RTAB-Map's and ORB-SLAM's usual bound, well above chance."""

@@ -179,8 +179,8 @@ def _merge_drive(
     other.read(drive, copied, ())
     if taken != drive:
         layout.set_drive_id(made / "keyframes.parquet", taken)
+    _link_join_inputs(other, drive, store, taken)  # what has a drive.json is put in by the next writer
     run_record.write_run_json(made / "drive.json", record if taken == drive else layout.renamed(record, taken))
-    _link_join_inputs(other, drive, store, taken)
     map_store.publish(store, taken, made)
     other.evict(drive)
     target_drives.add(taken, record)

@@ -47,7 +47,7 @@ class NetworkInput(Settings):
     std: tuple[float, ...] = (0.229, 0.224, 0.225)
     """Divides each channel then."""
     interpolation: Literal["area", "linear", "cubic"] = "area"
-    """How an image is resized; `area` averages where it shrinks and is linear where it grows."""
+    """Interpolation of a resized image; `area` averages where it shrinks and is linear where it grows."""
     layout: Literal["nchw", "nhwc"] = "nchw"
     """Order of the axes: batch, channels, height, width, or with the channels last."""
     input: str = ""

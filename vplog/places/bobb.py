@@ -254,7 +254,7 @@ class BobbState(ReferencesState):
 
     @property
     def pairing(self) -> Pairing:
-        """Which boxes of two places are compared."""
+        """Boxes of two places that are compared."""
         return self.settings.pairing
 
     def lists(self, *columns: pa.Array) -> CodeLists:

@@ -116,8 +116,8 @@ def explanations(descriptors: Sequence[Bytes], candidates: Ints, execution: Exec
         of[of == number[row]] = -1
         of.sort(axis=1)
         first = np.concatenate([np.ones((len(of), 1), bool), of[:, 1:] != of[:, :-1]], axis=1)  # once a feature
-        who, times = np.unique(of[first & (of >= 0)], return_counts=True)
-        return who, (times / len(found)).astype(np.float32)
+        candidate, count = np.unique(of[first & (of >= 0)], return_counts=True)
+        return candidate, (count / len(found)).astype(np.float32)
 
     candidate, share = zip(*execution.map(explained_by, range(len(descriptors))), strict=True)
     start = np.concatenate([[0], np.cumsum([len(one) for one in candidate])])

@@ -113,7 +113,7 @@ def _features_of(features: Features, settings: HybridSettings) -> Described:
 
 
 def learn_vlad(features: Sequence[Described], settings: HybridSettings) -> BinaryVlad:
-    """From the library's features, of which there is one at least."""
+    """A vocabulary of the library's features, of which there is one at least."""
     steps, points = map(np.concatenate, zip(*features, strict=True))
     rows = spread_rows(len(steps), _MOST_FEATURES)
     roots, points = steps[rows].astype(np.float64) / ROOT_STEPS, points[rows]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class WordSettings(Settings):
-    """How features become words."""
+    """Quantisation of features to visual words."""
 
     features: int = Field(default=800, ge=1)
     """Strongest features of an image that are used."""

@@ -107,7 +107,7 @@ def references_hash(references: Sequence[Reference], settings: Settings) -> str:
 
 
 _FEATURES = pa.schema([("reference", pa.int32()), ("x", pa.float32()), ("y", pa.float32()), ("size", pa.float32())])
-"""And `descriptor`, of as many bytes as the features' own."""
+"""Columns of features.parquet but `descriptor`, whose bytes are those of the features' own."""
 _REFERENCES = pa.schema(
     [
         ("drive", pa.string()),

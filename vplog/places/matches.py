@@ -44,7 +44,7 @@ class Once(Generic[Value]):
 
 
 class WeighedMatchSettings(Settings):
-    """How features are matched to those of a library."""
+    """Matching of features to those of a library."""
 
     features: int = Field(default=400, ge=0)
     """Strongest keypoints of an image that are used, of those large enough; 0 uses patches alone."""

@@ -1,4 +1,4 @@
-"""Which frames become the reference images of a library."""
+"""Choice of the reference images of a library."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FRAMES_A_REFERENCE = 8
 
 
 class LibrarySettings(Settings):
-    """Which images become the reference library where none is given."""
+    """Reference library that is made where none is given."""
 
     choose: Literal["random", "spread", "coverage"] = "random"
     """How: `random` frames, as the paper (section IV); `spread`, evenly along the drive; `coverage`, those that

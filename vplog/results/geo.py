@@ -27,7 +27,7 @@ _POINT_Z = struct.pack("<BI", 1, 1001)
 
 @dataclass(frozen=True, eq=False)
 class Earth:
-    """Where on earth the trajectory's frame is."""
+    """Pose of the trajectory's frame on earth."""
 
     origin: tuple[float, float, float]
     """Latitude and longitude in degrees and altitude in m, WGS84."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import re
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -16,13 +18,22 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from google.protobuf.message import DecodeError
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.reader import McapReader, make_reader
+from mcap.writer import MCAP0_MAGIC
 
 from vplog.data import Floats, Gps
 from vplog.errors import ResultError
 from vplog.geometry import se3
 from vplog.results.foxglove import CAMERA
 from vplog.results.mcap import FIXES, PICTURES
+from vplog.storage.parquet_limits import crc_of
+
+_DATA_END = struct.Struct("<BQI")
+"""Opcode, length and CRC-32 of all before, or 0: the MCAP specification, Data End."""
+_FOOTER = struct.Struct("<BQQQI8s")
+"""Opcode, length, starts of the summary and of its offsets, CRC-32 of the summary and of this so far, or 0, and magic:
+the MCAP specification, Footer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,12 +115,29 @@ def read_camera_pose(path: Path) -> Floats | None:
 def _reading(path: Path) -> Iterator[McapReader]:
     try:
         with path.open("rb") as stream:
+            _check_crcs(stream)
             yield make_reader(stream, validate_crcs=True)
     except FileNotFoundError:
         raise ResultError(f"{path} does not exist. Give the folder that `vplog run -o` wrote.") from None
     except (OSError, McapError, DecodeError, ValueError, EOFError, struct.error) as error:
         why = (str(error).splitlines() or [type(error).__name__])[0]
         raise ResultError(f"{path} cannot be read: {why} Run `vplog run` again.") from None
+
+
+def _check_crcs(stream: BinaryIO) -> None:
+    """Raises ValueError or struct.error where the CRC-32 of the data or the summary does not match: those of chunks and
+    attachments, which the reader checks, leave out names of topics and indexes."""
+    size = stream.seek(0, io.SEEK_END)
+    stream.seek(max(size - _FOOTER.size, 0))
+    footer, length, summary_start, _, summary_crc, magic = _FOOTER.unpack(stream.read())
+    stream.seek(0)
+    data = crc_of(stream, summary_start - _DATA_END.size)
+    end = _DATA_END.unpack(stream.read(_DATA_END.size))
+    summary = crc_of(stream, size - summary_start - len(magic) - 4)
+    framed = (footer, length, magic, *end[:2]) == (Opcode.FOOTER, 20, MCAP0_MAGIC, Opcode.DATA_END, 4)
+    if not framed or end[2] not in (0, data) or summary_crc not in (0, summary):
+        raise ValueError("It is damaged: its checksum does not match.")
+    stream.seek(0)
 
 
 def _gps(fixes: list[LocationFix]) -> Gps:

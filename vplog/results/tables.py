@@ -282,7 +282,7 @@ def covariance_of(information: Floats) -> Floats:
 
 
 _SCALES = ("odometry", "depth", "stereo", "none")
-"""Where the metres of a closure may come from."""
+"""Sources of the metres of a closure."""
 
 
 EXACT_LEDGER = pa.schema(
@@ -467,7 +467,7 @@ def placed_table(columns: Sequence[Any]) -> pa.Table:
 
 
 def write_placed(path: Path, table: pa.Table, metadata: TableMetadata) -> None:
-    """Where the views of a log are in a map; `metadata` is that of the map."""
+    """Write the places of a log's views in a map; `metadata` is that of the map."""
     _write(path, "placed", table, metadata, None)
 
 

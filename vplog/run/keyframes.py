@@ -1,4 +1,4 @@
-"""Which frames become nodes: by motion, never two with the same stamp, none where odometry is missing."""
+"""Selection of keyframes: by motion, never two with the same stamp, none where odometry is missing."""
 
 from __future__ import annotations
 

@@ -130,12 +130,12 @@ def _check_seal(path: Path, footer_alone: bool = False) -> None:
         sound = zlib.crc32(stream.read()) == footer
         if sound and not footer_alone:
             stream.seek(0)
-            sound = _crc_of(stream, start) == body
+            sound = crc_of(stream, start) == body
     if not sound:
         raise ValueError("It is damaged: its checksum does not match.")
 
 
-def _crc_of(stream: BinaryIO, count: int) -> int:
+def crc_of(stream: BinaryIO, count: int) -> int:
     """CRC-32 of the next `count` bytes."""
     total = 0
     while count and (block := stream.read(min(count, _BLOCK_BYTES))):

@@ -29,7 +29,7 @@ _PUT_BACK = "Put it back there, or give a truth file: --truth FILE.tum."
 
 @dataclass(frozen=True)
 class TruthOptions(closures.PlaceCriterion):
-    """How a run is compared with the truth."""
+    """Options of the comparison of a run with the truth."""
 
     align: str = "se3"
     """Alignment of the ATE, a name of `trajectory.ALIGNMENTS`."""

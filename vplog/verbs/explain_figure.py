@@ -46,7 +46,7 @@ class View:
     agreement: Agreement
     boxes: list[SharedBoxes]
     missing: str
-    """Why there are no boxes."""
+    """Reason that there are no boxes."""
 
 
 def draw(path: Path, view: View) -> None:

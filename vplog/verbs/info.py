@@ -294,7 +294,7 @@ def _about_gps(gps: Gps | None, found: LogInfo) -> dict[str, Any] | None:
 
 
 def _scale(camera: Camera | None, found: LogInfo) -> dict[str, str]:
-    """Where the metres of a closure come from."""
+    """Source of the metres of a closure."""
     if camera is None:
         return {"source": "none", "why": "The log has no camera images."}
     if camera.matrix is None:

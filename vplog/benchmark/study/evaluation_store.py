@@ -78,7 +78,7 @@ class Bench:
     """File of the finished evaluations, by the hash of their inputs."""
     scratch: Path
     folders: list[FeatureFolder]
-    """Where the features of each drive are."""
+    """Features of each drive."""
     execution: Execution
     warnings: list[str] = field(default_factory=list)
     _traversals: dict[int, Traversal] = field(default_factory=dict)

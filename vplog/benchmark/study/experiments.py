@@ -83,7 +83,7 @@ _CHANGED = ("r_at_1", "anr", "ap")
 
 @dataclass(frozen=True)
 class StudyOptions:
-    """Which experiments are done, and on what."""
+    """Choice of experiments and their data."""
 
     methods: Sequence[str] = METHODS
     sizes: Sequence[int] = (10, 20, 50, 100)
@@ -98,7 +98,7 @@ class StudyOptions:
     """Names of the experiments; None for all."""
     topics: TopicChoice | None = None
     cache: CacheChoice = CacheChoice()
-    """Where features are kept for further calls."""
+    """Cache of features for further calls."""
 
     def libraries(self, drive: int, size: int | None = None) -> list[Library]:
         """One for each seed."""

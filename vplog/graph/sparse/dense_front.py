@@ -42,7 +42,7 @@ def eliminate_together(front: Floats, eliminated: int, workers: Workers) -> bool
         columns = workers.ranges(end, length, 2 * _LEAST_SHARE)
         workers.each(_panel, [(front, begun, end, scale, left, right) for left, right in columns])
         rows = workers.ranges(end, length, _LEAST_SHARE, _BY_THREAD)
-        workers.each(_take_panel_away, [(front, begun, end, low, high) for low, high in rows])
+        workers.each(_subtract_panel, [(front, begun, end, low, high) for low, high in rows])
     return True
 
 
@@ -58,7 +58,7 @@ def eliminate_front(front: Floats, eliminated: int) -> bool:
         end = min(begun + _PANEL, eliminated)
         if not _panel(front, begun, end, scale, begun, length):
             return False
-        _take_panel_away(front, begun, end, end, length)
+        _subtract_panel(front, begun, end, end, length)
     return True
 
 
@@ -86,12 +86,12 @@ def _panel(front: Floats, begun: int, end: int, scale: Floats, low: int, high: i
             for i in range(last, end):
                 for k in range(first, last):
                     share[k - first] = front[k, i]
-                take_away(front, i, front, first, last, share, max(i, left), right)
+                subtract_scaled(front, i, front, first, last, share, max(i, left), right)
     return True
 
 
 @numba.njit(cache=True, nogil=True)
-def _take_panel_away(front: Floats, begun: int, end: int, low: int, high: int) -> None:
+def _subtract_panel(front: Floats, begun: int, end: int, low: int, high: int) -> None:
     """Subtract the outer products of the complete rows begun:end of R from rows low:high."""
     length = len(front)
     share = np.empty(AT_ONCE)
@@ -102,11 +102,11 @@ def _take_panel_away(front: Floats, begun: int, end: int, low: int, high: int) -
                 last = min(first + AT_ONCE, end)
                 for k in range(first, last):
                     share[k - first] = front[k, i]
-                take_away(front, i, front, first, last, share, max(i, left), right)
+                subtract_scaled(front, i, front, first, last, share, max(i, left), right)
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
-def take_away(
+def subtract_scaled(
     target: Floats, row: int, rows: Floats, low: int, high: int, share: Floats, left: int, right: int
 ) -> None:
     """target[row] less the sum of rows[low:high], up to eight, each times its share, in columns left:right."""

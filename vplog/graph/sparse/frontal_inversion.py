@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 
-from vplog.graph.sparse.dense_front import AT_ONCE, STRIP, take_away
+from vplog.graph.sparse.dense_front import AT_ONCE, STRIP, subtract_scaled
 from vplog.graph.sparse.frontal import found, rows_of_child
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def _cross_rows(front: Floats, begun: int, end: int, gain: Floats, low: int, hig
             for k in range(begun, end):
                 for other in range(i, last):
                     share[other - i] = gain[k - begun, other]
-                take_away(front, k, front, i, last, share, left, right)
+                subtract_scaled(front, k, front, i, last, share, left, right)
     for k in range(begun, end):
         for j in range(low, high):
             front[j, k] = front[k, j]

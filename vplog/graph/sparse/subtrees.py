@@ -1,4 +1,4 @@
-"""Which parts of an elimination tree are worked on side by side, and what is left above them all."""
+"""Subtrees of an elimination tree that are eliminated in parallel, and the rest above them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""In which order the poses of a sparse graph are eliminated, and which entries of the factor that fills.
+"""Elimination order of the poses of a sparse graph, and the fill-in of the factor.
 
 Davis, Direct Methods for Sparse Linear Systems, SIAM 2006, chapters 4 and 7. Everything here is in blocks: one row of
 the matrix for each node.
@@ -75,7 +75,7 @@ class Elimination:
 
 
 def dissected(n: int, a: Ints, b: Ints) -> Ints:
-    """When each node (n,) is eliminated."""
+    """(n,) position of each node in the elimination order."""
     graph = gtsam.SymbolicFactorGraph()
     for one, other in zip(a.tolist(), b.tolist(), strict=True):
         graph.push_factor(one, other)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from vplog.logs.calibrations.camera import CalibratedCamera
 
 _MODELS = (".", "sparse", "sparse/0", "colmap/sparse/0", "dslr_calibration_undistorted")
-"""Where a model lies below the folder of a reconstruction: COLMAP's own, its automatic one, NeRF's, ETH3D's."""
+"""Paths of a model below the folder of a reconstruction: COLMAP's own, its automatic one, NeRF's, ETH3D's."""
 _LARGEST = 2**31
 """Bytes of images.bin; 100,000 images of 1000 points take a third of it."""
 _UNITS = (

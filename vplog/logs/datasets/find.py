@@ -1,4 +1,4 @@
-"""Which data set a folder is, by its content."""
+"""Detection of data sets in a folder, by its content."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def read(path: Path) -> DataSet:
 
 
 def _calibration(path: Path) -> CalibratedCamera | None:
-    """That of the camera which the folder or the comments of its lists name."""
+    """Calibration of the camera that the folder or the comments of its lists name."""
     with (path / "rgb.txt").open("rb") as stream:
         named = re.search(r"freiburg([123])", f"{path.resolve().name} {stream.read(1000)!r}")
     if named is None:

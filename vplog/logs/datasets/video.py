@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -11,11 +12,22 @@ from vplog.errors import LogError
 from vplog.logs.datasets import ros1
 from vplog.logs.datasets.streams import DataSet, Stream
 from vplog.logs.formats.container import Channel
-from vplog.logs.messages.video import MAX_PIXELS, grey
+from vplog.logs.messages.records import BadMessageError
+from vplog.logs.messages.video import (
+    MAX_PIXELS,
+    NAMES,
+    PLAIN,
+    WHOLE_KEY,
+    VideoStream,
+    careful,
+    grey,
+    new_decoder,
+    padded,
+    pyav,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from fractions import Fraction
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from vplog.data import Bytes, Ints
@@ -23,9 +35,23 @@ if TYPE_CHECKING:
 _TURNS = {90: cv2.ROTATE_90_COUNTERCLOCKWISE, 180: cv2.ROTATE_180, -180: cv2.ROTATE_180, -90: cv2.ROTATE_90_CLOCKWISE}
 """By the degrees counterclockwise that PyAV gives of the display matrix (ISO/IEC 14496-12, 8.3.2)."""
 _AHEAD = 250
-"""Frames that are decoded to reach one, rather than sought from the key frame before it: usual distances of these."""
+"""Packets that are read to reach one, rather than sought from the key frame before it: usual distances of these."""
+_FILTERS = {"h264": "h264_mp4toannexb,dump_extra", "hevc": "hevc_mp4toannexb,dump_extra"}
+"""FFmpeg's filters that make packets of files like those of messages, each key frame with its parameter sets."""
 _MOST_FRAMES = 10_000_000
 """Frames of a file: two days at 60 Hz."""
+
+
+class _Packet(NamedTuple):
+    """A packet without its data; times in the ticks of its stream."""
+
+    pts: int | None
+    dts: int | None
+    position: int
+    """Byte of the file."""
+    key: bool
+    discarded: bool
+    """It is decoded for others, and not shown."""
 
 
 def is_video(path: Path) -> bool:
@@ -37,74 +63,138 @@ def is_video(path: Path) -> bool:
 
 def read(path: Path) -> DataSet:
     """Stamps are those of the file, since its start. Raises LogError where it holds no picture, or PyAV is missing."""
-    frames = VideoFrames(path)
+    remarks = list[str]()
+    frames = VideoFrames(path, remarks.append)
     channel = Channel("video", "sensor_msgs/Image", "ros1")
 
     def message(row: int) -> bytes:
         stamp_ns = int(frames.stamp_ns[row])
         return ros1.image(stamp_ns, "video", "mono8", frames.image(row))
 
-    return DataSet("video", [Stream(channel, frames.stamp_ns, message, lambda _: MAX_PIXELS)])
+    return DataSet("video", [Stream(channel, frames.stamp_ns, message, lambda _: MAX_PIXELS)], remarks=remarks)
 
 
 class VideoFrames:
-    """The frames of a file by their row in time, decoded forward from the key frame before them."""
+    """The frames of a file by their row in time."""
 
-    def __init__(self, path: Path) -> None:
-        """Reads the packets once, without decoding. Raises LogError."""
-        self._av, self._path = _av(path), path
+    def __init__(self, path: Path, note: Callable[[str], object] = lambda _: None) -> None:
+        """Reads the packets once; `note` takes what the decoder cannot. Raises LogError."""
+        self._av, self._path, self._note = pyav(f"{path} is a video"), path, note
         with self._opened() as container:
             stream = self._stream(container)
-            packets = [(packet.pts, packet.dts) for packet in container.demux(stream) if packet.size]
-            self._slots = container.format.name == "avi" or any(pts is None for pts, _ in packets)
-            """AVI has a slot of time for each packet in place of stamps: the frames take them in their order."""
-            self._tick_s: Fraction = stream.time_base
-            times = [dts if self._slots else pts for pts, dts in packets]
-            ticks = np.unique([time for time in times if time is not None])
-        if not 0 < len(ticks) <= _MOST_FRAMES:
+            self._codec, self._tick_s = stream.codec_context.codec.canonical_name, stream.time_base
+            packets = [
+                _Packet(one.pts, one.dts, one.pos, one.is_keyframe, one.is_discard)
+                for one in container.demux(stream)
+                if one.size
+            ]
+            # AVI has a slot of time for each packet in place of stamps: the frames take them in their order
+            slots = any(one.pts is None for one in packets) or (
+                container.format.name == "avi" and self._codec == "h264" and stream.codec_context.has_b_frames
+            )
+        self._packets = packets
+        self._at, self._data = -1, b""
+        """The last packet that was read, and its number."""
+        self._running: Iterator[tuple[int, bytes]] | None = None
+        """Those behind it."""
+        times = [one.dts if slots else one.pts for one in packets]
+        shown = [time for time, one in zip(times, packets, strict=True) if time is not None and not one.discarded]
+        self._ticks = np.unique(np.array(shown, np.int64))
+        if not 0 < len(self._ticks) <= _MOST_FRAMES:
             raise LogError(f"{path} holds no picture with a time stamp. Give another video.")
-        self._ticks: list[int] = [int(tick) for tick in ticks]
-        self._rows = {tick: row for row, tick in enumerate(self._ticks)}
-        self._running: Any = None
-        """The frames from the last one on."""
-        self._next = 0
-        """The row that comes next."""
+        self._turn = self._first_turn()
+        self._decoder()  # what it lacks is said at once
+        order = self._decoded_order() if slots else range(len(packets))
+        places = {int(tick): row for row, tick in enumerate(self._ticks)}
+        rows = [-1] * len(packets)  # of those that are not shown
+        for number, time, one in zip(order, times, (packets[number] for number in order), strict=True):
+            if time is not None and not one.discarded:
+                rows[number] = places[time]
+        kinds = bytes(WHOLE_KEY if one.key else PLAIN for one in packets)
+        self._video = VideoStream(self._codec, self._packet, len(packets), self._decoder, rows, kinds)
 
     @property
     def stamp_ns(self) -> Ints:
         """(F,) since the first frame."""
-        return np.array([int((tick - self._ticks[0]) * 10**9 * self._tick_s) for tick in self._ticks], np.int64)
+        return np.array(
+            [int((tick - self._ticks[0]) * 10**9 * self._tick_s) for tick in self._ticks.tolist()], np.int64
+        )
 
     def image(self, row: int) -> Bytes:
         """(H, W) uint8 grey; (0, 0) where it does not decode. Rows are best read in increasing order."""
-        wanted = self._ticks[row]
         try:
-            if self._running is None or not self._next <= row < self._next + _AHEAD:
-                self._running = self._from_key(wanted)
-            for tick, frame in self._running:
-                self._next = self._rows.get(tick, self._next - 1) + 1
-                if tick == wanted and not frame.is_corrupt:
-                    turn = _TURNS.get(round(frame.rotation))
-                    picture = grey(frame)
-                    return picture if turn is None else np.asarray(cv2.rotate(picture, turn), np.uint8)
-                if tick is not None and tick >= wanted:
-                    break
-        except self._av.error.FFmpegError:
-            self._running = None
-        return np.zeros((0, 0), np.uint8)
+            frame = self._video.frame(row)
+        except BadMessageError:
+            return np.zeros((0, 0), np.uint8)
+        turn = _TURNS.get(round(frame.rotation) or self._turn)
+        return grey(frame) if turn is None else np.asarray(cv2.rotate(grey(frame), turn), np.uint8)
 
-    def _from_key(self, tick: int) -> Iterator[tuple[int | None, Any]]:
-        """Times and frames from the key frame before a time on; from the first where they take slots."""
-        container = self._opened()
+    def _packet(self, number: int) -> bytes:
+        """Empty where it cannot be read."""
+        if self._running is None or not self._at <= number <= self._at + _AHEAD:
+            self._at, self._running = -1, self._from(number)
+        try:
+            while self._at < number:
+                self._at, self._data = next(self._running)
+        except (StopIteration, self._av.error.FFmpegError):
+            self._running = None
+            return b""
+        return self._data if self._at == number else b""
+
+    def _from(self, number: int) -> Iterator[tuple[int, bytes]]:
+        """Packets with their numbers from one on, or from one before it."""
+        container, numbers = self._opened(), {one.position: number for number, one in enumerate(self._packets)}
         stream = self._stream(container)
-        stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
-        stream.codec_context.thread_count = 1  # with more, what damage does is a matter of chance
-        if self._slots:
-            yield from zip(self._ticks, container.decode(stream), strict=False)
-            return
-        container.seek(tick, stream=stream, backward=True)
-        for frame in container.decode(stream):
-            yield frame.pts, frame
+        key = next((one for one in self._packets[number::-1] if one.key), None)
+        if key and len(numbers) == len(self._packets):
+            container.seek(key.pts if key.dts is None else key.dts, stream=stream, backward=True)
+        else:
+            numbers = {}
+        name = _FILTERS.get(self._codec)
+        bytestream = self._av.bitstream.BitStreamFilterContext(name, stream) if name else None
+        found = (one for one in container.demux(stream) if one.size)
+        for count, packet in enumerate(found):
+            at = numbers.get(packet.pos, -1) if numbers else count
+            for one in bytestream.filter(packet) if bytestream else (packet,):
+                yield at, bytes(one)
+
+    def _decoder(self) -> Any:
+        stream = self._stream(self._opened())
+        known = stream.codec_context
+        if self._codec not in NAMES:
+            return careful(known)
+        decoder = new_decoder(self._codec, str(self._path), self._note)
+        decoder.color_range = known.color_range
+        if self._codec not in _FILTERS:
+            decoder.extradata = known.extradata
+        return decoder
+
+    def _first_turn(self) -> int:
+        """The turn that the container names, in degrees counterclockwise."""
+        with self._opened() as container, suppress(self._av.error.FFmpegError):
+            stream = self._stream(container)
+            stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+            for frame in container.decode(stream):
+                return round(frame.rotation)
+        return 0
+
+    def _decoded_order(self) -> list[int]:
+        """Numbers of the packets as their frames come out, those without a frame before the next key frame."""
+        decoder, found = self._decoder(), list[int]()
+        decoder.options = {"max_pixels": str(MAX_PIXELS)}
+        for number in [*range(len(self._packets)), None]:
+            packet = None if number is None else padded(self._packet(number))
+            if packet is not None:
+                packet.pts = packet.dts = number
+            with suppress(self._av.error.FFmpegError):
+                found += [frame.pts for frame in decoder.decode(packet)]
+        lost = [number for number in range(len(self._packets)) if number not in {*found}]
+        order = list[int]()
+        for number in found:
+            while lost and self._packets[number].key and lost[0] < number:
+                order.append(lost.pop(0))
+            order.append(number)
+        return [*order, *lost]
 
     def _opened(self) -> Any:
         try:
@@ -116,11 +206,3 @@ class VideoFrames:
         if not container.streams.video:
             raise LogError(f"{self._path} has no video stream. Give a file with pictures.")
         return container.streams.video[0]
-
-
-def _av(path: Path) -> Any:
-    try:
-        import av
-    except ImportError:
-        raise LogError(f"{path} is a video, and PyAV is not installed. Install vplog[video].") from None
-    return av

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 Octets = bytes | memoryview
 """Bytes of a message: its own where they are few, else a view of the chunk that holds them."""
 Place = tuple[int, ...]
-"""Where a message lies in its container; only the container that gave it out can read it."""
+"""Place of a message in its container; only the container that gave it out can read it."""
 
 
 class Channel(NamedTuple):

@@ -54,7 +54,7 @@ class Chunk:
     disputed: bool = False
     """Its own indexes and that of the bag count its messages differently."""
     damaged: bool = False
-    """Not all of it could be unpacked and read."""
+    """Some of it could not be unpacked and read."""
 
 
 @dataclass
@@ -67,7 +67,7 @@ class Layout:
     recorded: dict[int, int] = field(default_factory=dict)
     """Messages per channel id by the file's statistics or its whole index; else empty."""
     gaps: list[tuple[int, int]] = field(default_factory=list)
-    """Where damage may begin, and where reading goes on."""
+    """First byte that may be damaged, and the byte at which reading resumes."""
     cut_at: int | None = None
     """Byte behind which nothing can be read, where messages may have been."""
     appended_at: int | None = None

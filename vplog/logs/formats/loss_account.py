@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.errors import plural
+
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
@@ -241,7 +243,7 @@ class LossAccount:
         total = sum(known)
         what = "an unknown number of messages"
         if known:
-            what = "no message" if not total else f"{total} message{'s' * (total > 1)}"
+            what = "no message" if not total else plural(total, "message")
         if known and len(known) < len(group):
             what += " and more that cannot be counted,"
         named = [f"{loss.topic}{_count(loss)}" for loss in group if loss.topic]

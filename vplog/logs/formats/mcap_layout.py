@@ -1,4 +1,4 @@
-"""Where the chunks of an MCAP file lie (mcap.dev/spec): read record by record, over damage too.
+"""Layout of the chunks of an MCAP file (mcap.dev/spec): read record by record, over damage too.
 
 A record has its length twice, before its fields and by them: where the two differ, the one with a record behind it
 holds. Where neither has, reading goes on at the next chunk of the file's index, or the next bytes that can be a record.
@@ -47,7 +47,7 @@ _FARTHEST_NS = 10 * 365 * 86_400 * 10**9
 _PRIVATE = 0x80
 """Opcodes from here on are an application's own and stepped over, as the specification requires."""
 _BEGIN = re.compile(re.escape(MAGIC) + rb"\x01")
-"""How a recording begins: another one may be appended to the first."""
+"""Magic bytes of a recording: another one may be appended to the first."""
 _FILLED = re.compile(rb"[^\0]")
 """Anything but the zeros that a disk may leave behind the end."""
 _U32, _U64 = -4, -8

@@ -1,4 +1,4 @@
-"""Where the chunks of a ROS 1 bag lie (wiki.ros.org/Bags/Format/2.0): read record by record, over damage too.
+"""Layout of the chunks of a ROS 1 bag (wiki.ros.org/Bags/Format/2.0): read record by record, over damage too.
 
 A record holds where another lies behind it. Where none does, reading goes on at the next bytes that can be the head of
 a chunk, or of a record of an index.
@@ -42,7 +42,7 @@ _RECORD_START = re.compile(
 )
 """Length of a header below 256 bytes, and its first field, one of a chunk's or an index's."""
 _BEGIN = re.compile(re.escape(MAGIC))
-"""How a recording begins: another one may be appended to the first."""
+"""Magic bytes of a recording: another one may be appended to the first."""
 _HEAD = 256
 """Bytes in which the head of a record ends, but for a connection's of a long topic."""
 _MAX_CHUNK = 2**28

@@ -49,7 +49,7 @@ class Metadata:
     recorded: dict[str, int]
     """Messages by topic; empty where it does not say."""
     start_ns: int
-    """When the recording began; 0 where it does not say."""
+    """Start time of the recording; 0 where unknown."""
     end_ns: int
 
 

@@ -14,7 +14,7 @@ SENTENCES = ("GGA", "GNS", "RMC", "GLL")
 """Sentences with a position, the one with most of altitude, quality and dilution first; a receiver sends several
 for each fix."""
 _FIELDS = {"GGA": (2, 15), "GNS": (2, 13), "RMC": (3, 10), "GLL": (1, 7)}
-"""Where the latitude stands, and how many fields there are at least."""
+"""Index of the latitude, and the least number of fields."""
 _SIGMA_M = {"1": 3.0, "2": 1.0, "4": 0.02, "5": 0.5}
 """m at a dilution of 1, by the quality of GGA: alone, differential, RTK with whole wavelengths, RTK without; multiplied
 by the dilution, as ROS's nmea_navsat_driver has it."""

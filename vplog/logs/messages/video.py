@@ -1,4 +1,4 @@
-"""Video in messages: H.264, H.265, VP9 and AV1, one frame a message, decoded from the key frame before it.
+"""Video in packets, as messages hold H.264, H.265, VP9 and AV1, each frame decoded from the key frame before it.
 
 Decoding runs forward only: for frames in order of time every packet is decoded at most once, and stretches between key
 frames without a frame of interest not at all. Behind a damaged or missing packet nothing is decoded up to the next key
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ from vplog.logs.messages.h264 import FrameNumbers
 from vplog.logs.messages.records import BadMessageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from av import VideoFrame
 
@@ -34,14 +34,16 @@ _CODECS = {
     "av1": ("av1", "AV1"),
 }
 """By a part of a format's first word (`h264`, `libx264`, `hevc_nvenc`): FFmpeg's codec, and its usual name."""
-_NAMES = dict(_CODECS.values())
-_DECODERS = {"av1": "libdav1d", "vp9": "libvpx-vp9"}
-"""FFmpeg's decoder where that of the codec's own name does not do: its `av1` is for graphics cards alone, and its `vp9`
-shows a wrong picture behind a damaged or missing packet."""
+NAMES = {**dict(_CODECS.values()), "vp8": "VP8"}
+"""Usual names of the codecs that have a decoder here."""
+_DECODERS = {"av1": ("libdav1d",), "vp9": ("libvpx-vp9", "vp9"), "vp8": ("libvpx", "vp8")}
+"""FFmpeg's decoders, the best first, where that of the codec's own name is not: its `av1` is for graphics cards alone,
+and its `vp9` and `vp8` show a wrong picture behind a damaged or missing packet."""
 MAX_PIXELS = 2**25
 """px of a video frame that is decoded: 8K (7680 x 4320); a decoder keeps up to 16 of them."""
 _DELAY = 64
 """Packets behind a frame that are given to the decoder before the frame counts as lost: H.264 and H.265 reorder 16."""
+_PADDING = 64
 _BROKEN = "a video packet between its key frame and it is damaged or missing"
 _START_CODE = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 _SEI, _RECOVERY_POINT = 6, 6
@@ -56,7 +58,7 @@ which FFmpeg takes for an error."""
 _DELIMITER, _SEQUENCE_HEADER = b"\x12\x00", 1
 """The unit (OBU) that an AV1 packet may begin with, and the type of the one behind it at a key frame: AV1 bitstream
 5.3."""
-_UNREAD, _PLAIN, _PARAMETERS, _KEY, _WHOLE_KEY = range(5)
+_UNREAD, PLAIN, _PARAMETERS, _KEY, WHOLE_KEY = range(5)
 """Kinds of packets: not read; needs those before it; parameter sets alone; a key frame without, or with them."""
 
 
@@ -67,29 +69,33 @@ def codec_of(encoding: str) -> str:
 
 
 class VideoStream:
-    """The frames of one topic, by their row in the order of the file."""
+    """The frames of one topic or file, by their row: the number of their packet, or their place as they are shown."""
 
-    def __init__(self, codec: str, topic: str, packet: Callable[[int], bytes | None], count: int) -> None:
-        """`packet` gives the payload of a row, empty where its message is damaged, None where it is the one before it
-        once more."""
-        self._codec, self._topic, self._packet, self._count = codec, topic, packet, count
-        self._kinds = bytearray(count)
-        self._av: Any = None
+    def __init__(
+        self, codec: str, packet: Callable[[int], bytes | None], count: int, decoder: Callable[[], Any],
+        rows: Sequence[int] = (), kinds: bytes = b"",
+    ) -> None:  # fmt: skip
+        """`packet` gives a payload by its number, empty where it is damaged, None where it is the one before it once
+        more; `decoder` a new decoder. `rows` and `kinds` of the packets are given where they are known."""
+        self._codec, self._packet, self._count, self._new_decoder = codec, packet, count, decoder
+        self._kinds = bytearray(kinds or count)
+        self._rows = rows or range(count)
+        self._number = {row: number for number, row in enumerate(rows)} if rows else range(count)
         self._decoder: Any = None
         self._numbers: FrameNumbers | None = None
         self._last = 0
         """The last row given out: frames behind it that came out since are ready."""
         self._next = 0
-        """The first row that the decoder has not been given."""
+        """The first packet that the decoder has not been given."""
         self._settled = 0
-        """The first row whose errors are damage."""
+        """The first packet whose errors are damage."""
         self._damaged = -1
-        """The last row that did not decode: none decodes from there to the next key frame."""
+        """The last packet that did not decode: none decodes from there to the next key frame."""
         self._ready: dict[int, VideoFrame] = {}
 
     def first_key(self) -> int | None:
-        """The first row from which decoding can start; None where there is none."""
-        return next((row for row in range(self._count) if self._kind(row) >= _KEY), None)
+        """The first packet from which decoding can start; None where there is none."""
+        return next((number for number in range(self._count) if self._kind(number) >= _KEY), None)
 
     def frame(self, row: int) -> VideoFrame:
         """Rows are best read in increasing order. Raises BadMessageError where it cannot be decoded, and LogError where
@@ -104,25 +110,25 @@ class VideoStream:
 
     def _advance(self, row: int) -> None:
         """Give the decoder packets until the frame of this row comes out."""
-        running = self._decoder is not None and self._last <= row
-        key = self._key_before(row, self._next + 1 if running else 0)  # at a key frame that is next, it runs on
+        number, running = self._number[row], self._decoder is not None and self._last <= row
+        key = self._key_before(number, self._next + 1 if running else 0)  # at a key frame that is next, it runs on
         if key is None and not running:
             raise BadMessageError("no key frame comes before it")
         if key is not None:
-            if key <= self._damaged <= row:
+            if key <= self._damaged <= number:
                 raise BadMessageError(_BROKEN)
             self._restart(key)
         self._run(row)
-        if row not in self._ready and key and self._codec in ("h264", "hevc"):
+        if row not in self._ready and key and self._codec not in _DECODERS:
             # pictures behind a key frame that are shown before it may refer to what comes before it (RASL, H.265
-            # 3.114), and so may those of a gradual refresh
+            # 3.114; B-frames of MPEG-4), and so may those of a gradual refresh
             earlier = self._key_before(key - 1, 0)
-            if earlier is not None and not earlier <= self._damaged <= row:
+            if earlier is not None and not earlier <= self._damaged <= number:
                 self._restart(earlier)
                 self._run(row)
 
     def _run(self, row: int) -> None:
-        while row not in self._ready and self._next < min(self._count, row + _DELAY):
+        while row not in self._ready and self._next < min(self._count, self._number[row] + _DELAY):
             self._feed(self._next, row)
             self._next += 1
         if row not in self._ready and self._next == self._count:
@@ -130,25 +136,13 @@ class VideoStream:
             self._decoder = None
 
     def _restart(self, key: int) -> None:
-        self._av = _av(self._codec, self._topic)
-        name = _DECODERS.get(self._codec, self._codec)
-        try:
-            self._decoder = self._av.CodecContext.create(name, "r")
-        except ValueError:  # PyAV's UnknownCodecError
-            raise LogError(
-                f"{self._topic} is {_NAMES[self._codec]} video, and the FFmpeg of this PyAV lacks its decoder, {name}. "
-                "Install PyAV's own wheel (pip install --force-reinstall av), or choose another topic with "
-                "--image-topic."
-            ) from None
-        # a wrong picture is no picture
-        self._decoder.options = {"err_detect": "explode", "max_pixels": str(MAX_PIXELS)}
-        self._decoder.thread_count = 1  # with more, what damage does is a matter of chance
+        self._decoder = self._new_decoder()
         self._next = self._settled = key
         self._numbers = FrameNumbers() if self._codec == "h264" else None
         if self._numbers and not _IDR.search(self._packet(key) or b""):
             self._settled += _REFERENCES
         if self._kind(key) == _KEY:  # its parameter sets came in a packet of their own
-            before = (r for r in range(key - 1, -1, -1) if self._kind(r) in (_PARAMETERS, _WHOLE_KEY))
+            before = (r for r in range(key - 1, -1, -1) if self._kind(r) in (_PARAMETERS, WHOLE_KEY))
             if (row := next(before, None)) is not None:
                 self._feed(row, key)
 
@@ -159,50 +153,55 @@ class VideoStream:
         follows = self._numbers is None or self._numbers.follows(data)
         if not data or not follows:  # FFmpeg takes an empty packet for the end
             return self._fail(number, row)
-        packet = self._av.Packet(data)
-        packet.pts = packet.dts = number
+        packet = padded(data)
+        packet.pts, packet.dts = self._rows[number], number
         return self._decode(packet, number, row)
 
     def _decode(self, packet: Any, number: int, row: int) -> None:
         """Decode one packet, None at the end; what comes out from this row on is ready."""
+        from av.error import FFmpegError
+
         try:
             for frame in self._decoder.decode(packet):
                 if frame.is_corrupt:
                     return self._fail(number, row)
                 if frame.pts is not None and frame.pts >= row:
                     self._ready[frame.pts] = frame
-        except self._av.error.FFmpegError:
+        except FFmpegError:
             if number >= self._settled:
                 return self._fail(number, row)
         return None
 
     def _fail(self, number: int, row: int) -> None:
         """Give the decoder up at this packet, with what it held back of those before."""
+        from av.error import FFmpegError
+
         decoder, self._decoder, self._damaged = self._decoder, None, number
-        with suppress(self._av.error.FFmpegError):  # it held nothing
+        with suppress(FFmpegError):  # it held nothing
             for frame in decoder.decode(None) if decoder is not None else ():
-                if frame.pts is not None and row <= frame.pts < number and not frame.is_corrupt:
+                broken = frame.is_corrupt or (number < self._count and frame.pts == self._rows[number])
+                if frame.pts is not None and frame.pts >= row and not broken:
                     self._ready[frame.pts] = frame
         if row not in self._ready:
             raise BadMessageError(_BROKEN)
 
-    def _key_before(self, row: int, first: int) -> int | None:
-        """The last key frame of rows first..row."""
-        return next((r for r in range(row, first - 1, -1) if self._kind(r) >= _KEY), None)
+    def _key_before(self, number: int, first: int) -> int | None:
+        """The last key frame of the packets first..number."""
+        return next((n for n in range(number, first - 1, -1) if self._kind(n) >= _KEY), None)
 
-    def _kind(self, row: int) -> int:
-        if self._kinds[row] == _UNREAD:
-            self._kinds[row] = packet_kind(self._codec, self._packet(row) or b"")
-        return self._kinds[row]
+    def _kind(self, number: int) -> int:
+        if self._kinds[number] == _UNREAD:
+            self._kinds[number] = packet_kind(self._codec, self._packet(number) or b"")
+        return self._kinds[number]
 
 
 def packet_kind(codec: str, data: bytes) -> int:
     """Whether decoding can start at a packet: by its first unit that holds a picture."""
     if codec == "vp9":  # uncompressed header, VP9 bitstream 6.2: marker 10, profile, show_existing_frame, frame_type
-        return _WHOLE_KEY if data and data[0] >> 6 == 2 and not data[0] & 0b1100 else _PLAIN
+        return WHOLE_KEY if data and data[0] >> 6 == 2 and not data[0] & 0b1100 else PLAIN
     if codec == "av1":  # a sequence header comes with every key frame, behind the delimiter: AV1 bitstream 7.5
         first = data.removeprefix(_DELIMITER)[:1]
-        return _WHOLE_KEY if first and first[0] >> 3 & 0xF == _SEQUENCE_HEADER else _PLAIN
+        return WHOLE_KEY if first and first[0] >> 3 & 0xF == _SEQUENCE_HEADER else PLAIN
     parameters = recovery = False
     for unit in _START_CODE.finditer(data):
         header = unit[1][0]
@@ -213,8 +212,8 @@ def packet_kind(codec: str, data: bytes) -> int:
             parameters = True
         if (1 <= kind <= 5) if codec == "h264" else kind <= 31:  # a slice
             key = (kind == 5 or recovery) if codec == "h264" else 16 <= kind <= 21  # IDR; BLA, IDR, CRA
-            return (_WHOLE_KEY if parameters else _KEY) if key else _PLAIN
-    return _PARAMETERS if parameters else _PLAIN
+            return (WHOLE_KEY if parameters else _KEY) if key else PLAIN
+    return _PARAMETERS if parameters else PLAIN
 
 
 def _payload_types(data: bytes) -> set[int]:
@@ -256,13 +255,48 @@ def rgb(frame: Any) -> Bytes:
     return frame.to_ndarray(format="rgb24")
 
 
-def _av(codec: str, topic: str) -> Any:
+def new_decoder(codec: str, subject: str, note: Callable[[str], object], advice: str = "") -> Any:
+    """A decoder of PyAV, an extra, that shows no wrong picture where it can. `note` takes what it cannot. Raises
+    LogError where PyAV or the codec's decoder is not there; `subject` is what holds the video."""
+    av = pyav(f"{subject} is {NAMES[codec]} video", advice)
+    best, *others = _DECODERS.get(codec, (codec,))
+    for name in (best, *others):
+        with suppress(ValueError):  # PyAV's UnknownCodecError
+            decoder = av.CodecContext.create(name, "r")
+            if name != best:
+                note(
+                    f"The FFmpeg of this PyAV lacks {best}: {subject}, {NAMES[codec]} video, may show a wrong picture "
+                    "behind a damaged or missing packet. Install PyAV's own wheel (pip install --force-reinstall av)."
+                )
+            return careful(decoder)
+    raise LogError(
+        f"{subject} is {NAMES[codec]} video, and the FFmpeg of this PyAV lacks its decoder, {best}. Install PyAV's own "
+        f"wheel (pip install --force-reinstall av){advice}."
+    )
+
+
+def padded(data: bytes) -> Any:
+    """A packet and the zeros that decoders read behind it (FFmpeg's AV_INPUT_BUFFER_PADDING_SIZE), where PyAV has what
+    happens to lie there."""
+    import av
+
+    return cast("Any", av.Packet)(memoryview(data + bytes(_PADDING))[: len(data)])
+
+
+def careful(decoder: Any) -> Any:
+    """The decoder, set to fail where it would show a wrong picture."""
+    decoder.options = {"err_detect": "explode", "max_pixels": str(MAX_PIXELS)}
+    decoder.thread_count = 1  # with more, what damage does is a matter of chance
+    return decoder
+
+
+def pyav(subject: str, advice: str = "") -> Any:
     """PyAV, an extra. Raises LogError where it is not installed."""
     try:
         import av
     except ImportError:
         raise LogError(
-            f"{topic} is {_NAMES[codec]} video, and PyAV, which decodes it, is not installed. Install vplog[video] "
-            "(pip install 'vplog[video]'), or choose another topic with --image-topic."
+            f"{subject}, and PyAV, which decodes it, is not installed. Install vplog[video] "
+            f"(pip install 'vplog[video]'){advice}."
         ) from None
     return av

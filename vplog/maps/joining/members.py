@@ -47,7 +47,7 @@ class Member:
 
     drive: str
     keyframes: Path
-    """Their table."""
+    """Table of its keyframes."""
     cache: Path
     """Stage cache of its run, with its features while it is new."""
     features: Path

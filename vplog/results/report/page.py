@@ -79,7 +79,7 @@ class Tracks:
     found: McapContent
     """Pictures, references and fixes in result.mcap."""
     earth: Earth | None
-    """Where the trajectory is on earth, None without satellite fixes."""
+    """Pose of the trajectory on earth, None without satellite fixes."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -159,9 +159,9 @@ def _panels(
         name = f"reference {found.reference}"
         panels.append(ReferencePanel(found.image, f"{name}: boxes of both", found.query_boxes, found.match_boxes, None))
         if len(panels) <= _VOTED:
-            for who, one in zip(("query", "match"), features, strict=True):
+            for side, one in zip(("query", "match"), features, strict=True):
                 votes = state.voting_map(one, found.reference)
-                panels.append(ReferencePanel(found.image, f"votes of the {who}", none, none, votes))
+                panels.append(ReferencePanel(found.image, f"votes of the {side}", none, none, votes))
     return panels
 
 
