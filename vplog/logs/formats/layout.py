@@ -154,7 +154,7 @@ class ChunkLosses:
     def add_chunk(self, chunk: Chunk, found: Mapping[int, int], spans: list[Span], what: str) -> None:
         """What a damaged chunk lacks but for the messages found, by channel id; `what` ends the sentence about it."""
         short = Counter(chunk.counts)
-        short.subtract(found)
+        short.subtract({i: n for i, n in found.items() if i in self.channels or i in short})
         if min(short.values(), default=0) < 0:  # damage gave messages the number of another channel
             short = {_NO_CHANNEL: short.total()}
         lost = topics_of(short, self.channels) if chunk.counts else None

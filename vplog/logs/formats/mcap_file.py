@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import struct
 from collections import Counter
+from functools import partial
 from typing import TYPE_CHECKING
 
 from mcap import records
@@ -18,7 +19,7 @@ from vplog.logs.formats.container import Channel, Contents, Notes
 from vplog.logs.formats.layout import ChunkLosses
 from vplog.logs.formats.loss_account import sampled
 from vplog.logs.formats.mcap_chunk import ChunkReader
-from vplog.logs.formats.mcap_layout import MAGIC, RECORD, read_layout
+from vplog.logs.formats.mcap_layout import MAGIC, read_layout
 from vplog.storage.remote_path import RemotePath
 
 if TYPE_CHECKING:
@@ -171,13 +172,8 @@ class McapFile:
 
     def _add_damaged_chunk(self, number: int, error: BadChunkError) -> None:
         """Account for a damaged chunk, and take its schemas and channels, which other chunks need."""
-        data, at = error.data, 0
-        while at + RECORD.size <= len(data):
-            opcode, length = RECORD.unpack_from(data, at)
-            at += RECORD.size
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and at + length <= len(data):
-                self._define(opcode, data[at : at + length], doubtful=True)
-            at += length
+        define = partial(self._define, doubtful=True)
+        ChunkReader(number, len(error.data), self._channels, define, None).whole(error.data)
         self._unread[number] = f", left out: {error}"
         self._add_unread(number)
 

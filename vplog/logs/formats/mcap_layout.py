@@ -194,7 +194,7 @@ class _LayoutReader:
             if agrees:
                 return kind, stop
         by_fields = start + (self._length_by_fields(opcode, start) or 0)
-        ends = sorted({stop, by_fields, self._entries_stop(start) if opcode == _MESSAGE_INDEX else stop})
+        ends = sorted({stop, by_fields})
         for end in ends:
             if ((opcode in _SHAPES and end > start) or end == stop) and self._is_record(end, behind=opcode):
                 return opcode, end
@@ -204,15 +204,6 @@ class _LayoutReader:
         if (0 < by_fields < stop or opcode >= _PRIVATE) and self._is_record(stop, behind=opcode, longer=True):
             return opcode, stop  # with fields of a later version, which are ignored
         return (opcode, stop) if opcode >= _PRIVATE and stop <= self._length else (0, 0)
-
-    def _entries_stop(self, start: int) -> int:
-        """Where the entries of a message index stop, by their times, which are those of its chunk."""
-        chunk, at = self._indexing, start + 6
-        while chunk and at + _ENTRY <= self._length:
-            if not chunk.first_ns <= int.from_bytes(self.at(at, 8), "little") <= chunk.last_ns:
-                break
-            at += _ENTRY
-        return at
 
     def _length_by_fields(self, opcode: int, start: int) -> int | None:
         """Bytes of a record whose fields begin at `start`, by the lengths among them."""
@@ -367,14 +358,10 @@ class _LayoutReader:
 
     def _is_chunk(self, position: int, length: int) -> bool:
         """Whether the lengths that the head of a chunk holds agree: with that of the record, and with each other."""
-        head = self.at(position + RECORD.size, _CHUNK_HEAD.size + 4 + 8)
-        if len(head) < _CHUNK_HEAD.size:
-            return False
-        name_length = _CHUNK_HEAD.unpack_from(head)[4]
-        start = _CHUNK_HEAD.size + name_length
-        if name_length > 4 or len(head) < start + 8 or head[_CHUNK_HEAD.size : start].decode("latin-1") not in KINDS:
-            return False
-        return struct.unpack_from("<Q", head, start)[0] + start + 8 == length
+        start = position + RECORD.size
+        size, name = struct.unpack("<I4s", self.at(start + _CHUNK_HEAD.size - 4, 8).ljust(8, b"\xff"))
+        known = size <= len(name) and name[:size].decode("latin-1") in KINDS
+        return known and self._length_by_fields(Opcode.CHUNK, start) == length
 
     def _is_message_head(self, position: int, opcode: int = Opcode.MESSAGE) -> bool:
         """Whether a message of a time near those found begins here, whatever its length."""
