@@ -96,7 +96,7 @@ def test_what_is_not_one_drive_is_refused(tmp_path: Path) -> None:
     assert "24.0 hours lie between" in refusal(a, b, next_day)
     other = KINDS["ros1"](tmp_path, 5, SECOND)
     assert "are not one drive" in refusal(a, other)
-    assert "no file" in refusal(a, tmp_path / "missing.mcap")
+    assert "no such file" in refusal(a, tmp_path / "missing.mcap")
     assert "is a folder; give it by itself" in refusal(a, b.parent)
     longer = [
         (t, k, e, at, d) for at in (0, 10**10) for t, k, e, _, d in [("/odom", "nav_msgs/msg/Odometry", "cdr", 0, b"")]

@@ -134,9 +134,9 @@ def test_a_drive_with_features_of_a_network(drive: Drive, network: Path, tmp_pat
 @pytest.mark.parametrize(
     ("yaml", "message"),
     [
-        ("points: descriptors\n", "output descriptors has 32 x 300 values of float32.* no points"),
-        ("descriptors: scores\n", "output scores has 300 values .* no descriptors"),
-        ("scores: keypoints\n", "output keypoints has 300 x 2 .* no scores"),
+        ("points: descriptors\n", "output descriptors has 32 x 300 values of float32.* for points"),
+        ("descriptors: scores\n", "output scores has 300 values .* for descriptors"),
+        ("scores: keypoints\n", "output keypoints has 300 x 2 .* for scores"),
         ("points: nowhere\n", "output nowhere is not there. There are: keypoints, scores, descriptors"),
         ("diameter_px: 0\n", "diameter_px must be a number"),
         ("colour: rgb\nmean: [0, 0, 0]\nstd: [1, 1, 1]\n", "cannot be run on an image"),

@@ -61,7 +61,7 @@ def _fast(case: Case) -> tuple[np.ndarray, Int32s, Int32s]:
     posting = np.array([f for each in owners for f in each], np.int32)
     patches = rvp.patches_of(case.points, case.cuts[0], case.cuts[1])
     count = (case.cuts[0].shape[1] - 1) * (case.cuts[1].shape[1] - 1)
-    totals = rvp.patch_totals(patches, np.array([len(each) for each in case.picture.words], np.int32), count)
+    totals = rvp.patch_totals(patches, np.array([len(each) for each in case.picture.words]), count)
     grid_x, grid_y = rvp.grid_cuts(case.picture.width, case.grid), rvp.grid_cuts(case.picture.height, case.grid)
     H = np.array([case.H[word] for word in words], np.int32)
     listed = np.array(words, np.int32), start, posting
