@@ -34,6 +34,7 @@ from vplog.logs import TopicChoice
 from vplog.maps.storage import map_store
 from vplog.maps.storage.layout import drive_names
 from vplog.pipeline import load_pipeline
+from vplog.results.run_record import read_run_json
 from vplog.run.reference_library import build_library
 
 if TYPE_CHECKING:
@@ -131,7 +132,7 @@ def test_a_map_grows_by_its_new_drives_alone(
         name for name in after if "drive=drive-2/" in name
     }
     assert set(before) <= set(after)
-    failures = json.loads((root / "failures.json").read_text())
+    failures = read_run_json(root / "failures.json")
     assert list(failures) == ["bad", "gone"]
     assert "which no log does" in failures["bad"]["error"]
 
@@ -165,7 +166,7 @@ def test_what_is_missing_or_changed_is_done_again(
     }.keys()
     monkeypatch.undo()
     assert run_batch(logs, whole, pipeline)["failed"] == 0
-    assert json.loads((whole / "failures.json").read_text()) == {}
+    assert read_run_json(whole / "failures.json") == {}
 
 
 @pytest.mark.parametrize("damage", ["flip", "gone", "record", "report"])
@@ -420,7 +421,7 @@ def test_a_join_that_fails_takes_no_fates_along(
     assert said.code == 1
     assert "bad: failed, 0.0 s: " in said.err
     assert "1 of 3 drives failed" in said.err
-    assert list(json.loads((root / "failures.json").read_text())) == ["bad"]
+    assert list(read_run_json(root / "failures.json")) == ["bad"]
     monkeypatch.setattr("vplog.maps.storage.layout.code_hash", lambda: "other code")
     found = run_batch([bad], root, load_pipeline("default", QUICK), options=BatchOptions(join=False))
     assert "Another version of vplog or its packages made 2 of the drives" in found["warnings"][0]
@@ -438,7 +439,7 @@ def test_what_was_found_stays_known_after_ctrl_c(
     monkeypatch.setattr(batch, "as_completed", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run_batch([bad, *logs], root, load_pipeline("default", QUICK))
-    assert list(json.loads((root / "failures.json").read_text())) == ["bad"]
+    assert list(read_run_json(root / "failures.json")) == ["bad"]
 
 
 def test_one_odometry_file_is_of_one_drive(logs: list[Path], tmp_path: Path, verb: Callable[..., Said]) -> None:
@@ -461,7 +462,7 @@ def test_the_exit_status_is_that_of_the_batch(
     assert (done.returncode, "Exception ignored" in done.stderr) == (code, False), done.stderr
     assert "Internal error" not in done.stderr
     failures = Path(root, "failures.json")
-    assert bool(failures.exists() and json.loads(failures.read_text())) == bad
+    assert bool(failures.exists() and read_run_json(failures)) == bad
 
 
 def test_a_drive_is_called_as_its_folder_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -609,7 +609,7 @@ def test_answers_of_a_file_stand_beside_the_methods(traversals: tuple[Path, Path
         ("query,match\n1,16\n", r":2: '16' is no frame of dusk, which has 16"),
         ("query,match\n-1,2\n", r"'-1' is no frame of day"),
         ("query,match\nx.png,2\n", r"'x.png' is no frame of day"),
-        ("query,match,score\n1,1,nan\n", r"'nan' is no score"),
+        ("query,match,score\n1,1,nan\n", r"'nan' is not a score"),
         ("query,match\n" + "1" * 5000, "longer than 4096"),
         ("query,match\n\xff", "not a CSV file"),
     ],

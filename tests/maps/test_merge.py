@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import shutil
 import signal
@@ -251,6 +250,6 @@ def test_removing_is_as_removing_the_folders(verb: Verb, tmp_path: Path) -> None
             shutil.rmtree(folder, ignore_errors=True)
     names = {path.relative_to(a) for path in a.rglob("*")}
     assert names == {path.relative_to(b) for path in b.rglob("*")}
-    assert json.loads((a / "failures.json").read_text()) == {}
+    assert run_record.read_run_json(a / "failures.json") == {}
     assert "Drives: two" in verb("map", "remove", a, "two", "none").error
     assert list(map_store.Store(a).drives()) == ["two"], "all or nothing"

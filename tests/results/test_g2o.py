@@ -169,7 +169,7 @@ def test_consecutive_ids_are_odometry_once(tmp_path: Path) -> None:
         ("EDGE_SE2 0 1 1e30 0 0 1 0 0 1 0 1\n", r"line 1: 1e\+30 m"),
         ("VERTEX_SE2 4 0 0 0\nVERTEX_SE2 4 1 0 0\nEDGE_SE2 4 5 1 0 0 1 0 0 1 0 1\n", "line 2: vertex 4 .* line 1"),
         ("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nFIX 8\n", "line 2: FIX 8"),
-        ("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n\x89PNG\x00\x00\n", "line 2: .*is no g2o element"),
+        ("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n\x89PNG\x00\x00\n", "line 2: .*is not a g2o element"),
         (SPATIAL + "VERTEX_SE2 2 0 0 0\n", "line 4: VERTEX_SE2 in a graph that has EDGE_SE3"),
         (SPATIAL.replace("0.6 0.8", "0.6 0.1"), "line 3: the quaternion has length 0.608"),
     ],

@@ -167,8 +167,8 @@ def _library_in(out: Path, opened: Sequence[Log] | None) -> list[str]:
     names = ["library.json", "features.parquet", "references.parquet"]
     if out.absolute().name == "library" and (out.absolute().parent / "run.json").is_file():
         raise SettingsError(f"{out} is the library of the run in {out.absolute().parent}. Choose another with -o.")
-    check_contents(out, "a library", all((out / name).is_file() for name in names))
     check_regular(out, "library.json")
+    check_contents(out, "a library", all((out / name).is_file() for name in names))
     if opened is not None and (out / "library.json").is_file():
         _check_same_logs(out, opened)
     return names

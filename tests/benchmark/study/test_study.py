@@ -258,7 +258,7 @@ def test_what_cannot_be_studied_is_said_in_one_line(
 ) -> None:
     folders = {"DAY": traversals[0], "DUSK": traversals[1], "OTHER": tmp_path / "other"}
     folders["OTHER"].mkdir()
-    (folders["OTHER"] / "study.json").write_text('{"drives": [{"log": "/other.mcap", "hash": "0"}]}')
+    (folders["OTHER"] / "study.json").write_text('{"vplog": "0.1.0", "drives": [{"log": "/other.mcap", "hash": "0"}]}')
     named = [folders.get(argument, argument) for argument in arguments]
     assert said in verb("study", "--truth", "index", "-o", tmp_path / "out", *QUICK, *named).error
 

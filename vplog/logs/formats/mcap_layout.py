@@ -141,7 +141,9 @@ class _LayoutReader:
     def finish(self) -> None:
         """Hold the chunks that were found against those that the index at the end lists."""
         if not self._chunked:
-            self.layout.unknown_at = next((at for at, opcode in self._unfit if self._is_message_head(at, opcode)), None)
+            timed = any(chunk.last_ns > _FARTHEST_NS for chunk in self.layout.chunks)  # else any field may be a time
+            unfit = (one for one in self._unfit if timed or one[1] not in _SHAPES)
+            self.layout.unknown_at = next((at for at, opcode in unfit if self._is_message_head(at, opcode)), None)
         found = {chunk.record: chunk for chunk in self.layout.chunks if chunk.compression is not None}
         for offset, (listed, indexes) in sorted(self._indexed.items()):
             if (chunk := found.get(offset)) is not None:
