@@ -51,7 +51,7 @@ class _Packet(NamedTuple):
     """Byte of the file."""
     key: bool
     discarded: bool
-    """It is decoded for others, and not shown."""
+    """Decoded as a reference of other frames, and not shown."""
 
 
 def is_video(path: Path) -> bool:
@@ -96,7 +96,7 @@ class VideoFrames:
         self._at, self._data = -1, b""
         """The last packet that was read, and its number."""
         self._running: Iterator[tuple[int, bytes]] | None = None
-        """Those behind it."""
+        """Packets behind the last one that was read, with their numbers."""
         times = [one.dts if slots else one.pts for one in packets]
         shown = [time for time, one in zip(times, packets, strict=True) if time is not None and not one.discarded]
         self._ticks = np.unique(np.array(shown, np.int64))

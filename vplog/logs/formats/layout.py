@@ -152,7 +152,7 @@ class ChunkLosses:
         return bool(layout.chunks[number].counts) and (bool(layout.recorded) or number + 1 < len(layout.chunks))
 
     def add_chunk(self, chunk: Chunk, found: Mapping[int, int], spans: list[Span], what: str) -> None:
-        """What a damaged chunk lacks but for the messages found, by channel id; `what` ends the sentence about it."""
+        """Messages lost in a damaged chunk: all but those found, by channel id; `what` ends the sentence about it."""
         short = Counter(chunk.counts)
         short.subtract({i: n for i, n in found.items() if i in self.channels or i in short})
         if min(short.values(), default=0) < 0:  # damage gave messages the number of another channel
