@@ -576,3 +576,21 @@ def test_a_log_begins_and_ends_with_times_that_another_confirms(name: str, tmp_p
         container, _ = open_container(path, Notes())
         contents = container.contents()
         assert abs(contents.start_ns - START_NS) < _FARTHEST_NS > abs(contents.end_ns - START_NS), at
+
+
+def test_a_channel_may_be_defined_chunks_before_its_first_message(tmp_path: Path) -> None:
+    """Of a file that repeats no channel in a summary, as a recorder that crashed leaves it."""
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=100, use_summary_offsets=False, index_types=IndexType.MESSAGE, **BARE)
+        writer.start("ros2", "test")
+        schema = writer.register_schema(KIND, "ros2msg", b"string data")
+        channels = [writer.register_channel(TOPICS[0], "cdr", schema)]
+        for number in range(12):
+            if number == 5:  # into a chunk of the first alone
+                channels.append(writer.register_channel(TOPICS[1], "cdr", schema))
+            writer.add_message(channels[number // 10], START_NS + number, bytes(40), START_NS + number)
+        writer.finish()
+    notes = Notes()
+    assert len(every_message(path, notes)) == 12
+    assert not notes.lines
