@@ -112,7 +112,7 @@ class _LayoutReader:
         while True:
             opcode, stop = self._bounds(position)
             if not opcode:
-                if data_ended:
+                if data_ended and self._search.first(_CHUNKS, position, self._is_record) is None:
                     self.layout.index_cut_at = min(position, self._length)
                     self.layout.appended_at = self._search.first(_BEGIN, position)
                     return

@@ -197,8 +197,7 @@ class _LayoutReader:
         found = {chunk.record: chunk for chunk in layout.chunks}
         skipped = {chunk.record: chunk for chunk in layout.missing}
         layout.missing, listed = [], len(self._infos) == self._chunk_count
-        others = (chunk for chunk in layout.chunks if chunk.record not in self._infos and not chunk.doubtful)
-        shifted = {(frozenset(chunk.counts.items()), chunk.last_ns) for chunk in others}  # by bytes inserted or lost
+        others = found.keys() - self._infos.keys()  # by bytes inserted or lost, or a damaged index
         for offset, info in sorted(self._infos.items()):
             if (chunk := found.get(offset)) is not None and not _is_another(chunk, info):
                 chunk.first_ns, chunk.last_ns = info.first_ns, info.last_ns
@@ -210,14 +209,13 @@ class _LayoutReader:
                 header, start, stop = self._head(offset)
                 self._record(_CHUNK, header or {}, offset, start, stop)
                 layout.chunks[-1].counts = info.counts
-            elif (frozenset(info.counts.items()), info.last_ns) in shifted:
-                listed = False
             elif gaps := [start for start, stop in layout.gaps if start <= offset < stop]:  # else the index is damaged
                 own = skipped.get(gaps[0])  # by the index records behind it, the last chunk in the gap
                 if own and own.counts and not own.doubtful:
                     del skipped[gaps[0]]
                     if own.counts != info.counts:
                         info.doubtful, self._index_sound = True, False
+                info.doubtful |= bool(others)  # then it may be one of these
                 layout.missing.append(info)
             else:
                 listed = False
