@@ -303,7 +303,17 @@ def test_a_bag_that_is_cut_between_two_records_is_cut(tmp_path: Path) -> None:
         assert [loss.reason for loss in notes.account.losses] == ["cut"], end
 
 
-SEVERAL = ("mcap-lz4", "mcap-zstd", "mcap-no-summary", "mcap-unchunked", "bag-none", "bag-bz2", "bag-lz4", "db3-folder")
+SEVERAL = (
+    "mcap-lz4",
+    "mcap-zstd",
+    "mcap-no-summary",
+    "mcap-unchunked",
+    "bag-none",
+    "bag-bz2",
+    "bag-lz4",
+    "db3",
+    "db3-folder",
+)
 """Formats of all kinds; in a chunk that is neither packed nor has a checksum, several damages can pass for messages."""
 
 

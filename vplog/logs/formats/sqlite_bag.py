@@ -180,7 +180,7 @@ class SqliteBag:
             yield found
 
     def _last_row(self) -> int:
-        """The highest number of a row, by the table or an index of it; where neither is sound, the most there can be."""
+        """The highest number of a row, by the table or its indexes; where none is sound, the most there can be."""
         try:
             found = self._db.execute("SELECT max(rowid) FROM messages").fetchone()[0]
         except _DAMAGE:
