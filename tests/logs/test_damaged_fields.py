@@ -113,6 +113,8 @@ class Format(NamedTuple):
     rows: bool = False
     """Rows of SQLite. They are looked up by halves, so that a damaged one may hide sound ones when they are counted;
     and without its first page, the list of tables, nothing is read."""
+    bag: bool = False
+    """A ROS 1 bag: where its index is damaged too, bytes that hold no record may have been a chunk."""
     folder: bool = False
     """With metadata.yaml beside it."""
 
@@ -145,12 +147,12 @@ FORMATS = {
     ),
     **{
         f"bag-{kind.lower() or 'none'}": Format(
-            lambda p, kind=kind: write_bag(p / "log.bag", kind), checked=kind == "BZ2"
+            lambda p, kind=kind: write_bag(p / "log.bag", kind), checked=kind == "BZ2", bag=True
         )
         for kind in ("", "BZ2", "LZ4")
     },
-    "bag-unindexed": Format(lambda p: unindexed(write_bag(p / "log.bag", "LZ4")), checked=False, cut=True),
-    "bag-none-unindexed": Format(lambda p: unindexed(write_bag(p / "log.bag", "")), checked=False, cut=True),
+    "bag-unindexed": Format(lambda p: unindexed(write_bag(p / "log.bag", "LZ4")), False, False, cut=True),
+    "bag-none-unindexed": Format(lambda p: unindexed(write_bag(p / "log.bag", "")), False, False, cut=True),
     "db3": Format(lambda p: write_db3(p / "log.db3"), counted=False, checked=False, rows=True),
     "db3-folder": Format(lambda p: write_db3(p / "log.db3"), checked=False, rows=True, folder=True),
 }
@@ -216,7 +218,8 @@ def compared(
     said = +said
     unknown = [loss.reason for loss in losses if loss.messages is None]
     state = f"missed {dict(missed)}, said {dict(said)} {unknown}, contents {dict(found)}: {notes.lines}"
-    if not missed and (said or unknown):
+    open_number = form.cut or (form.bag and not form.counted)
+    if not missed and (said or (unknown and not open_number)):
         return f"invented loss: {state}"
     if missed and not (said or unknown):
         return f"silent loss: {state}"
@@ -517,19 +520,6 @@ def test_where_nothing_is_left_the_times_are_those_of_most_chunks(tmp_path: Path
     spans = [span for loss in notes.account.losses for span in loss.spans_ns]
     assert spans
     assert all(abs(ns - START_NS) < _FARTHEST_NS for span in spans for ns in span)
-
-
-@pytest.mark.parametrize("name", ["bag-unindexed", "bag-none-unindexed"])
-def test_a_damaged_field_name_of_an_index_is_no_lost_chunk(name: str, tmp_path: Path) -> None:
-    """Of a bag that no index lists the chunks of: what was read is what the damaged index counts."""
-    path = FORMATS[name].write(tmp_path)
-    whole, problems = path.read_bytes(), []
-    for field in (field for field in FIELDS[".bag"](whole) if field.name == "op4.header_length"):
-        for at in range(field.offset + 4, field.offset + 51):
-            path.write_bytes(whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :])
-            if found := problem(path, WRITTEN, FORMATS[name]._replace(counted=False), content=False):
-                problems.append(f"{at - field.offset} of {field.offset}: {found}")
-    assert not problems, f"{len(problems)}\n" + "\n".join(problems)
 
 
 def test_a_message_that_became_another_record_is_no_silent_loss(tmp_path: Path) -> None:
