@@ -429,6 +429,19 @@ def test_chunks_that_are_gone_or_in_each_others_place_are_accounted_for(name: st
     assert not problems, "\n".join(problems)
 
 
+@pytest.mark.parametrize("name", ["mcap-lz4", "mcap-no-crc", "bag-lz4"])
+def test_what_is_gone_up_to_the_index_at_the_end_is_accounted_for(name: str, tmp_path: Path) -> None:
+    """From the index of a chunk on: the chunks that are still listed lie behind the end of the file."""
+    form = FORMATS[name]._replace(counted=False)
+    path = form.write(tmp_path)
+    whole = path.read_bytes()
+    kind = "op6.header_length" if path.suffix == ".bag" else "chunk_index.record_length"
+    ends = [field.offset for field in FIELDS[path.suffix](whole) if field.name == kind]
+    for start in chunk_starts(whole, path.suffix)[1:4]:
+        path.write_bytes(whole[: start - 30] + whole[ends[-2] + 20 :])
+        assert problem(path, WRITTEN, form, content=False) == ""
+
+
 @pytest.mark.parametrize("name", [*CHUNKED, "bag-unindexed", "bag-none-unindexed", "mcap-no-summary", "mcap-cut-off"])
 def test_bytes_that_are_zero_or_gone_or_new_are_accounted_for(name: str, tmp_path: Path) -> None:
     """Over the end of one chunk and the head of the next, up to all of two; nothing tells what two chunks held."""

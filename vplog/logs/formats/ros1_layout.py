@@ -79,7 +79,7 @@ class _LayoutReader:
         while position < self._length or position == len(MAGIC):
             header, start, stop = self._head(position)
             found, inside = None, header is not None and number(header, b"op") == _CHUNK
-            lost = False
+            lost = alone = False
             if (
                 header is None
                 or not self._is_sound(header)
@@ -98,11 +98,13 @@ class _LayoutReader:
                     self._skip(position, found)
                     position = found
                     continue
+                own = stop
                 stop, lost = self._stop(header, start, stop, found)
+                alone = inside and not _is_too_long(header, stop - start) and stop <= own
             if inside or not lost:
                 self._record(number(header, b"op"), header, position, start, stop)
             if lost:
-                self._skip(position, stop, known=inside and not _is_too_long(header, stop - start))
+                self._skip(position, stop, known=alone)
             position = stop
         if position > self._length or (self._index_at > self._length and not self._infos):
             self.layout.cut_at = self._length
