@@ -595,7 +595,7 @@ def test_a_channel_may_be_defined_chunks_before_its_first_message(tmp_path: Path
     """Of a file that repeats no channel in a summary, as a recorder that crashed leaves it."""
     path = tmp_path / "log.mcap"
     with path.open("wb") as file:
-        writer = Writer(file, chunk_size=100, use_summary_offsets=False, index_types=IndexType.MESSAGE, **BARE)
+        writer = Writer(file, chunk_size=100, use_summary_offsets=False, index_types=IndexType.MESSAGE, **BARE)  # type: ignore[arg-type]
         writer.start("ros2", "test")
         schema = writer.register_schema(KIND, "ros2msg", b"string data")
         channels = [writer.register_channel(TOPICS[0], "cdr", schema)]

@@ -253,8 +253,10 @@ class FixTrack:
             bad = left_out(gps)
             if bad.any():
                 notes.add(f"{self.topic}: {int(bad.sum())} of {len(bad)} fixes left out: {why}.")
-                columns = (gps.stamp_ns, gps.latitude_deg, gps.longitude_deg, gps.altitude_m, gps.covariance)
-                gps = Gps(*(column[~bad] for column in columns))
+                kept = ~bad
+                degrees = gps.latitude_deg[kept], gps.longitude_deg[kept]
+                gps = Gps(gps.stamp_ns[kept], *degrees, gps.altitude_m[kept], covariance[kept])
+                covariance = covariance[kept]
         return gps
 
 
