@@ -261,6 +261,21 @@ def test_a_clock_is_set_back_by_more_than_had_passed(seed: int, size_s: float) -
     assert not [line for line in said if "set" in line]
 
 
+@given(seeds, st.booleans())
+def test_a_clock_is_set_back_by_days_in_a_gap(seed: int, still: bool) -> None:
+    """No motion tells: parts of one drive in another order do not lie so far apart."""
+    rng = np.random.default_rng(seed)
+    true_ns, log_ns = topic(rng, 30, rng.uniform(10, 60))
+    kept = (true_ns < START_NS + 12 * SECOND) | (true_ns > START_NS + 15 * SECOND)
+    true_ns, log_ns = true_ns[kept], log_ns[kept]
+    steps = [(START_NS + 13 * SECOND, int(rng.uniform(2, 2000) * 3600) * SECOND)]
+    found = stamps(after(true_ns, true_ns, steps), after(log_ns, log_ns, steps))
+    found.xyz_m = true_ns[:, None] / SECOND * [0.0 if still else 1.0, 0.0, 0.0]
+    _, rows, said = ordered(found)
+    np.testing.assert_array_equal(rows[0], np.arange(len(true_ns)))
+    assert any("set back" in line for line in said)
+
+
 @settings(max_examples=10)
 @given(seeds, st.floats(0.3, 0.6))
 def test_small_steps_of_the_headers_are_mended(seed: int, size_s: float) -> None:

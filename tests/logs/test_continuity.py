@@ -96,6 +96,22 @@ def test_jumps_are_found_and_the_motion_continues(seed: int, times: int, resets:
 
 
 @given(seeds, st.integers(1, 2))
+def test_jumps_of_odometry_without_noise_are_found(seed: int, times: int) -> None:
+    """A simulator's, or interpolated: speed changes evenly, so that nearly no step deviates but the jumps."""
+    rng = np.random.default_rng(seed)
+    seconds = np.arange(0, 20, 1 / rng.uniform(8, 50))
+    knots = np.arange(0, 24, 3.0)
+    speed, turn = (np.interp(seconds, knots, rng.uniform(low, high, 8)) for low, high in ((0.5, 8), (-0.3, 0.3)))
+    yaw, period = np.cumsum(turn) * seconds[1], seconds[1]
+    place = np.cumsum(np.stack([speed * np.cos(yaw), speed * np.sin(yaw), 0 * yaw], 1), axis=0) * period
+    rows = np.sort(rng.choice(np.arange(10, len(seconds) - 10, 8), times, replace=False))
+    for row in rows.tolist():
+        place[row + 1 :] += rng.choice([-1, 1], 3) * rng.uniform(10, 40)
+    poses = matrices(place, Rotation.from_rotvec(np.outer(yaw, [0, 0, 1])))
+    assert find_jumps(START_NS + (seconds * 1e9).astype(np.int64), poses).tolist() == rows.tolist()
+
+
+@given(seeds, st.integers(1, 2))
 def test_stray_poses_are_left_out(seed: int, together: int) -> None:
     stamp_ns, true = drive(seed)
     rows = np.arange(20, len(true) - 20, 31)

@@ -113,6 +113,8 @@ class Format(NamedTuple):
     rows: bool = False
     """Rows of SQLite. They are looked up by halves, so that a damaged one may hide sound ones when they are counted;
     and without its first page, the list of tables, nothing is read."""
+    bag: bool = False
+    """A ROS 1 bag: where its index is damaged too, bytes that hold no record may have been a chunk."""
     folder: bool = False
     """With metadata.yaml beside it."""
 
@@ -145,12 +147,12 @@ FORMATS = {
     ),
     **{
         f"bag-{kind.lower() or 'none'}": Format(
-            lambda p, kind=kind: write_bag(p / "log.bag", kind), checked=kind == "BZ2"
+            lambda p, kind=kind: write_bag(p / "log.bag", kind), checked=kind == "BZ2", bag=True
         )
         for kind in ("", "BZ2", "LZ4")
     },
-    "bag-unindexed": Format(lambda p: unindexed(write_bag(p / "log.bag", "LZ4")), checked=False, cut=True),
-    "bag-none-unindexed": Format(lambda p: unindexed(write_bag(p / "log.bag", "")), checked=False, cut=True),
+    "bag-unindexed": Format(lambda p: unindexed(write_bag(p / "log.bag", "LZ4")), False, False, cut=True),
+    "bag-none-unindexed": Format(lambda p: unindexed(write_bag(p / "log.bag", "")), False, False, cut=True),
     "db3": Format(lambda p: write_db3(p / "log.db3"), counted=False, checked=False, rows=True),
     "db3-folder": Format(lambda p: write_db3(p / "log.db3"), checked=False, rows=True, folder=True),
 }
@@ -216,7 +218,8 @@ def compared(
     said = +said
     unknown = [loss.reason for loss in losses if loss.messages is None]
     state = f"missed {dict(missed)}, said {dict(said)} {unknown}, contents {dict(found)}: {notes.lines}"
-    if not missed and (said or unknown):
+    open_number = form.cut or (form.bag and not form.counted)
+    if not missed and (said or (unknown and not open_number)):
         return f"invented loss: {state}"
     if missed and not (said or unknown):
         return f"silent loss: {state}"
@@ -303,7 +306,17 @@ def test_a_bag_that_is_cut_between_two_records_is_cut(tmp_path: Path) -> None:
         assert [loss.reason for loss in notes.account.losses] == ["cut"], end
 
 
-SEVERAL = ("mcap-lz4", "mcap-zstd", "mcap-no-summary", "mcap-unchunked", "bag-none", "bag-bz2", "bag-lz4", "db3-folder")
+SEVERAL = (
+    "mcap-lz4",
+    "mcap-zstd",
+    "mcap-no-summary",
+    "mcap-unchunked",
+    "bag-none",
+    "bag-bz2",
+    "bag-lz4",
+    "db3",
+    "db3-folder",
+)
 """Formats of all kinds; in a chunk that is neither packed nor has a checksum, several damages can pass for messages."""
 
 
@@ -416,6 +429,19 @@ def test_chunks_that_are_gone_or_in_each_others_place_are_accounted_for(name: st
     assert not problems, "\n".join(problems)
 
 
+@pytest.mark.parametrize("name", ["mcap-lz4", "mcap-no-crc", "bag-lz4"])
+def test_what_is_gone_up_to_the_index_at_the_end_is_accounted_for(name: str, tmp_path: Path) -> None:
+    """From the index of a chunk on: the chunks that are still listed lie behind the end of the file."""
+    form = FORMATS[name]._replace(counted=False)
+    path = form.write(tmp_path)
+    whole = path.read_bytes()
+    kind = "op6.header_length" if path.suffix == ".bag" else "chunk_index.record_length"
+    ends = [field.offset for field in FIELDS[path.suffix](whole) if field.name == kind]
+    for start in chunk_starts(whole, path.suffix)[1:4]:
+        path.write_bytes(whole[: start - 30] + whole[ends[-2] + 20 :])
+        assert problem(path, WRITTEN, form, content=False) == ""
+
+
 @pytest.mark.parametrize("name", [*CHUNKED, "bag-unindexed", "bag-none-unindexed", "mcap-no-summary", "mcap-cut-off"])
 def test_bytes_that_are_zero_or_gone_or_new_are_accounted_for(name: str, tmp_path: Path) -> None:
     """Over the end of one chunk and the head of the next, up to all of two; nothing tells what two chunks held."""
@@ -509,19 +535,6 @@ def test_where_nothing_is_left_the_times_are_those_of_most_chunks(tmp_path: Path
     assert all(abs(ns - START_NS) < _FARTHEST_NS for span in spans for ns in span)
 
 
-@pytest.mark.parametrize("name", ["bag-unindexed", "bag-none-unindexed"])
-def test_a_damaged_field_name_of_an_index_is_no_lost_chunk(name: str, tmp_path: Path) -> None:
-    """Of a bag that no index lists the chunks of: what was read is what the damaged index counts."""
-    path = FORMATS[name].write(tmp_path)
-    whole, problems = path.read_bytes(), []
-    for field in (field for field in FIELDS[".bag"](whole) if field.name == "op4.header_length"):
-        for at in range(field.offset + 4, field.offset + 51):
-            path.write_bytes(whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :])
-            if found := problem(path, WRITTEN, FORMATS[name]._replace(counted=False), content=False):
-                problems.append(f"{at - field.offset} of {field.offset}: {found}")
-    assert not problems, f"{len(problems)}\n" + "\n".join(problems)
-
-
 def test_a_message_that_became_another_record_is_no_silent_loss(tmp_path: Path) -> None:
     form = FORMATS["mcap-unchunked-no-summary"]
     path = form.write(tmp_path)
@@ -576,3 +589,21 @@ def test_a_log_begins_and_ends_with_times_that_another_confirms(name: str, tmp_p
         container, _ = open_container(path, Notes())
         contents = container.contents()
         assert abs(contents.start_ns - START_NS) < _FARTHEST_NS > abs(contents.end_ns - START_NS), at
+
+
+def test_a_channel_may_be_defined_chunks_before_its_first_message(tmp_path: Path) -> None:
+    """Of a file that repeats no channel in a summary, as a recorder that crashed leaves it."""
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=100, use_summary_offsets=False, index_types=IndexType.MESSAGE, **BARE)  # type: ignore[arg-type]
+        writer.start("ros2", "test")
+        schema = writer.register_schema(KIND, "ros2msg", b"string data")
+        channels = [writer.register_channel(TOPICS[0], "cdr", schema)]
+        for number in range(12):
+            if number == 5:  # into a chunk of the first alone
+                channels.append(writer.register_channel(TOPICS[1], "cdr", schema))
+            writer.add_message(channels[number // 10], START_NS + number, bytes(40), START_NS + number)
+        writer.finish()
+    notes = Notes()
+    assert len(every_message(path, notes)) == 12
+    assert not notes.lines

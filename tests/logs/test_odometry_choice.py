@@ -175,6 +175,17 @@ def test_frames_tell_between_equal_types(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
+def test_what_hardly_is_odometry_is_never_taken_silently(tmp_path: Path) -> None:
+    """A pose that never changes, and one of a part in the body."""
+    still = poses("/odom", ODOMETRY, np.repeat(OTHER[:1], COUNT, axis=0))
+    assert "/odom never moves" in " ".join(logs.open(drive(tmp_path / "still", still)).info().warnings)
+    part = poses("/tool", POSE, WALK)
+    for message in part:
+        message.message.header.frame_id = "base_link"
+    said = " ".join(logs.open(drive(tmp_path / "part", part)).info().warnings)
+    assert "/tool is placed in base_link, which moves" in said
+
+
 def test_transforms_in_a_circle_are_followed_once(tmp_path: Path) -> None:
     back = np.linalg.inv(WALK)
     fixed = transforms(("odom", "base_link", WALK), ("base_link", "odom", back), ("map", "odom", OTHER))

@@ -48,11 +48,13 @@ def find_jumps(stamp_ns: Ints, poses: Floats) -> Ints:
     usual_s = np.minimum(seconds, max(_GAP_S, float(np.median(seconds)))).mean()  # the mean: stamps of bursts crowd
     least_s = np.maximum(seconds, usual_s)
     window_s = np.convolve(seconds, np.ones(3), "same")
+    length_m = np.linalg.norm(translation, axis=1)
     limits_m = (
-        least_s * (_ACCELERATION_M_S2 * window_s / 2 + _IMPULSE_M_S), _TIMES * _typical(deviation_m),
-        _PERIODS * _typical(np.linalg.norm(translation, axis=1) / seconds) * least_s,
+        least_s * (_ACCELERATION_M_S2 * window_s / 2 + _IMPULSE_M_S), _TIMES * _typical(deviation_m, length_m > 0),
+        _PERIODS * _typical(length_m / seconds, length_m > 0) * least_s,
     )  # fmt: skip
-    limits_rad = (_TURN_RAD_S * least_s, _TIMES * _typical(np.linalg.norm(rotation, axis=1)), _LEAST_TURN_RAD)
+    turn_rad = np.linalg.norm(rotation, axis=1)
+    limits_rad = (_TURN_RAD_S * least_s, _TIMES * _typical(turn_rad, turn_rad > 0), _LEAST_TURN_RAD)
     far = np.all([deviation_m > limit for limit in limits_m], axis=0)
     turned = np.all([deviation_rad > limit for limit in limits_rad], axis=0)
     return np.flatnonzero(np.logical_or(far, turned))
@@ -91,10 +93,9 @@ def _deviation(steps: Floats, seconds: Floats) -> Floats:
     return np.minimum(*found)
 
 
-def _typical(values: Floats) -> float:
-    """The 90 % quantile of the values above zero: a robot at rest does not count."""
-    moving = values[values > 0]
-    return float(np.quantile(moving, 0.9)) if len(moving) else 0.0
+def _typical(values: Floats, moving: np.ndarray) -> float:
+    """The 90 % quantile of the values of steps that move: a robot at rest does not count."""
+    return float(np.quantile(values[moving], 0.9)) if moving.any() else 0.0
 
 
 def _outlier(stamp_ns: Ints, poses: Floats, rows: Ints) -> np.ndarray:

@@ -68,7 +68,7 @@ COVERED = 0.9
 """Share of the camera's time that odometry covers in a usual log: recorders start and stop within seconds."""
 _LEAST_HZ = 5.0
 """Poses a second, or one per image, beyond which more of them add nothing: 2 m apart at 10 m/s."""
-_SPARSE = "poses a second that differ"
+_SPARSE, _STILL, _PLACED = "poses a second that differ", "never moves", "is placed in"
 _LEAST_FACTOR = 0.01
 """Least factor: nothing measured makes a source impossible where it is the only one."""
 
@@ -92,7 +92,7 @@ def score_source(
         whose = "camera's" if len(camera_ns) else "sources'"
         evidence[f"covers {coverage:.0%} of the {whose} time"] = max(coverage * coverage / 2, _LEAST_FACTOR)
     if rate_hz is not None and (share := rate_hz / min(camera_hz, _LEAST_HZ)) < COVERED:
-        what = f"{rate_hz:.2g} {_SPARSE}" if moved else "its pose never changes"
+        what = f"{rate_hz:.2g} {_SPARSE}" if moved else _STILL
         evidence[what] = max(math.sqrt(share), _LEAST_FACTOR)  # the root: a robot that mostly stands has odometry too
     if rate_hz is None:
         evidence["a single pose"] = _LEAST_FACTOR
@@ -216,6 +216,10 @@ def _note_doubts(source: OdometrySource, requested: bool, has_images: bool, note
             f"{source.topic} has {source.rate_hz:.2g} poses a second that differ; between them the motion is "
             "interpolated."
         )
+    for what in source.evidence:
+        if what == _STILL or what.startswith(_PLACED):
+            doubt = "did its estimator run?" if what == _STILL else "is it a part of the robot?"
+            notes.add(f"{source.topic} {what}; {doubt}{'' if requested else ' No other source is better.'}")
     if not requested and _MAYBE_COMMANDED in source.evidence:
         notes.add(
             f"{source.topic} is a command by its name (where the robot should be), but moves {source.frames[-1]}, "
@@ -248,7 +252,7 @@ def _evidence_by_name(topic: str, kind: str, frames: list[str], source_kind: str
     found = dict([_OF_KIND["twist"]]) if source_kind == "twist" else found
     parent, child = (frame.split("/")[-1] for frame in (*frames[:1], *frames[-1:])) if frames else ("", "")
     if parent in _BODIES or (parent and parent == child):
-        found[f"is placed in {parent}, which moves"] = 0.05
+        found[f"{_PLACED} {parent}, which moves"] = 0.05
     elif parent in _MAP:
         found[f"in {parent}, where poses jump"] = 0.9
     elif not parent:

@@ -31,6 +31,8 @@ _AROUND = 10
 """Messages on either side of a step by which its speed is known."""
 _LONGEST_GAP_NS = 10 * 10**9
 """ns; a way that takes longer at that speed is a jump of the poses."""
+_LONGEST_PAUSE_NS = 3600 * 10**9
+"""ns; between parts of one drive in another order lies no more."""
 _FURTHEST_STEP = 3
 """Times nine tenths of the steps from one message to the next: a drive that goes on does not step further."""
 
@@ -52,7 +54,7 @@ class _Drop:
     overlap: int
     """Turns from one side to the other beyond those of neighbours."""
     continuous: bool
-    """The motion leads on over it in the order of the file and not in that of time."""
+    """The motion leads on over it in the order of the file and not in that of time, or no drive pauses for so long."""
 
 
 def correct_clock_steps(topics: Iterable[Stamps], notes: Notes) -> None:
@@ -108,7 +110,7 @@ def _drops(one: Stamps) -> list[_Drop]:
                 -int(step[row - 1]), elapsed if elapsed > 0 else period,
                 0 if elapsed > 0 or one.xyz_m is None else _time_by_motion(one.xyz_m, row, period),
                 max(_alternations(log_ns[before], log_ns[behind]) - _ALTERNATIONS, 0),
-                _is_continuous(log_ns, one.xyz_m, row),
+                last_ns < log_ns[:row].min() - _LONGEST_PAUSE_NS or _is_continuous(log_ns, one.xyz_m, row),
             )
         )  # fmt: skip
     return found

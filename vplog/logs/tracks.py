@@ -41,7 +41,7 @@ _TIMES_USUAL = 10.0
 """times the usual speed between fixes, beyond which they jump."""
 _TIMES_HIGH = 2.0
 """times the speed that nine of ten fixes that confirm each other do not exceed, up to which one that jumps off its
-neighbours is reached from those beyond."""
+neighbours is reached from those beyond; and times the way between nine of ten, beyond which one was held back."""
 
 
 class PoseTrack:
@@ -246,10 +246,18 @@ class FixTrack:
             altitude = np.interp(stamp_ns, stamp_ns[known], altitude[known]) if known.any() else np.zeros(len(stamp_ns))
             covariance[~known] = _without_altitude(covariance[~known])
         gps = Gps(stamp_ns, latitude, longitude, altitude, covariance)
-        near = _reachable(gps)
-        if far := int((~near).sum()):
-            notes.add(f"{self.topic}: {far} of {len(near)} fixes left out: nothing moves that far in the time.")
-        return Gps(stamp_ns[near], latitude[near], longitude[near], altitude[near], covariance[near])
+        for left_out, why in (
+            (_frozen, "they repeat the one before them, up to a jump, as a driver does that lost its receiver"),
+            (_unreachable, "nothing moves that far in the time"),
+        ):
+            bad = left_out(gps)
+            if bad.any():
+                notes.add(f"{self.topic}: {int(bad.sum())} of {len(bad)} fixes left out: {why}.")
+                kept = ~bad
+                degrees = gps.latitude_deg[kept], gps.longitude_deg[kept]
+                gps = Gps(gps.stamp_ns[kept], *degrees, gps.altitude_m[kept], covariance[kept])
+                covariance = covariance[kept]
+        return gps
 
 
 def _no_position(fix: FixMessage) -> str:
@@ -278,12 +286,29 @@ def _without_altitude(covariance: Floats) -> Floats:
     return result
 
 
-def _reachable(gps: Gps) -> np.ndarray:
-    """(T,) bool: fixes of the longest run without a jump, of those from where it can be reached, and those that no
-    neighbour confirms where they lie on the way between such runs."""
+def _frozen(gps: Gps) -> Bools:
+    """(T,) bool: fixes that repeat the place before them to the last bit, where the next that does not is further off
+    than a fix from the one before it usually is; a receiver at rest goes on from where it stood."""
+    place = np.stack([gps.latitude_deg, gps.longitude_deg], axis=1)
+    step_m = np.linalg.norm(np.diff(local_enu(gps).enu_m[:, :2], axis=0), axis=1)
+    same = (place[1:] == place[:-1]).all(1)
+    frozen = np.zeros(len(place), bool)
+    if same.all():
+        return frozen
+    usual_m = float(np.quantile(step_m[~same], 0.9))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], same, [0]])))
+    for first, last in edges.reshape(-1, 2).tolist():
+        if last < len(step_m) and step_m[last] > _TIMES_HIGH * usual_m:
+            frozen[first + 1 : last + 1] = True
+    return frozen
+
+
+def _unreachable(gps: Gps) -> Bools:
+    """(T,) bool: all but the fixes of the longest run without a jump, of those from where it can be reached, and those
+    that no neighbour confirms where they lie on the way between such runs."""
     place, seconds = local_enu(gps).enu_m, gps.stamp_ns / 1e9
     if len(place) < 2:
-        return np.ones(len(place), bool)
+        return np.zeros(len(place), bool)
     speed = np.linalg.norm(np.diff(place, axis=0), axis=1) / np.diff(seconds)
     fastest = max(_FASTEST_M_S, _TIMES_USUAL * _usual_speed_m_s(place, seconds))
     bounds = [0, *(np.flatnonzero(speed > fastest) + 1).tolist(), len(place)]
@@ -303,7 +328,7 @@ def _reachable(gps: Gps) -> np.ndarray:
         beside = sure[max(at - 1, 0) : at + 1]
         far = np.linalg.norm(place[beside] - place[alone], axis=1)
         reached[alone] = bool((far <= usual * np.abs(seconds[beside] - seconds[alone])).all())
-    return reached
+    return ~reached
 
 
 def _usual_speed_m_s(place: Floats, seconds: Floats) -> float:

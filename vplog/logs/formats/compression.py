@@ -101,18 +101,6 @@ _DECODERS = {
 }
 
 
-def frame_length(kind: str, data: bytes) -> int | None:
-    """Bytes of the lz4 or bz2 frame that data begin with; None where it is not whole."""
-    decoder = bz2.BZ2Decompressor() if kind == "bz2" else lz4.frame.LZ4FrameDecompressor()
-    part = data
-    try:
-        while decoder.decompress(part, max_length=_BLOCK) and not decoder.eof:  # it may claim to hold any size
-            part = b""
-    except (RuntimeError, OSError, ValueError, EOFError):
-        return None
-    return len(data) - len(decoder.unused_data or b"") if decoder.eof else None
-
-
 def unpack_zstd_message(data: Octets) -> bytes:
     """One zstd frame with its own length, bounded like a chunk. Raises BadChunkError."""
     try:

@@ -211,7 +211,7 @@ class ChunkLosses:
         return (
             before is not None
             and missing.start < missing.stop
-            and missing.last_ns > 0
+            and len(missing.counts) > 0
             and before.first_ns <= missing.first_ns <= missing.last_ns <= before.last_ns
             and Counter(missing.counts) <= Counter(before.counts)
         )

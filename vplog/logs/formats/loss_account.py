@@ -70,7 +70,7 @@ class _Lost:
 
 _OUTSIDE = ("cut", "missing_file", "damaged_bytes", "unknown_channel")
 """Reasons for which messages never came to light, so that no count of what was found has them."""
-_HOW_MANY_OPEN = (*_OUTSIDE, "damaged_chunk")
+_OPEN = (*_OUTSIDE, "damaged_chunk")
 """Reasons that may leave open how many messages they took."""
 
 
@@ -141,60 +141,41 @@ class LossAccount:
         self, files: Collection[str], recorded: Mapping[str, int], found: Mapping[str, int], end_ns: int | None = None
     ) -> dict[str, int]:
         """Make the losses in these files add up to what was recorded less what was found: uncounted ones get what is
-        left, those counted twice lose it. `end_ns` is when the recording ended. Returns what no loss explains."""
+        left; all of them, where those that were counted are more. `end_ns` is when the recording ended. Returns what no
+        loss explains."""
         if not recorded:
             return {}
-        for topic, count in recorded.items():
-            self._reduce(topic, files, found.get(topic, 0) + self._outside(topic, files) - count)
-        short = {topic: count - found.get(topic, 0) - self._outside(topic, files) for topic, count in recorded.items()}
-        short = {topic: count for topic, count in short.items() if count > 0}
-        left_open = [
-            (reason, key, lost)
-            for reason in _HOW_MANY_OPEN
-            for key, lost in self._found.get((reason, ""), {}).items()
-            if key[0] in files and (lost.messages is None or reason in _OUTSIDE)  # else `found` has them
-        ]
-        if not left_open:
+        unnamed = self._found.get(("damaged_chunk", ""), {}).items()
+        found = {"": sum(one.messages or 0 for key, one in unnamed if key[0] in files), **found}
+        short = Counter({topic: count - found.get(topic, 0) for topic, count in recorded.items()})
+        lost = [
+            (reason, topic, key, lost)
+            for (reason, topic), places in self._found.items()
+            for key, lost in places.items()
+            if key[0] in files and (reason in _OUTSIDE or (reason == "damaged_chunk" and lost.messages is None))
+        ]  # of the other damaged chunks, `found` has the messages
+        counted = Counter[str]()
+        for _, topic, _, one in lost:
+            counted[topic] += one.messages or 0 if topic else 0
+        if all(count <= short[topic] for topic, count in counted.items()):
+            short.subtract(counted)
+            lost = [one for one in lost if not one[1]]
+        short = Counter({topic: count for topic, count in short.items() if count > 0})
+        if not lost:
             return short
-        for reason, key, _ in left_open:
-            del self._found[reason, ""][key]
-        reason, key, _ = left_open[0]
-        spans = merged([span for _, _, lost in left_open for span in lost.spans])
-        if reason == "cut" and spans and end_ns is not None:
+        spans = merged([span for *_, one in lost for span in one.spans])
+        first, _, key, _ = min(lost, key=lambda one: (_OPEN.index(one[0]), one[2]))
+        if first == "cut" and spans and end_ns is not None:
             spans[-1] = spans[-1][0], max(spans[-1][1], end_ns)
-        detail = " ".join(dict.fromkeys(lost.detail for _, _, lost in left_open))
-        counted = {
-            topic: places[key].messages or 0
-            for (r, topic), places in self._found.items()
-            if r == reason and key in places
-        }  # of the same place
-        self.add(reason, Counter(short) + Counter(counted) or {"": 0}, key, spans, detail)
-        self._settled.update((reason, key) for reason, key, _ in left_open)
+        for reason, topic, place, _ in lost:
+            del self._found[reason, topic][place]
+        detail = " ".join(dict.fromkeys(one.detail for *_, one in lost if one.detail))
+        beside = {
+            topic: places[key].messages for (r, topic), places in self._found.items() if r == first and key in places
+        }
+        self.add(first, short + Counter(beside) or {"": 0}, key, spans, detail)
+        self._settled.update((reason, place) for reason, _, place, _ in lost)
         return {}
-
-    def _reduce(self, topic: str, files: Collection[str], excess: int) -> None:
-        """Take as many messages from the counted losses of a topic, the last first; none where there are not as many:
-        then it is the number of recorded ones that is wrong."""
-        counted = [
-            (reason, key, lost)
-            for reason in _HOW_MANY_OPEN
-            for key, lost in sorted(self._found.get((reason, topic), {}).items(), key=lambda item: item[0])
-            if key[0] in files and lost.messages and topic
-        ]
-        if excess > sum(lost.messages or 0 for _, _, lost in counted):
-            return
-        for reason, key, lost in reversed(counted):
-            less = min(max(excess, 0), lost.messages or 0)
-            if less:
-                lost.messages, excess = (lost.messages or 0) - less, excess - less
-                self._settled.add((reason, key))
-            if not lost.messages:
-                del self._found[reason, topic][key]
-
-    def _outside(self, topic: str, files: Collection[str]) -> int:
-        reasons = _OUTSIDE if topic else ("damaged_chunk",)  # what has no topic yet may get one, or is in none
-        places = [lost for reason in reasons for lost in self._found.get((reason, topic), {}).items()]
-        return sum(lost.messages or 0 for key, lost in places if key[0] in files)
 
     @property
     def losses(self) -> list[Loss]:
@@ -214,7 +195,7 @@ class LossAccount:
 
     def _in_log(self, reason: str, spans: list[Span]) -> list[Span]:
         """The spans without what is far from the log: stamps that damage has changed."""
-        if reason not in _HOW_MANY_OPEN:
+        if reason not in _OPEN:
             return spans
         spans = [(a or b, b) for a, b in spans if b]  # 0 is no time
         start, end = self._span

@@ -59,11 +59,12 @@ class McapFile:
 
     def contents(self) -> Contents:
         """Counted by the indexes behind the chunks; a chunk without is unpacked, as all are where the file's statistics
-        differ."""
+        differ or a channel is not defined: its definition may lie in any chunk before."""
         layout = self._layout
-        if layout.summary_definitions:
-            self._define_doubtful()
         by_id, times = self._counted(unpack_all=False)
+        if layout.summary_definitions or by_id.keys() - self._channels.keys():
+            self._define_all()
+            by_id, times = self._counted(unpack_all=False)
         listed = sum((Counter(chunk.counts) for chunk in layout.missing), +by_id)
         if layout.recorded and layout.recorded != dict(listed) and layout.chunks:
             by_id, times = self._counted(unpack_all=True)
@@ -136,8 +137,8 @@ class McapFile:
         else:
             self._channels[record.id] = Channel(record.topic, self._schemas[record.schema_id], record.message_encoding)
 
-    def _define_doubtful(self) -> None:
-        """Take schemas and channels of a damaged summary where no chunk has them."""
+    def _define_all(self) -> None:
+        """Take the schemas and channels of all chunks, and those of a damaged summary where no chunk has them."""
         for number in range(len(self._layout.chunks)):
             data = self._data(number)
             ChunkReader(number, len(data), self._channels, self._define, None).whole(data)

@@ -112,7 +112,7 @@ class _LayoutReader:
         while True:
             opcode, stop = self._bounds(position)
             if not opcode:
-                if data_ended:
+                if data_ended and self._search.first(_CHUNKS, position, self._is_record) is None:
                     self.layout.index_cut_at = min(position, self._length)
                     self.layout.appended_at = self._search.first(_BEGIN, position)
                     return
@@ -145,6 +145,7 @@ class _LayoutReader:
             unfit = (one for one in self._unfit if timed or one[1] not in _SHAPES)
             self.layout.unknown_at = next((at for at, opcode in unfit if self._is_message_head(at, opcode)), None)
         found = {chunk.record: chunk for chunk in self.layout.chunks if chunk.compression is not None}
+        placed = bool(found and self._indexed)
         for offset, (listed, indexes) in sorted(self._indexed.items()):
             if (chunk := found.get(offset)) is not None:
                 if chunk.counts and chunk.counts.keys() != indexes.keys():
@@ -152,11 +153,13 @@ class _LayoutReader:
             elif (stop := self._chunk_stop(offset)) is not None:  # it was jumped over
                 self._add_chunk(offset + RECORD.size, stop, cut=False)
                 self.layout.chunks[-1].counts = self._counts(indexes)
-            elif any(start <= offset < stop for start, stop in self.layout.gaps):  # else the index is what is damaged
+            elif any(start <= offset < stop for start, stop in self.layout.gaps):
                 listed.counts = self._counts(indexes)
                 self.layout.missing.append(listed)
+            else:  # bytes are gone or new before it, or the index is damaged
+                placed = False
         self.layout.in_order()
-        if found and self._indexed:  # they tell of every chunk in the gaps
+        if placed:  # the index tells of every chunk in the gaps
             self.layout.gaps = []
 
     def _chunk_stop(self, position: int) -> int | None:

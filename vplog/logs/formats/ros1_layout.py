@@ -12,7 +12,6 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError
-from vplog.logs.formats.compression import frame_length
 from vplog.logs.formats.layout import MOST_GAPS, Chunk, Layout, ResyncSearch
 
 if TYPE_CHECKING:
@@ -44,23 +43,9 @@ _RECORD_START = re.compile(
 _BEGIN = re.compile(re.escape(MAGIC))
 """Magic bytes of a recording: another one may be appended to the first."""
 _HEAD = 256
-"""Bytes in which the head of a record ends, but for a connection's of a long topic."""
-_MAX_CHUNK = 2**28
-"""Bytes of a packed chunk whose end is looked for; recorders make them of 768 kB."""
-_LEAST_CHUNK = 48
-"""Bytes of a chunk record without data."""
+"""Bytes in which the fields of the bag's own header end."""
 _PACKED = 1.02
 """Times the size of a chunk up to which its packed length is believed: lz4 and bzip2 add less than 2 % to noise."""
-_VALUES = re.compile(
-    rb"compression=(?:none|lz4|bz2)|op=.|(?:size|ver|conn|count|(?:conn|chunk)_count)=.{4}|"
-    rb"(?:(?:index|chunk)_pos|(?:start|end)_time)=.{8}",
-    re.DOTALL,
-)
-"""Fields in the headers of all records but connections, whatever the lengths before them."""
-_OF_CHUNK = re.compile(rb"(compression|size)=|ver=|conn=|count=")
-"""The names of fields that tell the head of a chunk from that of an index, one of which damage may have changed."""
-
-
 _Head = tuple[dict[bytes, bytes] | None, int, int]
 """Header of a record, None where it is damaged, and where its data start and stop."""
 
@@ -94,7 +79,7 @@ class _LayoutReader:
         while position < self._length or position == len(MAGIC):
             header, start, stop = self._head(position)
             found, inside = None, header is not None and number(header, b"op") == _CHUNK
-            lost = False
+            lost = alone = False
             if (
                 header is None
                 or not self._is_sound(header)
@@ -113,92 +98,58 @@ class _LayoutReader:
                     self._skip(position, found)
                     position = found
                     continue
+                own = stop
                 stop, lost = self._stop(header, start, stop, found)
+                alone = inside and not _is_too_long(header, stop - start) and stop <= own
             if inside or not lost:
                 self._record(number(header, b"op"), header, position, start, stop)
             if lost:
-                self._skip(position, stop, known=inside)
+                self._skip(position, stop, known=alone)
             position = stop
         if position > self._length or (self._index_at > self._length and not self._infos):
             self.layout.cut_at = self._length
 
     def _stop(self, header: dict[bytes, bytes], start: int, stop: int, found: int | None) -> tuple[int, bool]:
         """Where a record stops that has none behind it, and whether more than its own bytes may lie up to there."""
-        end, in_chunk = self._end_by_content(header, start, max(stop, found or 0)), number(header, b"op") == _CHUNK
-        is_sure = in_chunk and header[b"compression"] != b"none"
-        is_sure |= number(header, b"op") != _BAG and end is not None and self._is_record(end, behind_chunk=in_chunk)
-        if end is not None and (is_sure or end in (stop, found)):
+        op, end = number(header, b"op"), None
+        if op in _ENTRY:
+            end = start + _ENTRY[op] * number(header, b"count")
+        elif op == _BAG:  # filled up with blanks
+            most = max(stop, found or 0)
+            end = most - len(self.at(start, most - start).lstrip())
+        elif op == _CHUNK and header[b"compression"] == b"none":
+            end = start + number(header, b"size")
+        if end is not None and (
+            end in (stop, found) or (op != _BAG and self._is_record(end, behind_chunk=op == _CHUNK))
+        ):
             return end, False
         return stop if found is None else found, found not in (None, stop)
 
-    def _end_by_content(self, header: dict[bytes, bytes], start: int, most: int) -> int | None:
-        """Where the data of a record stop by its header, or by themselves; they are tried up to `most`."""
-        op = number(header, b"op")
-        if op in _ENTRY:
-            return start + _ENTRY[op] * number(header, b"count")
-        if op == _BAG:  # filled up with blanks
-            return most - len(self.at(start, most - start).lstrip())
-        if op != _CHUNK or header[b"compression"] == b"none":
-            return start + number(header, b"size") if op == _CHUNK else None
-        data = self.at(start, min(most - start, _MAX_CHUNK))
-        length = frame_length(header[b"compression"].decode("ascii", "replace"), data)
-        return None if length is None else start + length
-
     def _skip(self, position: int, found: int, known: bool = False) -> None:
-        """Take note of bytes without a record, and of the chunk that may lie in them. `known`: the first is a chunk
-        that is read."""
+        """Take note of bytes without a record, in which chunks may lie. `known`: the first is a chunk that is read."""
         self.layout.gaps.append((position, found))
-        kinds = self._kinds_left(position, found)
-        kinds = kinds[1:] if known and kinds else kinds
-        if self._indexing is not None and (not kinds or kinds[0] != _CHUNK):
+        if self._indexing is not None:
             self._indexing.doubtful = True
-        if (kinds is None or _CHUNK in kinds) and not self._is_behind_chunks(position):
-            self._indexing = Chunk(position, found, record=position, doubtful=kinds != [_CHUNK])
+        if not known and not self._is_behind_chunks(position) and not self._is_own_header(position, found):
+            self._indexing = Chunk(position, found, record=position, doubtful=True)
             self.layout.missing.append(self._indexing)
+
+    def _is_own_header(self, position: int, found: int) -> bool:
+        """Whether bytes without a record are the bag's own header, which is filled up with blanks."""
+        blanks = self.at(position + _HEAD, min(found - position - _HEAD, _MAX_HEADER))
+        return position == len(MAGIC) and bool(blanks) and not blanks.strip(b" ")
 
     def _is_behind_chunks(self, position: int) -> bool:
         """Whether the bag's index lies before a position."""
         chunks = self.layout.chunks
         return (chunks[-1].record if chunks else 0) < self._index_at <= position
 
-    def _kinds_left(self, position: int, found: int) -> list[int] | None:
-        """Kinds of the records in damaged bytes, by what is left of their heads; None where anything may lie there."""
-        kinds: list[int] = []
-        if position == len(MAGIC) and not self.at(position + _HEAD, min(found - position - _HEAD, _MAX_HEADER)).strip():
-            return kinds  # the blanks of the bag's own header
-        while found - position >= _LEAST_CHUNK:
-            kind, ends = self._ends_left(position)
-            behind = (end for end in sorted(ends) if position < end < found and _VALUES.match(self.at(end + 8, _HEAD)))
-            end = found if found in ends else next(behind, None)
-            if end is None or len(kinds) > MOST_GAPS:
-                return None
-            kinds.append(kind)
-            position = end
-        return kinds
-
-    def _ends_left(self, position: int) -> tuple[int, set[int]]:
-        """Kind of a damaged record, and where it may stop by each of its lengths that damage may have left."""
-        head, end = self.at(position, _HEAD), 4
-        values: dict[bytes, bytes] = {}
-        while field := _VALUES.match(head, end + 4):
-            name, _, values[name] = field[0].partition(b"=")
-            end = field.end()
-        name = _OF_CHUNK.search(head)
-        starts = [position + 8 + int.from_bytes(head[:4], "little"), position + end + 4]
-        ends = {start + int.from_bytes(self.at(start - 4, 4), "little") for start in starts}
-        by_header = (number(values, b"size"), _ENTRY[_INDEX] * number(values, b"count"))
-        return _CHUNK if name is None or name[1] else _INDEX, ends | {
-            start + length for start in starts for length in by_header
-        }
-
     def finish(self) -> None:
         """Hold what was found against the bag's index."""
         layout = self.layout
         found = {chunk.record: chunk for chunk in layout.chunks}
-        skipped = {chunk.record: chunk for chunk in layout.missing}
-        layout.missing, listed = [], len(self._infos) == self._chunk_count
-        others = (chunk for chunk in layout.chunks if chunk.record not in self._infos and not chunk.doubtful)
-        shifted = {(frozenset(chunk.counts.items()), chunk.last_ns) for chunk in others}  # by bytes inserted or lost
+        skipped, layout.missing, listed = layout.missing, [], len(self._infos) == self._chunk_count
+        others = found.keys() - self._infos.keys()  # by bytes inserted or lost, or a damaged index
         for offset, info in sorted(self._infos.items()):
             if (chunk := found.get(offset)) is not None and not _is_another(chunk, info):
                 chunk.first_ns, chunk.last_ns = info.first_ns, info.last_ns
@@ -210,21 +161,15 @@ class _LayoutReader:
                 header, start, stop = self._head(offset)
                 self._record(_CHUNK, header or {}, offset, start, stop)
                 layout.chunks[-1].counts = info.counts
-            elif (frozenset(info.counts.items()), info.last_ns) in shifted:
-                listed = False
-            elif gaps := [start for start, stop in layout.gaps if start <= offset < stop]:  # else the index is damaged
-                own = skipped.get(gaps[0])  # by the index records behind it, the last chunk in the gap
-                if own and own.counts and not own.doubtful:
-                    del skipped[gaps[0]]
-                    if own.counts != info.counts:
-                        info.doubtful, self._index_sound = True, False
+            elif any(start <= offset < stop for start, stop in layout.gaps):  # else the index is damaged
+                info.doubtful |= bool(others)  # then it may be one of these
                 layout.missing.append(info)
             else:
                 listed = False
         if self._index_sound and len(self._infos) == self._chunk_count:
             layout.recorded = dict(sum((Counter(info.counts) for info in self._infos.values()), Counter()))
         if not self._infos or not listed:
-            layout.missing += skipped.values()
+            layout.missing += skipped
         layout.gaps = []  # each has its chunk among the missing ones
         layout.in_order()
         ended = self._infos or 0 < self._index_at <= (layout.cut_at or 0)
@@ -304,7 +249,7 @@ class _LayoutReader:
         position, span = number(header, b"chunk_pos"), (time_ns(header, b"start_time"), time_ns(header, b"end_time"))
         info = Chunk(position, position, first_ns=span[0], last_ns=span[1], record=position)
         for connection, count in struct.iter_unpack("<II", data[: len(data) // 8 * 8]):
-            if 0 < count <= self._length:
+            if 0 < count <= self._length // _ENTRY[_INDEX]:
                 info.counts[connection] = count
         info.doubtful = len(info.counts) != number(header, b"count")
         self._index_sound &= not info.doubtful and position not in self._infos
