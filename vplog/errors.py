@@ -66,8 +66,11 @@ def nearest(name: str, choices: Iterable[str], key: Callable[[str], str] = str, 
     spelled: dict[str, str] = {}
     for choice in choices:
         spelled.setdefault(key(choice).lower(), choice)
-    found = difflib.get_close_matches(name.lower(), spelled, n=1, cutoff=cutoff)
-    return f" Did you mean {spelled[found[0]]}?" if found else ""
+    found = difflib.get_close_matches(name.lower(), spelled, cutoff=cutoff)
+    if not found:
+        return ""
+    first = name.lower().lstrip("-")[:1]  # letter, which is seldom the wrong one
+    return f" Did you mean {spelled[max(found, key=lambda one: one.lstrip('-')[:1] == first)]}?"
 
 
 def nearest_path(path: Path) -> str:

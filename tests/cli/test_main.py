@@ -148,6 +148,11 @@ def test_wrong_usage_exits_with_2(verb: Verb, arguments: tuple[str, ...]) -> Non
         ("library A -o LIB --thread 3", "no option --thread. Did you mean --threads?"),
         ("info A B", "one argument too many: B"),
         ("run --closuer none A", "no option --closuer. Did you mean --closure of vplog explain?"),
+        (
+            "run A -o OUT -odometry-topic /odom",
+            "no option -odometry-topic. Write it with two hyphens: --odometry-topic.",
+        ),
+        ("egport RUN --format kitti -o FILE", "Did you mean export?"),
         ("run A -o OUT --topic /cam", "Write it in full: --image-topic, --depth-topic,"),
         ("help fly", "Verbs: info"),
         ("query MAP LOG", "Did you mean vplog map query?"),

@@ -70,8 +70,11 @@ class Parser(argparse.ArgumentParser):
             known = self._option_string_actions
             if name.lstrip(_DASHES) != name:
                 self.error(f"{name} begins with another dash. Write --{name.lstrip(_DASHES)}")
-            short = name[:2] in known and not name.startswith("--")  # -oOUT
-            if name[:1] != "-" or name in ("-", "--") or name in known or short or " " in text or _is_number(text):
+            if name[:1] != "-" or name in ("-", "--") or name in known or " " in text or _is_number(text):
+                continue
+            if f"-{name}" in known:  # -output is no `-o utput`
+                self.error(f"no option {name}. Write it with two hyphens: -{name}.")
+            if name[:2] in known and not name.startswith("--"):  # -oOUT
                 continue
             others = [one.prog for one in self._family if name in one._option_string_actions]
             of_family = (f"{option} of {one.prog}" for one in self._family for option in one._option_string_actions)

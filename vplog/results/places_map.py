@@ -79,7 +79,7 @@ def read_places(folder: Path, drive: str | None = None) -> DrivePlaces:
     header = tables.read_metadata(folder / "descriptors.parquet")
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     if len(column) != len(keyframes.stamp_ns):
-        raise ResultError(f"{folder} has {len(column)} descriptors for {len(keyframes.stamp_ns)} keyframes.")
+        raise ResultError(f"{folder} has {len(column)} descriptors for {len(keyframes.stamp_ns)} keyframes. Run again.")
     rows = np.arange(len(column), dtype=np.int32)
     return DrivePlaces(drive or keyframes.drive, folder, rows, keyframes.stamp_ns, world_from_body, column, header)
 
@@ -118,7 +118,7 @@ def write_places(
     rest = iter(parts)
     first = next(rest, None)
     if first is None:
-        raise ResultError("There is no place to write.")
+        raise ResultError("The drives given have no place, so there is no file to write. Give a drive with places.")
     names = list(drives)
     kind, library = first.descriptors.type, first.header.get("vplog.library", "")
     described = _parts(kind)
@@ -226,7 +226,9 @@ def read_drives(path: Path, kind: pa.DataType) -> Iterator[DrivePlaces]:
                     yield _places_of(waiting, path, parts, kind)
                     waiting = []
                 if drive in done and not waiting:
-                    raise ResultError(f"{path} holds the places of {drive} in two stretches.")
+                    raise ResultError(
+                        f"{path} does not hold the places of {drive} together. Write it again: vplog map export"
+                    )
                 done.add(drive)
                 waiting.append(rows)
         if waiting:
