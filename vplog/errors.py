@@ -74,9 +74,11 @@ def nearest(name: str, choices: Iterable[str], key: Callable[[str], str] = str, 
 
 
 def nearest_path(path: Path) -> str:
-    """` Did you mean PATH?`: the entry with the nearest name in the folder of a path that does not exist, or empty."""
+    """` Did you mean PATH?`: the entry with the name nearest to the first part of a path that does not exist, or empty."""
     if "://" in str(path) or os.path.exists(path):  # noqa: PTH110 (false for a name that is too long)
         return ""
+    while not os.path.exists(path.parent):  # noqa: PTH110
+        path = path.parent
     try:
         entries = sorted(map(str, path.parent.iterdir()))
     except OSError:

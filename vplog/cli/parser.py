@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
@@ -30,12 +31,19 @@ _MOST = 10**9
 """Largest count an option may have: far above any drive, and whole in every number type."""
 
 
+class _Help(argparse.HelpFormatter):
+    """Help wrapped between words alone: names and options with hyphens are whole."""
+
+    def _split_lines(self, text: str, width: int) -> list[str]:
+        return textwrap.wrap(" ".join(text.split()), max(width, 20), break_on_hyphens=False, break_long_words=False)
+
+
 class Parser(argparse.ArgumentParser):
     """The command line or one verb of it. Options are written in full: what abbreviates one may mean two later."""
 
     def __init__(self, *args: Any, family: list[Parser] | None = None, **options: Any) -> None:
         """`family` collects the parsers of one command line, to tell which verb a misplaced option belongs to."""
-        super().__init__(*args, allow_abbrev=False, **options)
+        super().__init__(*args, allow_abbrev=False, formatter_class=_Help, **options)
         self._family = [] if family is None else family
         self._family.append(self)
         self._intermixing, self._brief_usage = False, ""
