@@ -74,7 +74,7 @@ def nearest(name: str, choices: Iterable[str], key: Callable[[str], str] = str, 
 
 
 def nearest_path(path: Path) -> str:
-    """` Did you mean PATH?`: the entry with the name nearest to the first part of a path that does not exist, or empty."""
+    """` Did you mean PATH?`: the entry with the name nearest to the first missing part of a path, or empty."""
     if "://" in str(path) or os.path.exists(path):  # noqa: PTH110 (false for a name that is too long)
         return ""
     while not os.path.exists(path.parent):  # noqa: PTH110

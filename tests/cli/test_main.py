@@ -192,6 +192,15 @@ def test_a_name_that_is_too_long_or_has_line_ends_is_an_error_in_one_line(
     assert said.code == 2 or not usage
 
 
+@pytest.mark.parametrize("words", ["info {}", "map merge {} -o OUT", "run --resume -o {}", "library A -o {}"])
+def test_a_link_to_itself_is_refused(verb: Verb, tmp_path: Path, words: str) -> None:
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    said = verb(*words.format(loop).split())
+    assert said.code == 2
+    assert f"{loop} is a link that leads to itself" in said.err
+
+
 @pytest.mark.parametrize("words", ["info s3://", "diff A gs:///run", "batch http:// -o B", "run https://?a -o B"])
 def test_a_url_without_a_server_is_refused(verb: Verb, words: str) -> None:
     said = verb(*words.split())

@@ -298,7 +298,7 @@ def demo(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json({"drive": str(drive.log), "truth": str(drive.truth), "run": done.record, "evaluation": found})
         return
-    printing.print_run(out, done.record, outcome_of(out, pipeline.join.spacing))
+    printing.print_run(out, done.record, outcome_of(out, pipeline.join.spacing), drive.truth)
     printing.print_evaluation(found)
 
 

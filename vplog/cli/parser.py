@@ -5,6 +5,7 @@ that name the nearest choice; the kinds of arguments, and the options that sever
 from __future__ import annotations
 
 import argparse
+import errno
 import math
 import os
 import textwrap
@@ -195,6 +196,13 @@ def output_or_stdout(text: str) -> Path:
 def _path(text: str) -> Path:
     if text == "-":
         raise argparse.ArgumentTypeError("stdin and stdout cannot be used here: name a path (./- for a file named -)")
+    try:
+        os.stat(text)  # noqa: PTH116 (of an empty text, too)
+    except (OSError, ValueError) as error:
+        if getattr(error, "errno", None) == errno.ELOOP:
+            raise argparse.ArgumentTypeError(
+                f"{text} is a link that leads to itself: name a file or a folder"
+            ) from None
     return Path(text)
 
 
