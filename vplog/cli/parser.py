@@ -87,7 +87,9 @@ class Parser(argparse.ArgumentParser):
                 continue
             others = [one.prog for one in self._family if name in one._option_string_actions]
             of_family = (f"{option} of {one.prog}" for one in self._family for option in one._option_string_actions)
-            near = nearest(name, known, cutoff=0.75) or nearest(name, of_family, _option, cutoff=0.75)
+            near = nearest(name, known, cutoff=0.75) or nearest(
+                name, of_family, lambda one: one.split()[0], cutoff=0.75
+            )
             if self._subparsers is not None and others:
                 self.error(f"{name} goes after the verb: {self.prog} VERB {name}")
             where = f" It is an option of {', '.join(others[:3])}." if others else ""
@@ -127,10 +129,6 @@ class Parser(argparse.ArgumentParser):
         usage = self._get_formatter()
         usage.add_usage(None, [one for one in self._actions if one.required or not one.option_strings], [])
         return usage.format_help()
-
-
-def _option(of_verb: str) -> str:
-    return of_verb.partition(" ")[0]
 
 
 def _is_number(text: str) -> bool:

@@ -123,10 +123,13 @@ def write_places(
     kind, library = first.descriptors.type, first.header.get("vplog.library", "")
     described = _parts(kind)
     columns = [pa.field(name, _stored(part), False) for name, part in described]
+    header = json.dumps(drives)
+    if len(header) > _MOST_HEADER:  # readers take headers of up to 100 MB
+        header = json.dumps({drive: {} for drive in drives})
     about = {
         **{key: first.header.get(key, "") for key in ("vplog.library", "vplog.version", "vplog.settings")},
         "vplog.table": "map",
-        "vplog.drives": _drives_header(drives),
+        "vplog.drives": header,
         "vplog.descriptor": json.dumps([_described(name, part) for name, part in described]),
         **({} if bounds is None else geo.geo_header(*bounds)),
     }
@@ -153,12 +156,6 @@ def write_places(
             writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema), ROWS_PER_GROUP)
             places += len(part.keyframe)
     return {"written": str(path), "drives": names, "places": places, "library": library}
-
-
-def _drives_header(drives: Mapping[str, dict[str, Any]]) -> str:
-    """The drives as JSON; their IDs alone where that is too long, as readers take headers of up to 100 MB."""
-    header = json.dumps(drives)
-    return header if len(header) <= _MOST_HEADER else json.dumps({drive: {} for drive in drives})
 
 
 def _arrays(part: DrivePlaces, names: Sequence[str]) -> list[pa.Array]:
