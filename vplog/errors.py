@@ -66,11 +66,13 @@ def nearest(name: str, choices: Iterable[str], key: Callable[[str], str] = str, 
     spelled: dict[str, str] = {}
     for choice in choices:
         spelled.setdefault(key(choice).lower(), choice)
-    found = difflib.get_close_matches(name.lower(), spelled, cutoff=cutoff)
+    typed = name.lower()
+    found = difflib.get_close_matches(typed, spelled, cutoff=cutoff)
     if not found:
         return ""
-    first = name.lower().lstrip("-")[:1]  # letter, which is seldom the wrong one
-    return f" Did you mean {spelled[max(found, key=lambda one: one.lstrip('-')[:1] == first)]}?"
+    ratios = [difflib.SequenceMatcher(None, one, typed).ratio() for one in found]
+    tied, first = found[: ratios.count(ratios[0])], typed.lstrip("-")[:1]  # letter, which is seldom the wrong one
+    return f" Did you mean {spelled[max(tied, key=lambda one: one.lstrip('-')[:1] == first)]}?"
 
 
 def nearest_path(path: Path) -> str:

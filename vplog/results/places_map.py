@@ -224,7 +224,7 @@ def read_drives(path: Path, kind: pa.DataType) -> Iterator[DrivePlaces]:
                     waiting = []
                 if drive in done and not waiting:
                     raise ResultError(
-                        f"{path} does not hold the places of {drive} together. Write it again: vplog map export"
+                        f"{path} does not hold the places of {drive} together. Write it again with `vplog map export`."
                     )
                 done.add(drive)
                 waiting.append(rows)
