@@ -66,14 +66,21 @@ def nearest(name: str, choices: Iterable[str], key: Callable[[str], str] = str, 
     spelled: dict[str, str] = {}
     for choice in choices:
         spelled.setdefault(key(choice).lower(), choice)
-    found = difflib.get_close_matches(name.lower(), spelled, n=1, cutoff=cutoff)
-    return f" Did you mean {spelled[found[0]]}?" if found else ""
+    typed = name.lower()
+    found = difflib.get_close_matches(typed, spelled, cutoff=cutoff)
+    if not found:
+        return ""
+    ratios = [difflib.SequenceMatcher(None, one, typed).ratio() for one in found]
+    tied, first = found[: ratios.count(ratios[0])], typed.lstrip("-")[:1]  # letter, which is seldom the wrong one
+    return f" Did you mean {spelled[max(tied, key=lambda one: one.lstrip('-')[:1] == first)]}?"
 
 
 def nearest_path(path: Path) -> str:
-    """` Did you mean PATH?`: the entry with the nearest name in the folder of a path that does not exist, or empty."""
+    """` Did you mean PATH?`: the entry with the name nearest to the first missing part of a path, or empty."""
     if "://" in str(path) or os.path.exists(path):  # noqa: PTH110 (false for a name that is too long)
         return ""
+    while not os.path.exists(path.parent):  # noqa: PTH110
+        path = path.parent
     try:
         entries = sorted(map(str, path.parent.iterdir()))
     except OSError:

@@ -18,7 +18,7 @@ _NOT_YAML = (yaml.YAMLError, ValueError, RecursionError)
 """Errors of the parser: a date like 2024-13-45 or too long a number is a ValueError, deep nesting ends the stack."""
 
 _A_SETTING = "`vplog config` prints every setting."
-_A_FILE = "`vplog config` prints one that is."
+_A_FILE = "`vplog config` prints a pipeline file."
 
 
 class Settings(BaseModel):

@@ -148,6 +148,11 @@ def test_wrong_usage_exits_with_2(verb: Verb, arguments: tuple[str, ...]) -> Non
         ("library A -o LIB --thread 3", "no option --thread. Did you mean --threads?"),
         ("info A B", "one argument too many: B"),
         ("run --closuer none A", "no option --closuer. Did you mean --closure of vplog explain?"),
+        (
+            "run A -o OUT -odometry-topic /odom",
+            "no option -odometry-topic. Write it with two hyphens: --odometry-topic.",
+        ),
+        ("egport RUN --format kitti -o FILE", "Did you mean export?"),
         ("run A -o OUT --topic /cam", "Write it in full: --image-topic, --depth-topic,"),
         ("help fly", "Verbs: info"),
         ("query MAP LOG", "Did you mean vplog map query?"),
@@ -185,6 +190,15 @@ def test_a_name_that_is_too_long_or_has_line_ends_is_an_error_in_one_line(
     assert "error: " in error
     assert "\x1b" not in error
     assert said.code == 2 or not usage
+
+
+@pytest.mark.parametrize("words", ["info {}", "map merge {} -o OUT", "run --resume -o {}", "library A -o {}"])
+def test_a_link_to_itself_is_refused(verb: Verb, tmp_path: Path, words: str) -> None:
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    said = verb(*words.format(loop).split())
+    assert said.code == 2
+    assert f"{loop} is a link that leads to itself" in said.err
 
 
 @pytest.mark.parametrize("words", ["info s3://", "diff A gs:///run", "batch http:// -o B", "run https://?a -o B"])

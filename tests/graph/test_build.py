@@ -74,7 +74,7 @@ def test_an_index_out_of_range_and_a_cut_graph_are_refused() -> None:
     alone = without_loops(DRIVE.graph)
     with pytest.raises(GraphError, match=r"poses 0\.\.29"):
         checked(replace(alone, b=with_entry(alone.b, (7,), 99)))
-    with pytest.raises(GraphError, match=r"from pose 0 to pose 8 \(22 of 30"):
+    with pytest.raises(GraphError, match=r"pose 0 and pose 8 \(22 of 30"):
         checked(replace(alone, a=with_entry(alone.a, (7,), 9), b=with_entry(alone.b, (7,), 10)))
 
 

@@ -241,7 +241,7 @@ def test_files_that_are_no_export_or_of_another_library_are_one_line(root: Path,
     assert "cannot be read" in verb("map", "merge", tmp_path / "deep", "-o", root).error
     mine = make_map(tmp_path / "mine", {"x": 7})
     for damaged, why in (
-        (pa.concat_tables([table, table]), "two stretches"), (table.drop_columns(["stamp_ns"]), "cannot be read"),
+        (pa.concat_tables([table, table]), "together"), (table.drop_columns(["stamp_ns"]), "cannot be read"),
         (table.slice(PLACES), "no place of far"), (table.take(list(range(PLACES))[::-1]), "do not increase"),
     ):  # fmt: skip
         pq.write_table(damaged, out)

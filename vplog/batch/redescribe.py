@@ -56,7 +56,9 @@ def redescribe_map(
         log = drives[drive]["log"]
         try:
             if PLACES_ONLY in drives[drive]:
-                raise LogError(f"Only its places are known. Add its log to the map first: vplog batch LOG -o {root}")
+                raise LogError(
+                    f"The map has places of it, and no log. Add its log to the map first: vplog batch LOG -o {root}"
+                )
             stored_log(
                 log, "Its log", f"Put it back, and give the same command again, or add it: vplog batch LOG -o {target}"
             )

@@ -298,7 +298,7 @@ def demo(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json({"drive": str(drive.log), "truth": str(drive.truth), "run": done.record, "evaluation": found})
         return
-    printing.print_run(out, done.record, outcome_of(out, pipeline.join.spacing))
+    printing.print_run(out, done.record, outcome_of(out, pipeline.join.spacing), drive.truth)
     printing.print_evaluation(found)
 
 
@@ -326,7 +326,10 @@ def _parser() -> argparse.ArgumentParser:
     def output(sub: argparse.ArgumentParser, text: str) -> None:
         option(sub, "-o --output", place, "OUT", text, required=True)
 
-    _add_info(add("info", info, topics))
+    sub = add("info", info, topics)
+    option(sub, "log", place, "LOG")
+    flag(sub, "--check", "print one line; exit status 1 if a run would fail")
+    option(sub, "--html", output_file, "FILE.html", "also write an HTML page with pictures of the drive")
     sub = add("library", library, topics, threads, settings)
     option(sub, "logs", place, "LOG", nargs="+")
     output(sub, "folder of the library")
@@ -349,12 +352,6 @@ def _parser() -> argparse.ArgumentParser:
         verb=lambda arguments: parser.parse_args([*" ".join(arguments.words).split(), "--help"]), debug=False
     )
     return parser
-
-
-def _add_info(sub: argparse.ArgumentParser) -> None:
-    option(sub, "log", place, "LOG")
-    flag(sub, "--check", "print one line; exit status 1 if a run would fail")
-    option(sub, "--html", output_file, "FILE.html", "also write an HTML page with pictures of the drive")
 
 
 def _add_force(sub: argparse.ArgumentParser, what: str = "run") -> None:

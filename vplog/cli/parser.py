@@ -5,8 +5,10 @@ that name the nearest choice; the kinds of arguments, and the options that sever
 from __future__ import annotations
 
 import argparse
+import errno
 import math
 import os
+import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
@@ -30,12 +32,19 @@ _MOST = 10**9
 """Largest count an option may have: far above any drive, and whole in every number type."""
 
 
+class _Help(argparse.HelpFormatter):
+    """Help wrapped between words alone: names and options with hyphens are whole."""
+
+    def _split_lines(self, text: str, width: int) -> list[str]:
+        return textwrap.wrap(" ".join(text.split()), max(width, 20), break_on_hyphens=False, break_long_words=False)
+
+
 class Parser(argparse.ArgumentParser):
     """The command line or one verb of it. Options are written in full: what abbreviates one may mean two later."""
 
     def __init__(self, *args: Any, family: list[Parser] | None = None, **options: Any) -> None:
         """`family` collects the parsers of one command line, to tell which verb a misplaced option belongs to."""
-        super().__init__(*args, allow_abbrev=False, **options)
+        super().__init__(*args, allow_abbrev=False, formatter_class=_Help, **options)
         self._family = [] if family is None else family
         self._family.append(self)
         self._intermixing, self._brief_usage = False, ""
@@ -70,12 +79,17 @@ class Parser(argparse.ArgumentParser):
             known = self._option_string_actions
             if name.lstrip(_DASHES) != name:
                 self.error(f"{name} begins with another dash. Write --{name.lstrip(_DASHES)}")
-            short = name[:2] in known and not name.startswith("--")  # -oOUT
-            if name[:1] != "-" or name in ("-", "--") or name in known or short or " " in text or _is_number(text):
+            if name[:1] != "-" or name in ("-", "--") or name in known or " " in text or _is_number(text):
+                continue
+            if f"-{name}" in known:  # -output is no `-o utput`
+                self.error(f"no option {name}. Write it with two hyphens: -{name}.")
+            if name[:2] in known and not name.startswith("--"):  # -oOUT
                 continue
             others = [one.prog for one in self._family if name in one._option_string_actions]
             of_family = (f"{option} of {one.prog}" for one in self._family for option in one._option_string_actions)
-            near = nearest(name, known, cutoff=0.75) or nearest(name, of_family, _option, cutoff=0.75)
+            near = nearest(name, known, cutoff=0.75) or nearest(
+                name, of_family, lambda one: one.split()[0], cutoff=0.75
+            )
             if self._subparsers is not None and others:
                 self.error(f"{name} goes after the verb: {self.prog} VERB {name}")
             where = f" It is an option of {', '.join(others[:3])}." if others else ""
@@ -115,10 +129,6 @@ class Parser(argparse.ArgumentParser):
         usage = self._get_formatter()
         usage.add_usage(None, [one for one in self._actions if one.required or not one.option_strings], [])
         return usage.format_help()
-
-
-def _option(of_verb: str) -> str:
-    return of_verb.partition(" ")[0]
 
 
 def _is_number(text: str) -> bool:
@@ -184,6 +194,13 @@ def output_or_stdout(text: str) -> Path:
 def _path(text: str) -> Path:
     if text == "-":
         raise argparse.ArgumentTypeError("stdin and stdout cannot be used here: name a path (./- for a file named -)")
+    try:
+        os.stat(text)  # noqa: PTH116 (of an empty text, too)
+    except (OSError, ValueError) as error:
+        if getattr(error, "errno", None) == errno.ELOOP:
+            raise argparse.ArgumentTypeError(
+                f"{text} is a link that leads to itself: name a file or a folder"
+            ) from None
     return Path(text)
 
 

@@ -143,8 +143,8 @@ def print_info(found: dict[str, Any]) -> None:
         print(f"{'run' if found['ready'] else 'this works':10} {found['command']}")
 
 
-def print_run(out: Path, record: dict[str, Any], outcome: Outcome) -> None:
-    """`outcome` is that of the run folder; `out` is what the user called it."""
+def print_run(out: Path, record: dict[str, Any], outcome: Outcome, truth: str | Path = "FILE.tum") -> None:
+    """`outcome` is that of the run folder; `out` is what the user called it; `truth` is the file to compare it with."""
     from vplog.data import Verdict
 
     counts, totals, named = record["counts"], record["totals"], shlex.quote(str(out))
@@ -155,7 +155,8 @@ def print_run(out: Path, record: dict[str, Any], outcome: Outcome) -> None:
         print_line(f"{count:9d}", f"{name}: {Verdict(name).sentence}")
     warn(record["warnings"])
     print_line("took", f"{totals['seconds']:.1f} s, {totals['peak_memory_mb']:.0f} MB")
-    commands = [f"vplog evaluate {named} --truth FILE.tum", f"vplog export {named} --format kitti -o FILE"]
+    evaluate = f"vplog evaluate {named} --truth {shlex.quote(str(truth))}"
+    commands = [evaluate, f"vplog export {named} --format kitti -o FILE"]
     if outcome.closures:
         commands.insert(1, f"vplog explain {named} --worst")
     print_next(f"{out}/report.html in a browser, {out}/result.mcap in Foxglove", *commands)

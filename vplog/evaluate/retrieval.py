@@ -226,7 +226,9 @@ def reliability(probability: ArrayLike, right: Bools, bins: int) -> Reliability:
     if probability.ndim != 1 or probability.shape != right.shape or bins < 1:
         raise ValueError(f"{probability.shape} probabilities, {right.shape} outcomes, {bins} bins")
     if len(probability) == 0:
-        raise TruthError("No query has an answer, so no probability can be judged. Are there candidates?")
+        raise TruthError(
+            "No query has an answer, so there is no probability to calibrate. Give candidates for one query at least."
+        )
     if not np.all((probability >= 0) & (probability <= 1)):
         raise ValueError("a probability is not between 0 and 1")
     edges = np.linspace(0.0, 1.0, bins + 1)

@@ -74,7 +74,9 @@ def read_lines(path: Path, form: str = _CSV, error: type[VplogError] = TruthErro
 
 def _check_size(path: Path) -> None:
     if path.stat().st_size > _FILE_BYTES:
-        raise TruthError(f"{path} is larger than {_FILE_BYTES // 2**20} MB, so it is no table of true pairs.")
+        raise TruthError(
+            f"{path} is larger than {_FILE_BYTES // 2**20} MB, so it is no table of true pairs. Give one `query,match`."
+        )
 
 
 def listed_rows(rows: Sequence[tuple[str, str, str]], query: Log, other: Log) -> Ints:
@@ -178,7 +180,7 @@ def _pairs(values: Any, path: Path) -> Ints:
         if type(query) is not int or not all(type(match) is int for match in matches):
             raise TruthError(f"{path} does not hold whole numbers alone. {_NPY}")
         if len(pairs) + len(matches) > _MOST_PAIRS:
-            raise TruthError(f"{path} holds more than {_MOST_PAIRS} pairs.")
+            raise TruthError(f"{path} holds more than {_MOST_PAIRS} pairs. Give fewer.")
         pairs += [(query, match) for match in matches]
     return np.array(pairs, np.int64).reshape(-1, 2)
 

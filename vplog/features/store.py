@@ -58,7 +58,7 @@ class FeatureStore:
         try:
             self._file = path.open("w+b")
         except OSError as error:
-            raise ResultError(f"Cannot write {path}: {error.strerror}.") from None
+            raise ResultError(f"Cannot write {path}: {error.strerror}. Set TMPDIR to a folder with room.") from None
 
     def __enter__(self) -> Self:
         return self

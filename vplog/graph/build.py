@@ -97,14 +97,16 @@ def checked(graph: PoseGraph) -> tuple[PoseGraph, list[str]]:
     wrong = np.flatnonzero((graph.a < 0) | (graph.b < 0) | (graph.a >= n) | (graph.b >= n) | (graph.a == graph.b))
     if len(wrong):
         edge = wrong[0]
-        raise GraphError(f"Edge {edge} joins {graph.a[edge]} and {graph.b[edge]}; there are poses 0..{n - 1}.")
+        raise GraphError(f"Edge {edge} joins {graph.a[edge]} and {graph.b[edge]}; the graph has poses 0..{n - 1}.")
     _check_poses(graph.world_from_body, "Pose {row}", graph.dimension)
     _check_poses(graph.a_from_b, "Edge {row}", graph.dimension)
     information = informed(graph)
     _check_matrices(information, "information", graph.a, graph.b)
     lost = np.flatnonzero(parts(n, graph.a, graph.b))
     if len(lost):
-        raise GraphError(f"No edge leads from pose 0 to pose {lost[0]} ({len(lost)} of {n} poses are cut off).")
+        raise GraphError(
+            f"Edges do not join pose 0 and pose {lost[0]} ({len(lost)} of {n} are cut off). Solve each part by itself."
+        )
 
     # scaled to a unit diagonal first, so that radians and metres are compared as likes
     diagonal = np.diagonal(information, axis1=1, axis2=2)
@@ -179,7 +181,7 @@ def _check_poses(poses: Floats, name: str, dimension: int) -> None:
     far = np.flatnonzero((np.abs(poses[:, :3, 3]) > _FURTHEST_M).any(1))
     if len(far):
         where = name.format(row=far[0])
-        raise GraphError(f"{where} is {np.abs(poses[far[0], :3, 3]).max():.3g} m out; nothing on Earth is so far away.")
+        raise GraphError(f"{where} is {np.abs(poses[far[0], :3, 3]).max():.3g} m out; check its unit, metres.")
     if dimension == 2:
         tilted = np.flatnonzero((np.abs(rotation[:, 2, 2] - 1) > 1e-5) | (poses[:, 2, 3] != 0))
         if len(tilted):

@@ -90,7 +90,7 @@ def check_log(path: Path) -> None:
 
 def _unreadable(path: Path, error: OSError) -> LogError:
     reason = error.strerror or " ".join(str(error).split())[:300].rstrip(".")
-    return LogError(f"Cannot read {path}: {reason}.")
+    return LogError(f"Cannot read {path}: {reason}. Check the path and its permissions.")
 
 
 def _check_there(path: Path) -> None:
@@ -164,7 +164,7 @@ def open_drive(paths: Sequence[Path], choice: TopicChoice) -> Log:
             container, kind = open_container(path, notes, str(path) if same_name else path.name)
             parts.append(_Part(path, kind, container, container.contents()))
         except OSError as error:
-            raise LogError(f"Cannot read {path}: {error.strerror or error}.") from None
+            raise _unreadable(path, error) from None
         except LogError as error:
             notes.account.add("missing_file", None, (str(path), 0), [], f"Left out: {error}")
     if not parts:

@@ -112,7 +112,9 @@ class BobbSettings(WeighedMatchSettings, RelearnedSettings):
         """`learn` without the index, which the first image to describe makes: comparing places needs none."""
         matcher = index_references(references, self)
         if len(matcher) >= NOBODY:
-            raise LibraryError(f"A library may have {NOBODY - 1} reference images, and this one has {len(matcher)}.")
+            raise LibraryError(
+                f"A library may have {NOBODY - 1} reference images, this one {len(matcher)}. Set library.size lower."
+            )
 
         def rarity() -> Floats:
             explained = list(execution.map(lambda row: _explained(matcher.match(row.features)), matcher.references))

@@ -89,7 +89,7 @@ def keep_references(references: Iterable[Reference], features: int | None = None
     """The references with their `features` strongest features, None for all. Raises LibraryError for none."""
     found = [replace(one, features=one.features.rows(slice(features))) for one in references]
     if not found:
-        raise LibraryError("A library needs at least one reference image; none was given.")
+        raise LibraryError("A library needs at least one reference image, and none was given. Give a log with images.")
     return found
 
 
@@ -197,7 +197,8 @@ def read_sources(folder: Path) -> set[tuple[str, int]]:
         table = _table(folder / "references.parquet", _REFERENCES)
         return set(zip(table["drive"].to_pylist(), table["stamp_ns"].to_pylist(), strict=True))
     except (OSError, ValueError, pa.ArrowException) as error:
-        raise LibraryError(f"{folder} cannot be read: {str(error).splitlines()[0].rstrip('.')}.") from None
+        why = str(error).splitlines()[0].rstrip(".")
+        raise LibraryError(f"{folder} cannot be read: {why}. Build it again with `vplog library`.") from None
 
 
 def load_references(folder: Path, execution: Execution = Execution()) -> list[Reference]:

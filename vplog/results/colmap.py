@@ -51,7 +51,9 @@ def lens(camera: Camera) -> tuple[str, dict[str, float]]:
     if not bent or camera.distortion_model == "none":
         return "PINHOLE", pinhole
     if len(bent) > len(_OPENCV):
-        raise ResultError(f"Camera {camera.name} has coefficients of a thin prism, which COLMAP has no model for.")
+        raise ResultError(
+            f"Camera {camera.name} has coefficients of a thin prism, which COLMAP has no model for. Rectify the images."
+        )
     model, count = ("OPENCV", 4) if len(bent) <= 4 else ("FULL_OPENCV", 8)
     return model, pinhole | dict(zip(_OPENCV[:count], [*bent, *[0.0] * 8], strict=False))
 

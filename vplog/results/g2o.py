@@ -173,7 +173,7 @@ def _split(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counte
                         raise _at(path, number, f"{tag[:30]!r} is not a g2o element")
                     left_out[tag] += 1
     except OSError as error:
-        raise GraphError(f"Cannot read {path}: {error.strerror or error}.") from None
+        raise GraphError(f"Cannot read {path}: {error.strerror or error}. Check its permissions.") from None
     return lines, fixed, left_out
 
 

@@ -79,7 +79,7 @@ def read_places(folder: Path, drive: str | None = None) -> DrivePlaces:
     header = tables.read_metadata(folder / "descriptors.parquet")
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     if len(column) != len(keyframes.stamp_ns):
-        raise ResultError(f"{folder} has {len(column)} descriptors for {len(keyframes.stamp_ns)} keyframes.")
+        raise ResultError(f"{folder} has {len(column)} descriptors for {len(keyframes.stamp_ns)} keyframes. Run again.")
     rows = np.arange(len(column), dtype=np.int32)
     return DrivePlaces(drive or keyframes.drive, folder, rows, keyframes.stamp_ns, world_from_body, column, header)
 
@@ -118,15 +118,18 @@ def write_places(
     rest = iter(parts)
     first = next(rest, None)
     if first is None:
-        raise ResultError("There is no place to write.")
+        raise ResultError("The drives given have no place, so there is no file to write. Give a drive with places.")
     names = list(drives)
     kind, library = first.descriptors.type, first.header.get("vplog.library", "")
     described = _parts(kind)
     columns = [pa.field(name, _stored(part), False) for name, part in described]
+    header = json.dumps(drives)
+    if len(header) > _MOST_HEADER:  # readers take headers of up to 100 MB
+        header = json.dumps({drive: {} for drive in drives})
     about = {
         **{key: first.header.get(key, "") for key in ("vplog.library", "vplog.version", "vplog.settings")},
         "vplog.table": "map",
-        "vplog.drives": _drives_header(drives),
+        "vplog.drives": header,
         "vplog.descriptor": json.dumps([_described(name, part) for name, part in described]),
         **({} if bounds is None else geo.geo_header(*bounds)),
     }
@@ -153,12 +156,6 @@ def write_places(
             writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema), ROWS_PER_GROUP)
             places += len(part.keyframe)
     return {"written": str(path), "drives": names, "places": places, "library": library}
-
-
-def _drives_header(drives: Mapping[str, dict[str, Any]]) -> str:
-    """The drives as JSON; their IDs alone where that is too long, as readers take headers of up to 100 MB."""
-    header = json.dumps(drives)
-    return header if len(header) <= _MOST_HEADER else json.dumps({drive: {} for drive in drives})
 
 
 def _arrays(part: DrivePlaces, names: Sequence[str]) -> list[pa.Array]:
@@ -226,7 +223,9 @@ def read_drives(path: Path, kind: pa.DataType) -> Iterator[DrivePlaces]:
                     yield _places_of(waiting, path, parts, kind)
                     waiting = []
                 if drive in done and not waiting:
-                    raise ResultError(f"{path} holds the places of {drive} in two stretches.")
+                    raise ResultError(
+                        f"{path} does not hold the places of {drive} together. Write it again with `vplog map export`."
+                    )
                 done.add(drive)
                 waiting.append(rows)
         if waiting:

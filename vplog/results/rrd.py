@@ -43,7 +43,7 @@ def write_rrd(path: Path, tracks: Tracks, closures: Closures, result: Path) -> N
         recording.disconnect()
         put_in_place(part, path)
     except OSError as error:
-        raise ResultError(f"Cannot write {path}: {error.strerror or error}.") from None
+        raise ResultError(f"Cannot write {path}: {error.strerror or error}. Choose another with -o.") from None
     finally:
         part.unlink(missing_ok=True)
 

@@ -431,7 +431,7 @@ def read_stamps(path: Path) -> Ints:
     with _reading(path), open_table(path) as file:
         stamp_ns = read_table(path, file, ["stamp_ns"])["stamp_ns"]
     if stamp_ns.type != pa.int64() or stamp_ns.null_count:
-        raise ResultError(f"{path} has stamps that are no whole numbers of nanoseconds, so it is damaged.")
+        raise ResultError(f"{path} is damaged: its stamps are no whole numbers of ns. Run `vplog run` again.")
     return np.asarray(stamp_ns.to_numpy(), np.int64)
 
 

@@ -45,7 +45,9 @@ class ReextractedFeatures:
                 self._store.append(features)
                 self._at[row] = len(self._store) - 1
             if missing[-1] not in self._at:
-                raise LogError(f"The log {self._log.name} does not have all keyframes of the drive.")
+                raise LogError(
+                    f"The log {self._log.name} does not have all keyframes of the drive. Give the whole log of the run."
+                )
 
     def __getitem__(self, row: int) -> Features:
         if row not in self._at:

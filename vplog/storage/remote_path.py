@@ -325,10 +325,10 @@ def local_copy(path: Path | RemotePath) -> Iterator[Path]:
         target = folder / (path.name or "remote")
         try:
             if not path.exists():
-                raise LogError(f"There is nothing at {path}.")
+                raise LogError(f"There is nothing at {path}. Check its name.")
             _download(path, target)
         except OSError as error:
-            raise LogError(f"Cannot read {path}: {reason(error)}.") from None
+            raise LogError(f"Cannot read {path}: {reason(error)}. Check the URL and its rights.") from None
         with stands_for(target, path):
             yield target
 

@@ -130,7 +130,7 @@ def _moved(folders: Sequence[Path]) -> dict[str, float | int]:
     baseline, run = (tables.read_trajectory(folder / "trajectory.parquet")[0] for folder in folders)
     stamps, one, other = np.intersect1d(baseline.stamp_ns, run.stamp_ns, return_indices=True)
     if len(stamps) < 3:
-        raise ResultError(f"{folders[0]} and {folders[1]} share {len(stamps)} stamps: they are not of one drive.")
+        raise ResultError(f"{folders[0]} and {folders[1]} share {len(stamps)} stamps. Give two runs of one drive.")
     known, poses = baseline.world_from_body[one], run.world_from_body[other]
     aligned, _ = se3.umeyama(poses[:, :3, 3], known[:, :3, 3])
     apart = se3.between(known, aligned @ poses)

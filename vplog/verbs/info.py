@@ -22,6 +22,7 @@ from vplog.results.html import render
 from vplog.results.previews import jpeg
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.run.odometry import gives_visual
+from vplog.storage.json_records import plain
 from vplog.storage.remote_path import address
 from vplog.storage.scratch import replacing
 
@@ -46,6 +47,7 @@ _OPTIONS = {
     "mask": "mask-topic", "wheelbase_m": "wheelbase-m", "track_m": "track-m", "wheel_radius_m": "wheel-radius-m",
 }  # fmt: skip
 """Option of the command line for each field of TopicChoice."""
+_CAMERA = ("name", "width", "height", "matrix", "distortion_model", "distortion", "body_from_camera", "baseline_m")
 _PART_WORDS = {
     "image": "camera",
     "right": "right image of the pair",
@@ -114,7 +116,7 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
         entry["why"] = _why(topic, found, topics)
     record = {
         **named,
-        "camera": None if camera is None else _about_camera(camera),
+        "camera": None if camera is None else {name: plain(getattr(camera, name)) for name in _CAMERA},
         "frames": {
             "count": len(stamp_ns), **_timing(stamp_ns), "sampled": decoded[1], "decoded": decoded[0],
             "keyframes": keyframes,
@@ -234,12 +236,6 @@ def _timing(stamp_ns: Ints) -> dict[str, Any]:
     if not len(stamp_ns):
         return {"start_ns": None, "end_ns": None, "rate_hz": None}
     return {"start_ns": int(stamp_ns[0]), "end_ns": int(stamp_ns[-1]), "rate_hz": rate_hz(stamp_ns)}
-
-
-def _about_camera(camera: Camera) -> dict[str, Any]:
-    names = ["name", "width", "height", "matrix", "distortion_model", "distortion", "body_from_camera", "baseline_m"]
-    values = {name: getattr(camera, name) for name in names}
-    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
 
 def _about_odometry(odometry: Odometry | None, found: LogInfo, topics: TopicChoice) -> dict[str, Any] | None:

@@ -145,7 +145,7 @@ def _binary(path: Path) -> list[_Image]:
 def _inside(name: str, path: Path) -> str:
     """A name below the folder of the images. Raises LogError."""
     if name.startswith("/") or ".." in name.split("/"):
-        raise LogError(f"{path} names {name[:60]}, which is outside its folder.")
+        raise LogError(f"{path} names {name[:60]}, which is outside its folder. Copy the images into it.")
     return name
 
 

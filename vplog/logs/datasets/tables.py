@@ -100,7 +100,7 @@ def listed_images(path: Path, folder: Path, unit_ns: int, columns: tuple[int, in
     names = [row[columns[1]] for row in rows]
     for name in names:
         if name.startswith("/") or ".." in name.split("/"):
-            raise LogError(f"{path} names {name[:60]}, which is outside {folder}.")
+            raise LogError(f"{path} names {name[:60]}, which is outside {folder}. Copy it there.")
     files = [folder / name for name in names]
     if not any(file.is_file() for file in files):
         raise LogError(
