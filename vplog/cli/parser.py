@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from vplog.errors import VplogError, nearest
+from vplog.storage.folders import is_unicode
 from vplog.storage.urls import printable, without_secrets
 
 if TYPE_CHECKING:
@@ -184,6 +185,8 @@ def output_or_stdout(text: str) -> Path:
 def _path(text: str) -> Path:
     if text == "-":
         raise argparse.ArgumentTypeError("stdin and stdout cannot be used here: name a path (./- for a file named -)")
+    if not is_unicode(os.path.abspath(text)):  # noqa: PTH100 (links are not followed)
+        raise argparse.ArgumentTypeError(f"{text}: a name on its path is not UTF-8, which records are. Rename it")
     return Path(text)
 
 
