@@ -176,7 +176,8 @@ def test_wrong_usage_says_what_is_meant_in_one_line(verb: Verb, arguments: str, 
     [
         ("x" * 300,), ("info", "x" * 300), ("localize", "M", "P", "-o", "x" * 300), ("schemas", "-o", "x" * 300),
         ("run", "A", "-o", "OUT", "--mask", "x" * 300), ("info", "a\nb"), ("run", "--resume", "-o", "a\nb"),
-        ("map", "info", "a\x1bb\n"), ("info", "a", "b\nc"), ("config", "--pipeline", "x" * 300 + ".yaml"),
+        ("map", "info", "a\x1bb\n"), ("info", "a", "b\nc"), ("info", "\udcff"),
+        ("run", "A", "-o", "\udcff/a"), ("config", "--pipeline", "x" * 300 + ".yaml"),
     ],
     ids=lambda words: " ".join(word[:9] for word in words),
 )  # fmt: skip

@@ -165,6 +165,17 @@ def test_a_map_localises_in_the_frame_of_its_joined_drives(
     assert vplog.open_map(root).localize(image, pictures / "camera.yaml").localized
     assert vplog.open_map(root).info(check=True)["damaged_files"] == []
     shutil.copytree(root, tmp_path / "moved")
+    for name, damaged in (("keyframes", "before"), ("descriptors", "after")):  # the other is searched all the same
+        shutil.copytree(root, tmp_path / name)
+        path = tmp_path / name / "runs" / f"drive={damaged}" / f"{name}.parquet"
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 4
+        path.write_bytes(data)
+        part = api.localize(
+            tmp_path / name, pictures / "pictures", topics={"calibration_file": pictures / "camera.yaml"}
+        )
+        assert [text.partition(":")[0] for text in part["warnings"]] == [f"{damaged} is damaged and left out"]
+        assert {one["drive"] for one in part["answers"] if one["localized"]} == {"before", "after"} - {damaged}
     for log in root.parent.glob("*.mcap"):
         log.rename(tmp_path / log.name)
     try:  # landmarks stand for the logs

@@ -235,6 +235,13 @@ def test_what_cannot_be_merged_is_one_line(verb: Verb, tmp_path: Path) -> None:
     assert list(map_store.Store(empty).drives()) == ["one"]
 
 
+def test_a_damaged_library_is_not_taken(verb: Verb, tmp_path: Path) -> None:
+    source, target = make_map(tmp_path / "source", {"walk": 1}), tmp_path / "target"
+    (source / "libraries" / LIBRARY / "features.parquet").write_bytes(b"PAR1")
+    assert "features.parquet of library aaaaaaaaaaaa is damaged" in verb("map", "merge", source, "-o", target).error
+    assert not list((target).glob("runs/*"))
+
+
 def test_removing_is_as_removing_the_folders(verb: Verb, tmp_path: Path) -> None:
     a, b = (make_map(tmp_path / name, {"one": 1, "two": 2, "three": 3}) for name in "ab")
     for root in (a, b):

@@ -14,7 +14,8 @@ import pytest
 
 import vplog
 from tests.maps.runs import LIBRARY, make_map
-from vplog.errors import ResultError
+from vplog.cache.input_hashes import hash_inputs
+from vplog.errors import LogError, ResultError
 from vplog.maps.storage.layout import folder_name
 from vplog.results import run_record
 from vplog.storage.folders import check_regular, regular_files
@@ -172,6 +173,14 @@ def test_a_library_with_what_is_not_its_own_is_refused(
     put_bad(here / place, kind, outside)
     known = {"LIB": here, "LOG": drive.log, "OUT": tmp_path / "out", "SOUND": root}
     refused(verb(*(known.get(word, word) for word in LIBRARY_VERBS[name])), here / place, outside)
+
+
+def test_a_name_that_no_record_can_hold_is_refused(root: Path, verb: Verb, tmp_path: Path) -> None:
+    """As disks of other systems have them: a path of bytes that are not UTF-8."""
+    (root / WALK / "\udcff").touch()
+    assert "is not UTF-8, which records are. Rename it." in verb("map", "merge", root, "-o", tmp_path / "new").error
+    with pytest.raises(LogError, match="is not UTF-8"):
+        hash_inputs(root)  # of a folder of images
 
 
 def test_a_folder_that_is_given_may_be_a_link(root: Path, verb: Verb, tmp_path: Path) -> None:

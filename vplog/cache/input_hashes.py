@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import cast
 
+from vplog.errors import LogError
+from vplog.storage.folders import is_unicode
 from vplog.storage.remote_path import RemotePath
 
 _BLOCK_BYTES = 2**20
@@ -66,8 +68,12 @@ def changed_s(drive: Path | Sequence[Path]) -> float:
 
 
 def _named(drive: Path | Sequence[Path]) -> list[tuple[str, Path]]:
-    return [
+    """The files of a log, with their names in it. Raises LogError where one is not UTF-8."""
+    named = [
         (str(file.relative_to(path)) if path.is_dir() else file.name, file)
         for path in files_of(drive)
         for file in (sorted(one for one in path.rglob("*") if one.is_file()) if path.is_dir() else [path])
     ]
+    if wrong := [file for name, file in named if not is_unicode(name)]:
+        raise LogError(f"{wrong[0]} has a name that is not UTF-8, which records are. Rename it.")
+    return named

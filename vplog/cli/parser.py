@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from vplog.errors import VplogError, nearest
+from vplog.storage.folders import is_unicode
 from vplog.storage.urls import printable, without_secrets
 
 if TYPE_CHECKING:
@@ -201,6 +202,8 @@ def _path(text: str) -> Path:
             raise argparse.ArgumentTypeError(
                 f"{text} is a link that leads to itself: name a file or a folder"
             ) from None
+    if not is_unicode(os.path.abspath(text)):  # noqa: PTH100 (links are not followed)
+        raise argparse.ArgumentTypeError(f"{text}: a name on its path is not UTF-8, which records are. Rename it")
     return Path(text)
 
 

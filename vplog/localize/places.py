@@ -26,7 +26,8 @@ from vplog.maps.search.index import SegmentView, update_index
 from vplog.maps.search.query import open_map
 from vplog.maps.search.sequences import best_lines
 from vplog.maps.storage import map_store
-from vplog.maps.storage.contents import damage_warnings
+from vplog.maps.storage.contents import damage_warnings, skip_damaged
+from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.layout import PICTURES, folder_name
 from vplog.pipeline import recorded_pipeline
 from vplog.places.sequence import SequenceSettings
@@ -141,21 +142,27 @@ def _of_map(root: Path, execution: Execution) -> Iterator[Places]:
         }
 
         def load(name: str, first: str) -> Landmarked:
-            table = _map_landmarks(store, known[name], pipeline, stack, execution)
+            with reading_drive(name):
+                table = _map_landmarks(store, known[name], pipeline, stack, execution)
             return Landmarked(_keyframes(store, joint, name), _map_earth(store, joint, first), table)
 
         first = {name: joint[name][1] if name in joint else name for name in known}
         drives = [PlacesOfDrive(name, first[name], partial(load, name, first[name])) for name in known]
-        search, warnings = _map_search(store, known, state, execution)
-        yield Places(str(store), state, pipeline, drives, search, warnings + damage_warnings(store))
+        warnings: list[str] = []
+        search = _map_search(store, known, drives, state, warnings, execution)
+        yield Places(str(store), state, pipeline, drives, search, warnings)
 
 
 def _keyframes(store: Store, joint: Mapping[str, tuple[Path, str]], drive: str) -> Floats:
     """(N, 4, 4) of a drive, in the frame that it shares with those it is joined with."""
-    path = store.file(drive, "keyframes.parquet")
-    if drive in joint:
-        path = joint[drive][0] / folder_name(drive) / "keyframes.parquet"
-    return tables.read_keyframes(path)[1]
+    if drive not in joint:
+        with reading_drive(drive):
+            return tables.read_keyframes(store.file(drive, "keyframes.parquet"))[1]
+    path = joint[drive][0] / folder_name(drive) / "keyframes.parquet"
+    try:
+        return tables.read_keyframes(path)[1]
+    except ResultError:
+        raise ResultError(f"{path} is damaged. Join the drives again: vplog map join {store}") from None
 
 
 def _map_earth(store: Store, joint: Mapping[str, tuple[Path, str]], first: str) -> Earth | None:
@@ -168,26 +175,44 @@ def _map_earth(store: Store, joint: Mapping[str, tuple[Path, str]], first: str) 
 
 
 def _map_search(
-    store: Store, known: Mapping[str, Mapping[str, Any]], state: PlaceState, execution: Execution
-) -> tuple[Search, list[str]]:
-    """The search for single views in all drives that have poses, and warnings."""
-    pictures = [number for number, about in enumerate(known.values()) if about.get(PICTURES)]
-    places, single, warnings = sum(store.rows("descriptors", one) for one in known), SequenceSettings(length=1), []
-    parts: list[SegmentView] = []
+    store: Store, known: Mapping[str, Mapping[str, Any]], drives: Sequence[PlacesOfDrive], state: PlaceState,
+    warnings: list[str], execution: Execution,
+) -> Search:  # fmt: skip
+    """The search for single views in all drives that have poses and are not damaged; `warnings` names those that are,
+    as they are found."""
+    parts, problems = list[SegmentView](), list[str]()
+    number = {name: at for at, name in enumerate(known)}
+
+    def indexed(state: CodedState) -> tuple[list[SegmentView], list[str]]:
+        there = {name: about for name, about in known.items() if name not in store.damaged}
+        found, problems = update_index(store, there, state, execution)
+        number_of = np.array([*map(number.__getitem__, there), -1], np.int32)  # -1 stays
+        return [replace(part, numbers=number_of[part.numbers]) for part in found], problems
+
     if isinstance(state, CodedState):
-        parts, warnings = update_index(store, known, state, execution)
+        parts, problems = skip_damaged(store, lambda: indexed(state))
+    warnings += [*problems, *damage_warnings(store)]
 
     def search(descriptors: Sequence[Any], top: int) -> list[list[tuple[int, int]]]:
-        if isinstance(state, CodedState):
-            found = best_places(parts, state, descriptors, min(top, places), execution)
-        else:
-            drives = dict(enumerate(known))
-            found = best_lines(store, drives, state, descriptors, min(top, places), single, execution)
-        rows = zip(found.drive.tolist(), found.keyframe.tolist(), found.count.tolist(), strict=True)
-        every = [list(zip(drive[:count], row[:count], strict=True)) for drive, row, count in rows]
-        return [[(drive, row) for drive, row in one if drive not in pictures] for one in every]
+        def attempt() -> list[list[tuple[int, int]]]:
+            poseless = {*store.damaged, *(name for name, about in known.items() if about.get(PICTURES))}
+            there = {at: name for name, at in number.items() if name not in poseless}
+            if isinstance(state, CodedState):
+                own = [replace(one, numbers=np.where(np.isin(one.numbers, [*there]), one.numbers, -1)) for one in parts]
+                found = best_places(own, state, descriptors, top, execution)
+            else:
+                found = best_lines(store, there, state, descriptors, top, SequenceSettings(length=1), execution)
+            rows = zip(found.drive.tolist(), found.keyframe.tolist(), found.count.tolist(), strict=True)
+            likely = [list(zip(drive[:count], row[:count], strict=True)) for drive, row, count in rows]
+            for at in sorted({drive for one in likely for drive, _ in one}):
+                _ = drives[at].loaded
+            return likely
 
-    return search, warnings
+        likely = skip_damaged(store, attempt)
+        warnings[:] = [*problems, *damage_warnings(store)]
+        return likely
+
+    return search
 
 
 def _map_landmarks(

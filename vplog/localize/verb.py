@@ -21,6 +21,7 @@ from vplog.localize.trajectory import JoinedLog, join_by_odometry
 from vplog.results.localized_table import write_localized
 from vplog.results.tables import TableMetadata
 from vplog.run.keyframes import select_keyframes
+from vplog.storage.scratch import check_file_output
 
 if TYPE_CHECKING:
     from vplog.stages import Log
@@ -68,10 +69,7 @@ def _check_out(out: Path | None) -> None:
         return
     if out.suffix not in (".parquet", ".tum"):
         raise ResultError(f"Cannot write {out}: poses are a table or a trajectory. Name FILE.parquet or FILE.tum.")
-    if not out.parent.is_dir():
-        raise ResultError(f"Cannot write {out}: there is no folder {out.parent}. Make it, or choose another with -o.")
-    if out.is_dir():
-        raise ResultError(f"Cannot write {out}: it is a folder. Name a file with -o.")
+    check_file_output(out)
 
 
 def _frames(log: Log, places: Places) -> tuple[Any, Keyframes | None, list[str]]:

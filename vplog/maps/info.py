@@ -7,19 +7,16 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import pyarrow as pa
-
 from vplog.errors import LibraryError, ResultError
 from vplog.maps.geo_bounds import bounds_of, is_finite
 from vplog.maps.import_places import PLACES_ONLY
 from vplog.maps.joining.joint_record import components_in, replaced_since
 from vplog.maps.storage import layout, map_store
 from vplog.maps.storage.contents import damage_warnings, library_mismatch, skip_damaged
-from vplog.maps.storage.damage import damaged_files
+from vplog.maps.storage.damage import damaged_files, damaged_table
 from vplog.places.library_files import read_library_record
 from vplog.results import run_record
 from vplog.storage.folders import regular_files
-from vplog.storage.parquet_limits import open_table
 
 if TYPE_CHECKING:
     from vplog.maps.storage.map_store import Store
@@ -45,7 +42,7 @@ def _damaged_files(store: Store) -> list[str]:
     if store.mirror is None:
         lines = [line for folder in folders for line in damaged_files(folder)]
         names = (name for name in regular_files(store.root) if name.endswith(".parquet") and name[:5] != "runs/")
-        return [*lines, *(line for name in names for line in _damaged_table(store.root / name))]
+        return [*lines, *filter(None, (damaged_table(store.root / name) for name in names))]
     wrong = list(store.mirror.damaged.values())
     for drive in list(store.mirror.manifests):
         try:
@@ -54,14 +51,6 @@ def _damaged_files(store: Store) -> list[str]:
             wrong.append(str(error))
         store.evict(drive)
     return wrong
-
-
-def _damaged_table(path: Path) -> list[str]:
-    try:
-        open_table(path).close()
-    except (OSError, ValueError, pa.ArrowException, ResultError) as error:
-        return [f"{path}: {str(error).splitlines()[0]}"]
-    return []
 
 
 def _describe(store: Store) -> dict[str, Any]:

@@ -42,11 +42,6 @@ class Candidates:
         return self.proposals.rows(self.drive == number)
 
 
-def no_candidates() -> Candidates:
-    """No candidates."""
-    return Candidates(np.empty(0, np.int32), propose([], ProposeSettings()))
-
-
 def proposed_in(
     later: Sequence[Any], earlier: Sequence[Any], state: PlaceState, pipeline: Pipeline, execution: Execution
 ) -> Proposals:
@@ -91,7 +86,7 @@ def candidates_among(
     drive to itself where there are enough of them: a drive of a few hundred views is done too soon to share.
     Progress counts the pairs of drives that were compared.
     """
-    found = {number: no_candidates() for number in later}
+    found = dict.fromkeys(later, Candidates(np.empty(0, np.int32), propose([], ProposeSettings())))
     inside = Execution(-(-execution.threads // max(later)))
     total, done = sum(number in searched[one] for one in later for number in range(max(later))), 0
 

@@ -95,14 +95,9 @@ def write_drive(
     return trajectory
 
 
-def _accepted(ledger: Closures) -> np.ndarray:
-    """Rows of the verified closures."""
-    return np.flatnonzero(ledger.accepted)
-
-
 def _verified_closures(later: int, earlier: int, ledger: Closures) -> graph_joint.Between:
     """The verified closures of a ledger, for the graph."""
-    rows = _accepted(ledger)
+    rows = np.flatnonzero(ledger.accepted)
     shared = busier(ledger.match[rows], ledger.query[rows])
     return graph_joint.Between(
         later,
@@ -117,7 +112,7 @@ def _verified_closures(later: int, earlier: int, ledger: Closures) -> graph_join
 
 def _with_solve(ledger: Closures, weight: Floats, residual: Floats) -> Closures:
     """The ledger with weights and residuals (L,) of its verified rows from the joint solve."""
-    rows = _accepted(ledger)
+    rows = np.flatnonzero(ledger.accepted)
     weights, residuals, verdict = np.full(len(ledger), np.nan), np.full(len(ledger), np.nan), list(ledger.verdict)
     weights[rows], residuals[rows] = weight, residual
     for row in rows[weight < 0.5].tolist():

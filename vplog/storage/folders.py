@@ -27,7 +27,8 @@ _BOXES, _RIFF = (b"ftyp", b"moov", b"mdat"), (b"AVI ", b"WEBP")
 
 def regular_files(folder: Path) -> Iterator[str]:
     """Names of the files in a folder and below it, hidden ones too, in order, relative to it; none where there is no
-    such folder. Links are not followed. Raises ResultError at the first link, pipe, socket or device."""
+    such folder. Links are not followed. Raises ResultError at the first link, pipe, socket or device, and at a name
+    that no record can hold."""
     try:
         with os.scandir(folder) as found:
             entries = sorted(found, key=lambda entry: entry.name)
@@ -36,6 +37,8 @@ def regular_files(folder: Path) -> Iterator[str]:
     except OSError as error:
         raise ResultError(f"Cannot read {folder}: {error.strerror}. Check its permissions.") from None
     for entry in entries:
+        if not is_unicode(entry.name):
+            raise ResultError(f"{folder / entry.name} has a name that is not UTF-8, which records are. Rename it.")
         if entry.is_dir(follow_symlinks=False):
             yield from (f"{entry.name}/{name}" for name in regular_files(folder / entry.name))
         elif entry.is_file(follow_symlinks=False):
@@ -45,6 +48,11 @@ def regular_files(folder: Path) -> Iterator[str]:
                 f"{folder / entry.name} is a {kind}, and maps, runs and libraries hold only files of their own. "
                 "Replace it with a copy of the file."
             )
+
+
+def is_unicode(name: str) -> bool:
+    """Whether the name of a file is UTF-8: Python has half a character for each byte of any other."""
+    return not any("\ud800" <= character <= "\udfff" for character in name)
 
 
 def is_below(name: object) -> bool:

@@ -10,7 +10,6 @@ import http.client
 import os
 import re
 import ssl
-import sys
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -89,8 +88,7 @@ def _has_credentials() -> bool:
     """Whether the client would find any: cloud.google.com/docs/authentication/application-default-credentials."""
     if os.environ.get("GOOGLE_APPLICATION_CREDENTIALS"):
         return True
-    home = Path(os.environ.get("APPDATA", "")) if sys.platform == "win32" else Path.home() / ".config"
-    if (home / "gcloud" / "application_default_credentials.json").is_file():
+    if Path("~/.config/gcloud/application_default_credentials.json").expanduser().is_file():
         return True
     try:
         urllib.request.build_opener(urllib.request.ProxyHandler({})).open(_METADATA, timeout=_METADATA_S).close()

@@ -97,6 +97,14 @@ def copy_folder(folder: Path, target: Path, what: str, **how: Any) -> None:
         raise ResultError(f"Cannot copy {what}: {why.rpartition('] ')[2].partition(': ')[0]}.") from None
 
 
+def check_file_output(path: Path) -> None:
+    """Raises ResultError, before any work, where a file to write has no folder or is one."""
+    if not path.parent.is_dir():
+        raise ResultError(f"Cannot write {path}: there is no folder {path.parent}. Make it, or choose another with -o.")
+    if path.is_dir():
+        raise ResultError(f"Cannot write {path}: it is a folder. Name a file with -o.")
+
+
 @contextmanager
 def replacing(path: Path, parents: bool = False) -> Iterator[BinaryIO]:
     """A binary stream that becomes `path` when the block ends well; what was there before stays until then. With

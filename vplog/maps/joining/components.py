@@ -26,8 +26,8 @@ from vplog.errors import NewerError, ResultError, VplogError
 from vplog.graph.build import parts
 from vplog.graph.refine import Refined, about_odometry
 from vplog.maps.joining.joint_record import read_joint, write_joint
-from vplog.maps.storage.damage import DamagedDriveError, reading_drive
-from vplog.maps.storage.layout import key_of
+from vplog.maps.storage.damage import DamagedDriveError, damaged_table, reading_drive
+from vplog.maps.storage.layout import folder_name, key_of
 from vplog.results import g2o, run_record, tables
 from vplog.sessions.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
 from vplog.storage.scratch import put_in_place
@@ -203,7 +203,7 @@ def solve_groups(
     for done, group in enumerate(groups):
         execution.progress("solve together", done, len(groups))
         components = known.get(group.key, {}).get("components")
-        if components is None or not all((folder / one["folder"] / "component.json").is_file() for one in components):
+        if components is None or not all(_is_whole(folder / one["folder"], one["drives"]) for one in components):
             known[group.key] = _solved(store, group, pipeline, drives.library)
         solved.append(known[group.key])
     execution.progress("solve together", len(groups), len(groups))
@@ -229,6 +229,16 @@ def _joint(store: Store) -> dict[str, Any]:
         return {}
 
 
+def _is_whole(component: Path, drives: Sequence[str]) -> bool:
+    """Whether the record and the tables of a component are there, as they were written."""
+    names = [f"{folder_name(drive)}/{table}" for drive in drives for table in ("keyframes", "trajectory")]
+    try:
+        run_record.read_run_json(component / "component.json")
+    except ResultError:
+        return False
+    return not any(damaged_table(component / f"{name}.parquet") for name in ("joins", *names))
+
+
 def _solved(store: Store, group: Group, pipeline: Pipeline, library: str) -> dict[str, Any]:
     """Solve a group, and rename in its components."""
     staging = store.staging / "joint"
@@ -242,7 +252,7 @@ def _solved(store: Store, group: Group, pipeline: Pipeline, library: str) -> dic
         return {"key": "", "drives": list(group.drives), "components": [], "apart": [], "reason": str(error)}
     for component in record["components"]:
         place = store.root / "joint" / component["folder"]
-        if (place / "component.json").is_file():  # of a join that was killed; its name says that it is the same
+        if _is_whole(place, component["drives"]):  # of a join that was killed; its name says that it is the same
             continue
         place.parent.mkdir(exist_ok=True)
         shutil.rmtree(place, ignore_errors=True)

@@ -18,6 +18,7 @@ from vplog.cache.code_hash import code_of
 from vplog.data import SharedReferences
 from vplog.errors import ResultError
 from vplog.maps.joining.members import CameraTrust, Member, camera_trust, keep_features, opened_drive
+from vplog.maps.storage.damage import damaged_table
 from vplog.maps.storage.layout import folder_name, key_of, quoted
 from vplog.results import run_record, tables
 from vplog.sessions.inter_session import closures_between, with_shared
@@ -119,12 +120,9 @@ def put_ledger(store: Store, task: PairTask, data: bytes) -> None:
 
 
 def is_stored(store: Store, task: PairTask) -> bool:
-    """Whether the ledger is stored, made from the same."""
+    """Whether the ledger is stored whole, made from the same."""
     path = ledger_path(store, task.later.drive, task.earlier.drive)
-    try:
-        return path.is_file() and tables.read_metadata(path).get("vplog.made_from") == task.key
-    except ResultError:  # damaged: it is computed again
-        return False
+    return not damaged_table(path) and tables.read_metadata(path).get("vplog.made_from") == task.key
 
 
 def known_camera(store: Store, member: Member, pipeline: Pipeline) -> CameraTrust | None:

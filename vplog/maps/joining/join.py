@@ -27,6 +27,7 @@ from vplog.maps.joining.candidate_drives import candidates_of, places_of
 from vplog.maps.joining.components import Drives, PairLedger, solve_groups
 from vplog.maps.joining.members import CameraTrust, Member, member_of, why_not_joined
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
+from vplog.maps.storage.damage import damaged_table
 from vplog.maps.storage.layout import PICTURES
 from vplog.maps.storage.map_store import Store, reading, writing
 from vplog.pipeline import Pipeline
@@ -169,7 +170,7 @@ def _is_up_to_date(store: Store, drives: Drives, at: int, pipeline: Pipeline) ->
     return joins.made_from == drive_pairs.search_key(member, pipeline) and all(
         drives.counts(at, pair)
         and pair["ledger"]
-        and drive_pairs.ledger_path(store, member.drive, pair["match"]).is_file()
+        and not damaged_table(drive_pairs.ledger_path(store, member.drive, pair["match"]))
         for pair in joins.pairs
     )
 

@@ -30,6 +30,7 @@ from vplog.results.run_record import read_run_json
 from vplog.run.keyframes import select_keyframes
 from vplog.stages import CodedState, FrameState, Log, PlaceState, StoredState
 from vplog.storage.remote_path import RemotePath
+from vplog.storage.scratch import check_file_output
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -62,11 +63,8 @@ def query_map(
 
     Views are chosen and described as the map's drives were, with its library. Raises VplogError with one line.
     """
-    out = query.out
-    if out is not None and not out.parent.is_dir():  # before any work
-        raise ResultError(f"Cannot write {out}: there is no folder {out.parent}. Make it, or choose another with -o.")
-    if out is not None and out.is_dir():
-        raise ResultError(f"Cannot write {out}: it is a folder. Name a file with -o.")
+    if (out := query.out) is not None:
+        check_file_output(out)
     with map_store.reading(root, query.cache) as store:
         _, pipeline, state = open_map(store, execution)
         settings = pipeline.sequence

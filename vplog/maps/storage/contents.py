@@ -10,16 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import unquote
 
-import pyarrow as pa
-
 from vplog.errors import LibraryError, NewerError, ResultError, nearest_path
 from vplog.maps.geo_bounds import earth_from_record, earth_of_run
-from vplog.maps.storage.damage import DamagedDriveError, check_run_tables, damaged_files, reading_drive
-from vplog.maps.storage.layout import ADD_AGAIN, FORMAT, HASH, RUN_TABLES, drive_record, folder_name, write_changed
+from vplog.maps.storage.damage import DamagedDriveError, check_run_tables, damaged_files, reading_drive, rows_of
+from vplog.maps.storage.layout import FORMAT, HASH, RUN_TABLES, drive_record, folder_name, write_changed
 from vplog.maps.storage.upload import send_rest, write_json
 from vplog.results import run_record
 from vplog.storage.folders import regular_files
-from vplog.storage.parquet_limits import check_version, read_footer
+from vplog.storage.parquet_limits import check_version
 from vplog.version import __version__
 
 if TYPE_CHECKING:
@@ -127,13 +125,8 @@ class Store:
         """Rows of a table of a drive, by its footer. Raises DamagedDriveError."""
         if self.mirror is not None:
             return int(self.mirror.manifests[drive]["files"].get(f"{name}.parquet", {}).get("rows", 0))
-        path = self.run(drive) / f"{name}.parquet"
         with reading_drive(drive):
-            try:
-                return read_footer(path).num_rows
-            except (OSError, ValueError, pa.ArrowException) as error:
-                why = str(error).splitlines()[0]
-                raise ResultError(f"{path} cannot be read: {why} Check its permissions, or {ADD_AGAIN}") from None
+            return rows_of(self.run(drive) / f"{name}.parquet")
 
     def earth(self, drive: str) -> Earth | None:
         """The georeference of a drive, None where it has none. Raises DamagedDriveError."""

@@ -25,11 +25,11 @@ from typing import TYPE_CHECKING
 from vplog.errors import LibraryError, ResultError, VplogError
 from vplog.maps.storage import lease_lock, local, upload
 from vplog.maps.storage.contents import Head, Store, common_library
-from vplog.maps.storage.damage import complete_record
+from vplog.maps.storage.damage import complete_record, damaged_table
 from vplog.maps.storage.layout import HASH, TABLES, drive_record, folder_name
 from vplog.maps.storage.remote_map import Mirror
 from vplog.results import run_record
-from vplog.storage.folders import check_regular
+from vplog.storage.folders import check_regular, regular_files
 from vplog.storage.remote_path import RemotePath, check_writable
 from vplog.storage.scratch import put_in_place, scratch
 
@@ -163,6 +163,11 @@ def add_library(store: Store, made: Path, digest: str) -> Path:
     """Make a folder in staging the library of this hash; it stays as it is where the map has it."""
     if not HASH.fullmatch(digest):
         raise LibraryError(f"{made} has no valid hash ({digest[:20]!r}). Build it again: vplog library")
+    for name in regular_files(made):
+        if name.endswith(".parquet") and damaged_table(made / name):
+            raise LibraryError(
+                f"{name} of library {digest[:12]} is damaged, so it is not put into {store}. Copy it back first."
+            )
     folder = store.library(digest)
     try:
         folder.parent.mkdir(exist_ok=True)

@@ -11,11 +11,9 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-
 from vplog.errors import NewerError, ResultError, SettingsError
 from vplog.maps.storage import objects
+from vplog.maps.storage.damage import rows_of
 from vplog.maps.storage.layout import RUN_TABLES, TABLES, folder_name, sha256_of
 from vplog.maps.storage.remote_map import Mirror, store_errors
 from vplog.results import run_record
@@ -73,7 +71,7 @@ def publish(mirror: Mirror, drive: str, made: Path) -> None:
     """Send a finished run folder and then its manifest. Raises ResultError; then the store has the drive as before."""
     mirror.check_lock()
     place, generation = mirror.remote / "runs" / folder_name(drive), secrets.token_hex(8)
-    rows = {f"{name}.parquet": {"rows": _rows(made / f"{name}.parquet")} for name in TABLES}
+    rows = {f"{name}.parquet": {"rows": rows_of(made / f"{name}.parquet")} for name in TABLES}
     with store_errors(mirror.remote):
         sent = _send_all(files_in(made), made, place / generation)
         try:
@@ -115,13 +113,6 @@ def _send_all(names: list[str], folder: Path, place: RemotePath) -> dict[str, di
 
     with ThreadPoolExecutor(_SENT_AT_ONCE) as pool:
         return dict(zip(names, pool.map(send, names), strict=True))
-
-
-def _rows(file: Path) -> int:
-    try:
-        return pq.read_metadata(file).num_rows
-    except (OSError, pa.ArrowException) as error:
-        raise ResultError(f"{file} cannot be read: {str(error).splitlines()[0].rstrip('.')}. Run again.") from None
 
 
 def _finish_publish(mirror: Mirror, drive: str, manifest: dict[str, Any]) -> None:
