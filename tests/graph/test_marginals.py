@@ -14,22 +14,31 @@ from tests.graph.gtsam_graph import as_values, weighted
 from vplog.geometry import se3
 from vplog.graph.factors import Factors
 from vplog.graph.least_squares import Objective, Positions, minimised
-from vplog.graph.marginals import pose_covariances
+from vplog.graph.marginals import SharedScale, pose_covariances
 from vplog.graph.sparse import linear
 
 WORLDS = 200
 
 
-def test_mean_nees_over_many_worlds_is_within_its_interval() -> None:
-    """One keyframe of each, so that they are independent: their sum is chi-square distributed with 6 degrees each."""
+@pytest.mark.parametrize("shared", [(), (0.02, 0.05)])
+def test_mean_nees_over_many_worlds_is_within_its_interval(shared: tuple[float, ...]) -> None:
+    """One keyframe of each, so that they are independent: their sum is chi-square distributed with 6 degrees each.
+
+    Also where all metres of the odometry are wrong alike, and those of the closures, with these sigmas.
+    """
     random, total = np.random.default_rng(0), 0.0
     for seed in range(WORLDS):
         drive = ring(14, 4, seed=seed)
-        objective = Objective(Factors.of(drive.graph), np.ones(len(drive.graph.a)))
-        poses = minimised(objective, drive.graph.world_from_body, 20, 1e-9).world_from_body
+        a_from_b, odometry = drive.graph.a_from_b.copy(), drive.graph.odometry
+        scales = [SharedScale(edges, sigma) for edges, sigma in zip((odometry, ~odometry), shared, strict=False)]
+        for edges, sigma in scales:
+            a_from_b[edges, :3, 3] *= 1.0 + sigma * random.normal()
+        graph = replace(drive.graph, a_from_b=a_from_b)
+        objective = Objective(Factors.of(graph), np.ones(len(graph.a)))
+        poses = minimised(objective, graph.world_from_body, 20, 1e-9).world_from_body
         row = int(random.integers(1, 14))
         first_from = [se3.between(one[:1], one[row : row + 1]) for one in (poses, drive.true)]
-        covariance = pose_covariances(objective, poses)[row : row + 1]
+        covariance = pose_covariances(objective, poses, scales)[row : row + 1]
         total += float(se3.mahalanobis2(se3.log(se3.between(*first_from)), covariance)[0])
     low, high = stats.chi2.interval(0.99, 6 * WORLDS) / np.array(6 * WORLDS)
     assert low < total / (6 * WORLDS) < high
@@ -44,7 +53,10 @@ def test_covariances_are_those_of_gtsam(large: bool, monkeypatch: pytest.MonkeyP
     weight[-5:] = 0.0
     objective = Objective(Factors.of(drive.graph), weight)
     poses = minimised(objective, drive.graph.world_from_body, 20, 1e-9).world_from_body
+    scaled = pose_covariances(objective, poses, [SharedScale(np.ones(len(weight), bool), 0.02)])
     found = pose_covariances(objective, poses)
+    away = se3.between(poses, poses[:1])[:, :3, 3]  # from the first pose, all metres being wrong alike
+    np.testing.assert_allclose((scaled - found)[:, 3:, 3:], 0.02**2 * away[:, :, None] * away[:, None], atol=2e-3)
     assert not found[0].any()
     marginals = gtsam.Marginals(weighted(drive.graph, weight), as_values(se3.between(poses[:1], poses), 3))
     expected = np.array([marginals.marginalCovariance(node) for node in range(60)])

@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from vplog.geometry import se3
 from vplog.graph.build import AXES, parts
+from vplog.graph.normal_equations import normal_equations
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, Ints
+    from collections.abc import Sequence
+
+    from vplog.data import Bools, Floats, Ints
     from vplog.graph.factors import Factors
     from vplog.graph.least_squares import Objective
     from vplog.graph.sparse.linear import BayesTree, Supernodes
+
+_STEP = 1e-4
+"""Step of a scale for differences: far above rounding, and errors of edges are linear in it."""
+
+
+class SharedScale(NamedTuple):
+    """An error of the metres of some edges that they share: a factor of 1 with this standard deviation."""
+
+    edges: Bools
+    """(E,)."""
+    sigma: float
 
 
 def edge_covariances(objective: Objective, poses: Floats, edges: Ints) -> Floats:
@@ -31,24 +46,42 @@ def edge_covariances(objective: Objective, poses: Floats, edges: Ints) -> Floats
     return bb - mixed - np.swapaxes(mixed, 1, 2) + Ad @ aa @ np.swapaxes(Ad, 1, 2)
 
 
-def pose_covariances(objective: Objective, poses: Floats) -> Floats:
+def pose_covariances(objective: Objective, poses: Floats, scales: Sequence[SharedScale] = ()) -> Floats:
     """Covariance (N, d, d) of world_from_body of every pose, in its own frame, after the least squares at `poses`.
 
     Relative to the first pose, whose own is 0, or with positions to where these are measured; d = 6, or 3 in the plane.
-    To first order; NaN where edges of positive weight do not lead to pose 0. Raises GraphError where the poses are not
-    determined.
+    What the errors of `scales` add no number of edges averages out. To first order; NaN where edges of positive weight
+    do not lead to pose 0. Raises GraphError where the poses are not determined.
     """
     graph, on = objective.factors.graph, np.flatnonzero(objective.weight > 0)
     a, b = graph.a[on], graph.b[on]
     ends = np.concatenate([a, b])
-    aa, _, bb = objective.information(poses).inverse_blocks(a, b)
+    information = objective.information(poses)
+    aa, _, bb = information.inverse_blocks(a, b)
     result = np.full((len(poses), *aa.shape[1:]), np.nan)
     result[ends] = np.concatenate([aa, bb])
+    if scales:
+        moved = information.solve(_by_scales(objective, poses, scales))
+        result += moved @ np.swapaxes(moved, 1, 2)
     part = parts(len(poses), a, b)
     result[part != part[0]] = np.nan
     if objective.positions is None:
         result[0] = 0.0
     return result
+
+
+def _by_scales(objective: Objective, poses: Floats, scales: Sequence[SharedScale]) -> Floats:
+    """(N, d, S) by how much one sigma of each scale changes the gradient at `poses`."""
+    graph = objective.factors.graph
+    columns = []
+    for edges, sigma in scales:
+        gradients = []
+        for factor in (1.0 - _STEP, 1.0 + _STEP):
+            a_from_b = graph.a_from_b.copy()
+            a_from_b[edges, :3, 3] *= factor
+            gradients.append(normal_equations(replace(graph, a_from_b=a_from_b), objective.weight, poses)[1])
+        columns.append((gradients[1] - gradients[0]) * (sigma / (2.0 * _STEP)))
+    return np.stack(columns, axis=2)
 
 
 def positions_redundancy(objective: Objective, poses: Floats) -> float:

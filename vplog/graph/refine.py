@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +13,7 @@ from vplog.graph.evidence import runs
 from vplog.graph.factors import Factors
 from vplog.graph.gps_factors import Fixes, inlier_fixes, with_fixes, with_noise_of, world_from_enu
 from vplog.graph.least_squares import Objective, minimised
-from vplog.graph.marginals import positions_redundancy
+from vplog.graph.marginals import SharedScale, positions_redundancy
 from vplog.graph.variance_components import Sigmas, claimed_times, estimate, extrapolated
 from vplog.settings import Settings
 
@@ -113,6 +113,8 @@ class Refined:
     """(F,) 1 for the GPS fixes that were kept, 0 for the others; empty without GPS."""
     world_from_enu: Floats | None
     """(4, 4) from the plane of the first fix, None without GPS."""
+    unknown: list[SharedScale] = field(default_factory=list)
+    """Errors that are left in the metres of the odometry, and of the closures that have their own."""
 
 
 def about_odometry(refined: Refined) -> dict[str, float]:
@@ -154,8 +156,10 @@ def refine(
     if fixes is not None:
         poses, inlier = inlier_fixes(Factors.of(rescaled(graph, scales, sigmas)), weight, poses, fixes)
         checked = True
+    left: dict[str, float] = {}
     if not checked or not (settings.noise or settings.scale):
-        return _refined(rescaled(graph, [], sigmas), solution, poses, sigmas, [], fixes, inlier)
+        refined = _refined(rescaled(graph, [], sigmas), solution, poses, sigmas, [], fixes, inlier)
+        return replace(refined, unknown=_unknown(of_odometry, loops, left, settings))
 
     scales, trail = scales if settings.scale else [], [sigmas]
     measured = _Measurements(graph, weight, fixes, inlier)
@@ -170,6 +174,7 @@ def refine(
                 sigmas = extrapolated(*trail[-3:])
                 trail = [sigmas]
         moved = [_scale_step(measured, scales, number, sigmas, poses) for number in range(len(scales))]
+        left |= {one.of: sigma / one.witnesses**0.5 for one, (_, sigma) in zip(scales, moved, strict=True)}
         if fixes is not None:
             fixes, inlier, factor = with_noise_of(fixes, inlier, poses, positions_redundancy(objective, poses))
             measured = replace(measured, fixes=fixes, inlier=inlier)
@@ -185,7 +190,19 @@ def refine(
     else:
         scales = []  # they wander
     poses = minimised(measured.objective(scales, sigmas, poses), poses, _STEPS, 1e-6).world_from_body
-    return _refined(rescaled(graph, scales, sigmas), solution, poses, sigmas, scales, fixes, inlier)
+    refined = _refined(rescaled(graph, scales, sigmas), solution, poses, sigmas, scales, fixes, inlier)
+    return replace(refined, unknown=_unknown(of_odometry, loops, left, settings))
+
+
+def _unknown(of_odometry: Bools, loops: Bools, left: dict[str, float], settings: RefineSettings) -> list[SharedScale]:
+    """Shared errors of metres: as the priors have them, or with the sigmas `left` where they were estimated; closures
+    whose scale was held against the odometry's share the odometry's too."""
+    own = loops & ~of_odometry
+    sigma = {"odometry": settings.scale_sigma, "closures": settings.closure_scale_sigma} | left
+    return [
+        SharedScale(of_odometry | own if "closures" in left else of_odometry, sigma["odometry"]),
+        SharedScale(own, min(sigma["closures"], settings.closure_scale_sigma)),
+    ]
 
 
 def _lengths(graph: PoseGraph, edges: Bools) -> Floats:

@@ -170,15 +170,15 @@ def about_gps(solved: Solved) -> dict[str, Any] | None:
 
 
 def keyframe_covariances(solved: Solved) -> Floats | None:
-    """(N, 6, 6) of the keyframes as the graph has them in the end, with the noise as estimated and the GPS fixes kept;
-    None where edges and fixes do not determine them."""
+    """(N, 6, 6) of the keyframes as the graph has them in the end, with the noise as estimated, the GPS fixes kept and
+    the scales that are not known; None where edges and fixes do not determine them."""
     refined, fixes = solved.refined, solved.fixes
     factors, poses, weight = Factors.of(refined.graph), refined.solution.world_from_body, refined.solution.weight
     objective = Objective(factors, weight)
     if fixes is not None and refined.inlier.any():
         objective = with_fixes(factors, weight, poses, fixes, refined.inlier)
     try:
-        return pose_covariances(objective, poses)
+        return pose_covariances(objective, poses, refined.unknown)
     except GraphError as error:
         _log.warning("The covariance of the keyframes is not known: %s", error)
         return None
