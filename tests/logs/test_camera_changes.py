@@ -136,13 +136,18 @@ def test_a_calibration_of_nan_is_not_set(tmp_path: Path) -> None:
     np.testing.assert_allclose(matrix, K)
 
 
-def test_calibrations_without_a_stamp_hold_from_their_log_time(tmp_path: Path) -> None:
-    """A lens that zooms, by a driver that stamps nothing."""
+@pytest.mark.parametrize(("stamped", "late_ns"), [(False, None), (True, None), (True, 3_000_000), (True, -(10**18))])
+def test_a_calibration_holds_from_its_image_on(stamped: bool, late_ns: int | None, tmp_path: Path) -> None:
+    """A lens that zooms, by a driver that stamps nothing, or the calibrations not as the images."""
     doubled = np.diag([2, 2, 1]) @ K
     messages = [image(SCENE, i, "/cam/image") for i in range(8)]
     messages += [info(K if i < 4 else doubled, SIZE, i) for i in range(8)]
     for message in messages:
-        message.message.header.stamp.__dict__.update(sec=0, nanosec=0)
+        of_image = message.topic == "/cam/image"
+        if of_image and stamped:
+            continue
+        stamp_ns = 0 if of_image or late_ns is None else message.stamp_ns + late_ns
+        message.message.header.stamp.__dict__.update(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
     log = logs.open(written(tmp_path / "drive", sorted(messages, key=lambda m: m.stamp_ns)))
     zoomed = [not np.array_equal(one, SCENE) for one in decoded(log)]
     assert zoomed == [False] * 4 + [True] * 4

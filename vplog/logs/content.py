@@ -145,8 +145,8 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     notes.extend(gps_notes)
     if gps is not None and read.fixes and body and (placed := tree.between(body, read.fixes.frame)) is not None:
         gps = replace(gps, antenna_m=placed[:3, 3])
-    calibrations = read.calibrations.finish(notes)
-    right_calibration = next(iter(read.right_calibrations.finish(notes)), None)
+    calibrations = read.finished(read.calibrations, notes)
+    right_calibration = next(iter(read.finished(read.right_calibrations, notes)), None)
     return Content(
         stamp_ns, places, read.images.stream, rows, paired[0], paired[1], paired[2], calibrations, right_calibration,
         odometry, frames, gps, tree, read.skew_ms(), chosen, [source for source, _ in sources], rates_hz,

@@ -86,32 +86,52 @@ class Calibrations:
 
     channel: Channel | None
     found: list[CalibrationMessage] = field(default_factory=list)
+    positions: list[int] = field(default_factory=list)
+    """Positions of those in the order of the file."""
     unset: int = 0
     """Messages before the first that is set."""
     _last: bytes = b""
     _first: CalibrationMessage | None = None
 
-    def add(self, calibration: CalibrationMessage, data: Octets) -> None:
+    def add(self, calibration: CalibrationMessage, data: Octets, position: int) -> None:
         self._last = bytes(data[_HEADER:])
         self._first = self._first or calibration
         if not calibration.is_set:
             self.unset += not self.found
         elif not self.found or not self.found[-1].equals(calibration):
             self.found.append(calibration)
+            self.positions.append(position)
 
     def repeats(self, data: Octets) -> bool:
         """Whether a message of ROS is that before it but for its stamp."""
         ros = self.channel is not None and self.channel.encoding in ("cdr", "ros1")
         return ros and bool(self.found) and data[_HEADER:] == self._last
 
-    def finish(self, notes: Notes) -> list[CalibrationMessage]:
-        """The calibrations that are set; the first one where none is."""
+    def finish(self, images: Stamps, times: Stamps, notes: Notes) -> list[CalibrationMessage]:
+        """The calibrations that are set; the first one where none is. Each with the stamp of the first of the `images`
+        that it is of: the nearest by header stamps where these are of the images' clock, else by the log `times` of
+        the topic."""
         if self.unset and self.found and self.channel:
             notes.add(
                 f"The first {plural(self.unset, 'calibration')} of {self.channel.topic} "
                 f"{'is' if self.unset == 1 else 'are'} not set (K is zero or NaN); the first that is set is used."
             )
-        return self.found or ([self._first] if self._first else [])
+        stamp_ns, rows = images.order("", Notes())
+        if not self.found or not len(rows):
+            return self.found or ([self._first] if self._first else [])
+        header_ns, log_ns = (np.array(one, np.int64)[rows] for one in (images.header_ns, images.log_ns))
+        own_ns = np.array([one.stamp_ns for one in self.found], np.int64)
+        logged_ns = np.array(times.log_ns, np.int64)[np.searchsorted(times.positions(), self.positions)]
+        same_clock = (own_ns != 0) & (own_ns >= header_ns.min()) & (own_ns <= header_ns.max())
+        first = np.where(same_clock, _nearest(header_ns, own_ns), _nearest(log_ns, logged_ns))
+        return [replace(one, stamp_ns=at) for one, at in zip(self.found, stamp_ns[first].tolist(), strict=True)]
+
+
+def _nearest(known_ns: Ints, wanted_ns: Ints) -> Ints:
+    """(M,) rows of the nearest of (K,), which are in no order."""
+    order = np.argsort(known_ns, kind="stable")
+    ordered = known_ns[order]
+    return order[np.searchsorted(ordered[:-1] + np.diff(ordered) // 2, wanted_ns)]
 
 
 class TopicCollector:
@@ -221,6 +241,12 @@ class TopicCollector:
         """The calibrations that a channel holds, if it is one of them."""
         return next((one for one in (self.right_calibrations, self.calibrations) if one.channel == channel), None)
 
+    def finished(self, calibrations: Calibrations, notes: Notes) -> list[CalibrationMessage]:
+        """The calibrations of the camera or the right one, stamped as its images."""
+        images = self.rights if calibrations is self.right_calibrations else self.images
+        times = self._others[calibrations.channel] if calibrations.channel else Stamps()
+        return calibrations.finish(images.stamps, times, notes)
+
     def stamps(self) -> list[tuple[str, Stamps]]:
         """Every topic that is followed over time, with its stamps."""
         images = [
@@ -251,7 +277,7 @@ class TopicCollector:
         channel = message.channel
         match decode(channel, message.data):
             case CalibrationMessage() as calibration if known := self.calibrations_of(channel):
-                known.add(replace(calibration, stamp_ns=calibration.stamp_ns or message.log_ns), message.data)
+                known.add(calibration, message.data, position)
             case PoseMessage() as pose if channel in self.poses:
                 self.poses[channel].add(pose, message.log_ns, position)
             case PathMessage(stamp_ns, _, poses):
