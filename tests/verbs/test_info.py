@@ -18,6 +18,8 @@ from tests.logs.test_rectification import BASELINE_M, PINHOLES, RIGHT_FROM_LEFT
 from tests.logs.test_rectification import drive as write_pair
 from vplog import logs
 from vplog.cli import main, parser
+from vplog.demo.scene import make_scene, take_picture
+from vplog.demo.settings import DemoSettings
 from vplog.logs import TopicChoice
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.storage.json_records import plain
@@ -96,6 +98,26 @@ def test_what_stops_a_run_is_a_problem(drive: Path, tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as ended:
         main.main(["info", str(tmp_path / "empty.mcap")])
     assert ended.value.code == 0  # the answer is the preflight's, not an error
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_camera_that_stands_is_a_problem_of_visual_odometry(moves: bool, tmp_path: Path) -> None:
+    """A KITTI sequence of a pair: what its run would find out after all of its images."""
+    street = make_scene(DemoSettings(laps=0.5, frame_rate_hz=6, width=384, height=216, seed=3))
+    assert street.camera.matrix is not None
+    for side, metres in enumerate((0.0, 0.3)):
+        (tmp_path / f"image_{side}").mkdir()
+        for row in range(4):
+            image = take_picture(street, row * moves, metres)[0]
+            assert cv2.imwrite(str(tmp_path / f"image_{side}" / f"{row:06d}.png"), image)
+    (tmp_path / "times.txt").write_text("".join(f"{row / 6:e}\n" for row in range(4)))
+    matrices = [street.camera.matrix @ np.column_stack([np.eye(3), [-metres, 0.0, 0.0]]) for metres in (0.0, 0.3)]
+    rows = [" ".join(map(str, matrix.ravel())) for matrix in matrices]
+    (tmp_path / "calib.txt").write_text(f"P0: {rows[0]}\nP1: {rows[1]}\n")
+    found = preflight(tmp_path).record
+    assert found["visual_odometry"] == "used"
+    assert [line.startswith("The camera stands") for line in found["problems"]] == [True] * (not moves)
+    assert ("vplog run" in found["command"]) == moves
 
 
 def words_of(told: str | None) -> list[str]:

@@ -170,7 +170,7 @@ def split_keyframes(
     if len(stamp_ns) < 2:
         raise LogError(
             f"{keyframes.drive}: by the odometry nothing moves far enough for a second keyframe, and a graph needs "
-            "two. Set keyframes.distance_m lower, or choose another topic with --odometry-topic."
+            "two. Set keyframes.distance_m lower, or choose another source with --odometry."
         )
     topics, paths = topics or logs.TopicChoice(), tuple(address(file.resolve()) for file in files_of(drive))
     alike = {

@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 
 from vplog import logs
-from vplog.data import Bytes, Camera, Gps, Ints, LogInfo, Odometry, OdometrySource, Topic
+from vplog.data import Bytes, Camera, Frame, Gps, Ints, LogInfo, Odometry, OdometrySource, Topic
 from vplog.errors import LogError
+from vplog.geometry.masking import masked
 from vplog.logs.clocks import GAP_NS, GAP_PERIODS
 from vplog.logs.odometry_sources import PROPERTIES, evidence_text
 from vplog.logs.stamps import rate_hz
@@ -22,6 +23,7 @@ from vplog.results.html import render
 from vplog.results.previews import jpeg
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.run.odometry import gives_visual
+from vplog.run.visual_odometry.visual import visual_odometry
 from vplog.storage.json_records import plain
 from vplog.storage.remote_path import address
 from vplog.storage.scratch import replacing
@@ -106,10 +108,14 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
     problems: list[str] = []
     camera, odometry, gps = _camera(log, problems), log.odometry(), log.gps()
     stamp_ns = log.stamps() if camera is not None else np.zeros(0, np.int64)
-    pictures, decoded = _pictures(log, stamp_ns, problems)
+    sampled, decoded = _sampled(log, stamp_ns, problems)
     visual = camera is not None and gives_visual(log)
     by_images = visual and odometry is None and topics.odometry in (None, "visual")
-    keyframes, missing = (None, []) if by_images else _keyframes(log, stamp_ns, odometry, problems)
+    keyframes, missing = None, []
+    if by_images and camera is not None:
+        _check_moves(log.name, sampled, camera, problems)
+    else:
+        keyframes, missing = _keyframes(log, stamp_ns, odometry, problems)
     warnings = [line for line in dict.fromkeys(found.warnings + log.warnings + missing) if line not in problems]
     named = {**asdict(found), "warnings": warnings}
     for topic, entry in zip(found.topics, named["topics"], strict=True):
@@ -118,7 +124,7 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
         **named,
         "camera": None if camera is None else {name: plain(getattr(camera, name)) for name in _CAMERA},
         "frames": {
-            "count": len(stamp_ns), **_timing(stamp_ns), "sampled": decoded[1], "decoded": decoded[0],
+            "count": len(stamp_ns), **_timing(stamp_ns), "sampled": decoded, "decoded": len(sampled),
             "keyframes": keyframes,
         },
         "odometry": _about_odometry(odometry, found, topics),
@@ -131,7 +137,7 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
         "ready": not problems,
         "command": command(path, topics),
     }  # fmt: skip
-    return Preflight(record, pictures)
+    return Preflight(record, [(frame.stamp_ns, _small(frame.image)) for frame in sampled])
 
 
 def command(path: Path, topics: TopicChoice) -> str:
@@ -151,19 +157,19 @@ def _camera(log: Log, problems: list[str]) -> Camera | None:
         return None
 
 
-def _pictures(log: Log, stamp_ns: Ints, problems: list[str]) -> tuple[list[tuple[int, Bytes]], tuple[int, int]]:
-    """Frames evenly spread over the drive that decode, and how many of how many did."""
+def _sampled(log: Log, stamp_ns: Ints, problems: list[str]) -> tuple[list[Frame], int]:
+    """Frames evenly spread over the drive that decode, and how many were tried."""
     rows = np.unique(np.linspace(0, len(stamp_ns) - 1, min(_SAMPLES, len(stamp_ns))).astype(np.int64))
-    pictures: list[tuple[int, Bytes]] = []
+    frames: list[Frame] = []
     reason = ""
     for encoded in log.frames(stamp_ns[rows]) if len(rows) else ():
         try:
-            pictures.append((encoded.stamp_ns, _small(encoded.decode().image)))
+            frames.append(encoded.decode())
         except LogError as error:
             reason = reason or str(error)
-    if len(rows) and not pictures:
+    if len(rows) and not frames:
         problems.append(f"None of {len(rows)} frames tried can be decoded. The first: {reason}")
-    return pictures, (len(pictures), len(rows))
+    return frames, len(rows)
 
 
 def _small(image: Bytes) -> Bytes:
@@ -195,6 +201,26 @@ def _keyframes(
             "odometry with --odometry-topic or --odometry-file."
         )
     return len(keyframes.stamp_ns), missing
+
+
+def _check_moves(drive: str, frames: list[Frame], camera: Camera, problems: list[str]) -> None:
+    """Note a camera that stands: one that is tracked through most of these frames and gives no second keyframe. Where
+    they are too far apart to be tracked it moves, or only the whole drive tells."""
+    odometry = visual_odometry(map(masked, frames), camera)
+    if (
+        odometry is None
+        or len(odometry.stamp_ns) <= len(frames) / 2
+        or (odometry.breaks is not None and len(odometry.breaks))
+    ):
+        return
+    keyframes, _ = select_keyframes(drive, odometry.stamp_ns, odometry, KeyframeSettings())
+    if len(keyframes.stamp_ns) < 2:
+        position = odometry.odom_from_body[:, :3, 3]
+        most_m = float(np.linalg.norm(position - position[0], axis=1).max())
+        problems.append(
+            f"The camera stands: by visual odometry it moves {most_m:.1g} m between {len(frames)} frames spread over "
+            "the drive, and a graph needs two keyframes. Give a longer part of it, or poses with --odometry-file."
+        )
 
 
 def _why(topic: Topic, found: LogInfo, topics: TopicChoice) -> str:
