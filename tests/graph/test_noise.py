@@ -75,14 +75,21 @@ def test_increments_agree_with_simulated_errors() -> None:
     np.testing.assert_allclose(np.cov(error.T), expected[0], atol=0.08 * np.abs(expected).max())
 
 
-def test_growing_covariance_is_taken_apart_into_the_increments() -> None:
-    logged = np.zeros((T, 6, 6))
-    for k in range(1, T):
-        moved = se3.adjoint(se3.between(POSES[k], POSES[k - 1]))
-        logged[k] = moved @ logged[k - 1] @ moved.T + SMALL
-    logged[0] = 1e-9 * np.eye(6)
-    result, _, source = edge_covariance(odometry(logged), STAMPS[::10], WIDE)
-    increments, _, other = edge_covariance(odometry(SMALL + np.zeros((T, 1, 1))), STAMPS[::10], WIDE)
+def accumulated(poses: np.ndarray) -> np.ndarray:
+    """(T, 6, 6) of the poses since the start, each increment with the noise `SMALL`."""
+    result = [1e-9 * np.eye(6)]
+    for moved in se3.adjoint(se3.between(poses[1:], poses[:-1])):
+        result.append(moved @ result[-1] @ moved.T + SMALL)
+    return np.array(result)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.1], ids=["away", "in circles"])
+def test_growing_covariance_is_taken_apart_into_the_increments(turn: float) -> None:
+    """In circles that of the translations grows and shrinks with the distance from the start."""
+    poses = np.array(list(accumulate(STEPS @ se3.exp(np.array([[0, 0, turn, 2.0, 0, 0]])), np.matmul)))
+    drive = Odometry(STAMPS, poses, accumulated(poses))
+    result, _, source = edge_covariance(drive, STAMPS[::10], WIDE)
+    increments, _, other = edge_covariance(Odometry(STAMPS, poses, SMALL + np.zeros((T, 1, 1))), STAMPS[::10], WIDE)
     assert (source, other) == ("accumulated", "increments")
     np.testing.assert_allclose(result, increments, rtol=1e-3, atol=1e-6)
 

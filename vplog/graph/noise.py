@@ -77,7 +77,7 @@ def covariance_without_breaks(
        variance is rate^2 * memory * travelled, a random walk that equals the linear rate once `memory` is travelled
        (or the whole drive, where that is shorter). Drift is systematic (scale, bias), so independent edges with
        the plain rate each would claim a drift that only grows with the root of the distance, far too small.
-    2. `accumulated`: its trace grows over the drive: it is the covariance P of the pose since the start, right
+    2. `accumulated`: the trace of its rotations or translations grows over the drive: it is the covariance P of the pose since the start, right
        perturbation, so the edge's is P_b - Ad(b_from_a) P_a Ad(b_from_a)^T. Where a driver leaves out the lever arm
        of the heading that difference is not a covariance, and P_a is only rotated.
     3. `increments`: it is constant or fluctuates. That cannot belong to an accumulated pose, so it is the noise of
@@ -126,7 +126,7 @@ def covariance_without_breaks(
     # an unknown axis must not leak into known ones through the adjoint: the model fills it in at the end
     logged = np.where((known[:, None] & known) & usable[:, None, None], logged, 0.0)
     logged = (logged + np.swapaxes(logged, 1, 2)) / 2
-    source = "accumulated" if _grows(variance[:, known]) else "increments"
+    source = "accumulated" if _grows(variance, known) else "increments"
     difference = _difference if source == "accumulated" else _sum
     covariance = difference(odometry, keys, logged)
     for axis in np.flatnonzero(~known):
@@ -195,12 +195,17 @@ def _travelled(stamps: Ints, step: Floats, keys: Ints) -> Floats:
     return np.diff(np.interp(keys - stamps[0], since_start, np.concatenate([[0.0], np.cumsum(step)])))
 
 
-def _grows(variance: Floats) -> bool:
-    """Whether the trace of (S, K) variances grows over the drive, allowing a hiccup per hundred samples."""
-    trace: Floats = variance.sum(1)
-    return bool(
-        (np.diff(trace) >= -1e-9 * trace[1:]).mean() > 0.99 and trace[-1] > 2.0 * trace[: len(trace) // 4 + 1].min()
-    )
+def _grows(variance: Floats, known: Bools) -> bool:
+    """Whether the trace of the rotations or that of the translations of (S, 6) variances grows over the drive, allowing
+    a hiccup per hundred samples. With the lever arm of the heading the translations of a drive that comes back shrink.
+    """
+    rotation = np.arange(6) < 3
+    for part in (known & rotation, known & ~rotation):
+        trace: Floats = variance[:, part].sum(1)
+        steady = (np.diff(trace) >= -1e-9 * trace[1:]).mean() > 0.99
+        if steady and trace[-1] > 2.0 * trace[: len(trace) // 4 + 1].min():
+            return True
+    return False
 
 
 def _sum(odometry: Odometry, keys: Ints, logged: Floats) -> Floats:
