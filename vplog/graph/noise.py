@@ -77,9 +77,9 @@ def covariance_without_breaks(
        variance is rate^2 * memory * travelled, a random walk that equals the linear rate once `memory` is travelled
        (or the whole drive, where that is shorter). Drift is systematic (scale, bias), so independent edges with
        the plain rate each would claim a drift that only grows with the root of the distance, far too small.
-    2. `accumulated`: the trace of its rotations or translations grows over the drive: it is the covariance P of the pose since the start, right
-       perturbation, so the edge's is P_b - Ad(b_from_a) P_a Ad(b_from_a)^T. Where a driver leaves out the lever arm
-       of the heading that difference is not a covariance, and P_a is only rotated.
+    2. `accumulated`: the trace of its rotations or translations grows over the drive: it is the covariance P of the
+       pose since the start, right perturbation, so the edge's is P_b - Ad(b_from_a) P_a Ad(b_from_a)^T. Where a driver
+       leaves out the lever arm of the heading that difference is not a covariance, and P_a is only rotated.
     3. `increments`: it is constant or fluctuates. That cannot belong to an accumulated pose, so it is the noise of
        one increment, as RTAB-Map takes it. Errors add per sample: the covariances between the keyframes, moved to
        the later body by the adjoint, are summed, a cut interval by its share.

@@ -93,8 +93,8 @@ KEYFRAMES = pa.schema(
         *pose_columns("world_", "world_from_body, optimised"),
         column(
             "covariance", MATRIX, "rad^2, rad m, m^2",
-            "6x6 of world_from_body in the body frame, by the solved graph: relative to the first keyframe, or to "
-            "earth with GPS; null where not known.", True,
+            "6x6 of world_from_body in the body frame, by the solved graph, with the scale that all metres share where "
+            "it is not known: relative to the first keyframe, or to earth with GPS; null where not known.", True,
         ),
     ]
 )  # fmt: skip
