@@ -99,6 +99,14 @@ def test_a_real_gap_is_no_jump_and_is_told() -> None:
     assert notes.lines == ["/t: 1 gap, the longest 60.1 s, 2.4 s after its first message."]
 
 
+@pytest.mark.parametrize(("messages", "kept"), [(2, 1), (3, 3), (5, 5), (11, 11)])
+def test_few_messages_with_one_stamp_have_a_clock_that_stands(messages: int, kept: int) -> None:
+    """Two may be one message, recorded twice."""
+    true_ns, log_ns = times(messages)
+    stamp_ns, _ = stamps(np.full(messages, true_ns[0]), log_ns).order("/t", Notes())
+    assert len(stamp_ns) == kept
+
+
 @pytest.mark.parametrize(
     ("header", "said"),
     [

@@ -35,6 +35,7 @@ MIXED: dict[str, tuple[list[tuple[str, dict[str, Any]]], set[str]]] = {
     "left and right": ([("left_{:03}.png", {}), ("right_{:03}.png", {})], {"left_*.png", "right_*.png"}),
     "numbers first": ([("{:06}_l.jpg", {}), ("{:06}_r.jpg", {})], {"*_l.jpg", "*_r.jpg"}),
     "cameras by number": ([("cam0_{:04}.png", {}), ("cam1_{:04}.png", {})], {"cam0_*.png", "cam1_*.png"}),
+    "an infrared pair": ([("infra1_{:04}.png", {}), ("infra2_{:04}.png", {})], {"infra1_*.png", "infra2_*.png"}),
     "numbers of cameras last": ([("{:04}-Camera_1.png", {}), ("{:04}-Camera_2.png", {})], {"*-Camera_1.png"}),
     "ScanNet": (
         [("frame-{:06}.color.jpg", {}), ("frame-{:06}.depth.png", {"bits": 16})],
@@ -71,6 +72,7 @@ ONE = {
     "stamps": [f"{1_600_000_000 + i}.{i:06}.png" for i in range(12)],
     "parts": [f"part{part}_{i:03}.png" for part in range(3) for i in range(4)],
     "frames called by a camera": [f"cam{i}.png" for i in range(30)],
+    "one fisheye of several": [f"fisheye2_{i:03}.png" for i in range(12)],
     "one camera of several": [f"cam1_{i:03}.png" for i in range(12)],
     "one after the other": [*(f"a_{i:03}.png" for i in range(6)), *(f"b_{i:03}.png" for i in range(6, 12))],
     "two formats in turn": [f"{i:03}.{'png' if i % 2 else 'jpg'}" for i in range(12)],

@@ -201,6 +201,17 @@ def test_a_folder_of_images_with_files_beside_it(tmp_path: Path) -> None:
     assert not apart["ready"]
 
 
+@pytest.mark.parametrize(("names", "rate_hz"), [("{}.500.png", 1.0), ("{:06}.png", None)])
+def test_the_rate_of_images_whose_names_are_no_times_is_not_made_up(
+    names: str, rate_hz: float | None, tmp_path: Path
+) -> None:
+    for i in range(4):
+        cv2.imwrite(str(tmp_path / names.format(i)), np.zeros((8, 10), np.uint8))
+    record = preflight(tmp_path).record
+    assert [record["frames"]["rate_hz"], record["topics"][0]["rate_hz"]] == [rate_hz, rate_hz]
+    assert ("assumed to be 0.1 s apart" in dict(preflight_lines(record))["frames"]) == (rate_hz is None)
+
+
 def test_gaps_are_placed_in_time(tmp_path: Path) -> None:
     messages = ros_messages(Drive(), 2)
     late = [m for m in ros_messages(Drive(), 2) if m.topic in ("/cam/image/compressed", "/odom")]

@@ -89,7 +89,7 @@ def _changing(names: list[str]) -> list[str]:
 
 
 Group = dict[str, list["Path"]]
-_NUMBER = re.compile(r"(cam(?:era)?[_-]?\d(?!\d))|(\d+)", re.IGNORECASE)
+_NUMBER = re.compile(r"((?:cam(?:era)?|infra|fisheye)[_-]?\d(?!\d))|(\d+)", re.IGNORECASE)
 """The number of a camera, with its word, or any other."""
 
 

@@ -37,6 +37,8 @@ _COARSE_NS = 3 * 10**8
 """ns by which the delay of stamps in whole seconds varies at least where they are not taken on the second."""
 _STANDING = 10
 """A topic whose stamps have fewer values than a tenth of its messages has a clock that stands."""
+_REPEATS = 3
+"""Messages at several log times with one stamp: fewer may be one message that was recorded twice."""
 _FASTEST_HZ = 1e6
 """Hz; stamps that are less than a microsecond apart are counters, not times."""
 _NAMED = 4
@@ -154,7 +156,8 @@ def _stamped(header_ns: Ints, log_ns: Ints) -> np.ndarray:
 
 def _no_clock(header_ns: Ints, log_ns: Ints) -> str:
     """Why header stamps are no times, as it follows the topic's name; empty where they may be."""
-    if len(np.unique(header_ns)) * _STANDING < len(header_ns):
+    values = len(np.unique(header_ns))
+    if values * _STANDING < len(header_ns) or (values == 1 and len(np.unique(log_ns)) >= _REPEATS):
         return "has header stamps that do not advance"
     ordered = header_ns[np.argsort(log_ns, kind="stable")]
     steps, part = np.diff(ordered), len(ordered) // 4  # those of a link's bursts are in no order, and yet advance

@@ -17,6 +17,7 @@ from vplog.data import Bytes, Camera, Frame, Gps, Ints, LogInfo, Odometry, Odome
 from vplog.errors import LogError
 from vplog.geometry.masking import masked
 from vplog.logs.clocks import GAP_NS, GAP_PERIODS
+from vplog.logs.image_folder import PERIOD_NS
 from vplog.logs.odometry_sources import PROPERTIES, evidence_text
 from vplog.logs.stamps import rate_hz
 from vplog.results.html import render
@@ -120,13 +121,14 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
     named = {**asdict(found), "warnings": warnings}
     for topic, entry in zip(found.topics, named["topics"], strict=True):
         entry["why"] = _why(topic, found, topics)
+        entry["rate_hz"] = None if _has_assumed_times(found, stamp_ns) else entry["rate_hz"]
     record = {
         **named,
         "camera": None if camera is None else {name: plain(getattr(camera, name)) for name in _CAMERA},
         "frames": {
             "count": len(stamp_ns), **_timing(stamp_ns), "sampled": decoded, "decoded": len(sampled),
             "keyframes": keyframes,
-        },
+        } | ({"rate_hz": None} if _has_assumed_times(found, stamp_ns) else {}),
         "odometry": _about_odometry(odometry, found, topics),
         "visual_odometry": "used" if by_images else "possible" if visual else "",
         "gps": _about_gps(gps, found),
@@ -138,6 +140,11 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
         "command": command(path, topics),
     }  # fmt: skip
     return Preflight(record, [(frame.stamp_ns, _small(frame.image)) for frame in sampled])
+
+
+def _has_assumed_times(found: LogInfo, stamp_ns: Ints) -> bool:
+    """The images of a folder have the times that they get where their names hold none."""
+    return found.kind == "images" and np.array_equal(stamp_ns, np.arange(len(stamp_ns)) * PERIOD_NS)
 
 
 def command(path: Path, topics: TopicChoice) -> str:
@@ -358,7 +365,9 @@ def preflight_lines(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
         lens = "uncalibrated" if matrix is None else f"fx {matrix[0][0]:.1f} px, {model}"
         pair = "" if camera["baseline_m"] is None else f", pair with a baseline of {camera['baseline_m']:.3f} m"
         yield "camera", f"{camera['name']}: {camera['width']} x {camera['height']}, {lens}{pair}"
-        rate = "" if frames["rate_hz"] is None else f" at {frames['rate_hz']:.1f} Hz"
+        assumed = found["kind"] == "images" and frames["count"] > 1
+        unknown = ", assumed to be 0.1 s apart as their names are no times" if assumed else ""
+        rate = unknown if frames["rate_hz"] is None else f" at {frames['rate_hz']:.1f} Hz"
         keyframes = "" if frames["keyframes"] is None else f", about {frames['keyframes']} keyframes"
         yield "frames", f"{frames['count']}{rate}{keyframes}; {frames['decoded']} of {frames['sampled']} sampled decode"
     if odometry is not None:
