@@ -119,16 +119,19 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
         keyframes, missing = _keyframes(log, stamp_ns, odometry, problems)
     warnings = [line for line in dict.fromkeys(found.warnings + log.warnings + missing) if line not in problems]
     named = {**asdict(found), "warnings": warnings}
+    timing = _timing(stamp_ns)
+    assumed = found.kind == "images" and np.array_equal(stamp_ns, np.arange(len(stamp_ns)) * PERIOD_NS)
+    if assumed:  # as the names of the images hold no times
+        timing["rate_hz"] = None
     for topic, entry in zip(found.topics, named["topics"], strict=True):
         entry["why"] = _why(topic, found, topics)
-        entry["rate_hz"] = None if _has_assumed_times(found, stamp_ns) else entry["rate_hz"]
+        entry["rate_hz"] = None if assumed else entry["rate_hz"]
     record = {
         **named,
         "camera": None if camera is None else {name: plain(getattr(camera, name)) for name in _CAMERA},
         "frames": {
-            "count": len(stamp_ns), **_timing(stamp_ns), "sampled": decoded, "decoded": len(sampled),
-            "keyframes": keyframes,
-        } | ({"rate_hz": None} if _has_assumed_times(found, stamp_ns) else {}),
+            "count": len(stamp_ns), **timing, "sampled": decoded, "decoded": len(sampled), "keyframes": keyframes,
+        },
         "odometry": _about_odometry(odometry, found, topics),
         "visual_odometry": "used" if by_images else "possible" if visual else "",
         "gps": _about_gps(gps, found),
@@ -140,11 +143,6 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
         "command": command(path, topics),
     }  # fmt: skip
     return Preflight(record, [(frame.stamp_ns, _small(frame.image)) for frame in sampled])
-
-
-def _has_assumed_times(found: LogInfo, stamp_ns: Ints) -> bool:
-    """The images of a folder have the times that they get where their names hold none."""
-    return found.kind == "images" and np.array_equal(stamp_ns, np.arange(len(stamp_ns)) * PERIOD_NS)
 
 
 def command(path: Path, topics: TopicChoice) -> str:
