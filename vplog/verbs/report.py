@@ -50,9 +50,7 @@ def report(
     record = run_record.read_single_run(folder)
     options = options or TruthOptions()
     if truth is None and options != TruthOptions():
-        raise TruthError(
-            "--distance-m, --heading-deg, --align and --truth-offset-s need a truth. Give one with --truth."
-        )
+        raise TruthError("--distance-m, --heading-deg, --align and --truth-offset-s need a truth: give --truth.")
     judged = judge(folder, record, truth, topics, options) if truth is not None else None
     pictures = None
     if log is not None and not mcap_read.read_pictures(folder / "result.mcap").pictures:
