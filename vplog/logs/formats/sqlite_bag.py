@@ -101,7 +101,7 @@ class SqliteBag:
         return salvaged
 
     def _add_damage(self, reason: str) -> None:
-        """What is lost is of unknown number: the numbers of the rows may be damaged too."""
+        """Note a loss of unknown number: the numbers of the rows may be damaged too."""
         self._damage = self._damage or f"{self._name} is damaged: {reason}."
         self._notes.account.add("damaged_bytes", None, (self._name, 0), [], self._damage)
 
