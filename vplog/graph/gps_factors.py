@@ -319,10 +319,11 @@ def cost_of_fixes(factors: Factors, weight: Floats, poses: Floats, fixes: Fixes)
             fit = minimised(together, fit, 20, 1e-4).world_from_body
     except GraphError:
         return most * len(fixes)
-    alone, noise = Objective(factors, weight), max(factor, 1.0) / fixes.alike
-    cost = together.cost(se3.between(fit[:1], fit)) - alone.cost(poses)
-    # errors that are alike tell less by as much, but those of a jump are none of them
-    cost += most * float((1.0 - inlier).sum()) + 1.5 * math.log(noise) * float(inlier.sum()) / fixes.alike
+    alone, count, alike = Objective(factors, weight), float(inlier.sum()), fixes.alike
+    cost = together.cost(se3.between(fit[:1], fit)) - alone.cost(poses) + most * float((1.0 - inlier).sum())
+    # of noise that wanders (autoregressive of first order), a fix tells what the one before it does not
+    surprise = max(factor, 1.0) / alike * 4.0 * alike / (1.0 + alike) ** 2
+    cost += 1.5 * count * (math.log(surprise) + 1.0 - 1.0 / alike)
     return cost + 0.5 * (together.information(fit).log_determinant() - _log_determinant(alone, poses))
 
 
