@@ -11,6 +11,7 @@ import pytest
 from tests.benchmarks.worlds import draw, make
 from tests.graph.drive import CLOSURE_SIGMA, ODOMETRY_SIGMA, Drive, position_error, ring
 from vplog.geometry import se3
+from vplog.graph import hypotheses
 from vplog.graph.consistency import OdometryChain, is_loop
 from vplog.graph.evidence import log_evidence, log_partition, log_room, log_tails, runs
 from vplog.graph.factors import Factors
@@ -91,6 +92,22 @@ def test_a_family_that_a_loose_odometry_agrees_with_is_left_out() -> None:
     kept = decided(graph, GncSettings()).solution.weight[is_loop(graph)] > 0.5
     assert (~drawn.is_true).sum() > drawn.is_true.sum() > 20
     assert (kept == drawn.is_true).all()
+
+
+def test_a_set_grown_from_the_surest_runs_is_of_true_closures() -> None:
+    drive = ring(160, loops=40, false=20, seed=3)
+    weight = hypotheses._grown(drive.graph, Sigmas(), OdometryChain.of(drive.graph)).weight
+    assert weight[drive.false].sum() <= 1  # that lands where it may be true; the evidence judges what has grown
+    assert weight[is_loop(drive.graph) & ~drive.false].sum() >= 38
+
+
+def test_a_family_is_rejected_whole_though_its_members_support_each_other() -> None:
+    drive, false = with_family(ring(160, loops=60, seed=1), np.arange(159, 219, 3), 3.0)
+    chain = OdometryChain.of(drive.graph)
+    mixed = hypotheses._refit(drive.graph, np.ones(len(false)), chain.poses, Sigmas())
+    weight = hypotheses._improved(drive.graph, mixed, [np.flatnonzero(false)]).weight
+    assert not (weight[false] > 0).any()
+    assert weight[~false].all()
 
 
 def test_where_all_are_false_odometry_is_kept_with_every_method() -> None:

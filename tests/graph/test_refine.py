@@ -14,7 +14,9 @@ from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
 from vplog.graph.build import build_graph
 from vplog.graph.consistency import residual_sigma
+from vplog.graph.factors import Factors
 from vplog.graph.gps_factors import Fixes, GpsSettings, antennas, cost_of_fixes, fixes_on
+from vplog.graph.least_squares import descend
 from vplog.graph.lm import LmSettings
 from vplog.graph.refine import Refined, RefineSettings, refine
 from vplog.graph.solve import GncSettings, decided
@@ -235,6 +237,22 @@ def test_closures_that_lead_away_from_gps_are_not_believed() -> None:
     jumped = replace(fixes, enu_m=fixes.enu_m + np.where(np.arange(len(fixes)) % 10 == 0, 500.0, 0.0)[:, None])
     assert kept(drive.graph, jumped) == 40
     assert kept(poisoned, jumped) == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_false_closures_are_not_excused_by_errors_of_fixes_that_they_make_alike(seed: int) -> None:
+    """What they bend is smooth, as a receiver's errors that wander are; and fixes that jump are there anyway."""
+    drive = ring(240, loops=0, false=4, seed=seed)
+    fixes = fixes_on(satellites(drive, 1.0), drive.odometry, drive.keyframes, GpsSettings())
+    jump = np.isin(np.arange(len(fixes)) // 20, [2, 7])
+    fixes = replace(fixes, enu_m=fixes.enu_m + np.where(jump, 30.0, 0.0)[:, None] * [1.0, 1.0, 0.5])
+    odometry = np.array([kind == EdgeKind.ODOMETRY for kind in drive.graph.kind])
+    loose = drive.graph.information / np.where(odometry, 9.0, 1.0)[:, None, None]
+    factors, cost = Factors.of(replace(drive.graph, information=loose)), []
+    for weight in (odometry.astype(float), np.ones(len(odometry))):
+        poses = descend(factors, weight, drive.graph.world_from_body, 100, 1e-4).world_from_body
+        cost.append(cost_of_fixes(factors, weight, poses, fixes))
+    assert cost[0] < cost[1]
 
 
 def test_fixes_far_noisier_than_they_claim_outvote_no_closures() -> None:
