@@ -100,8 +100,8 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     """Read the chosen topics once; what had to be repaired or left out is noted."""
     read = TopicCollector(chosen)
     stamped = [channel for channel in read.by_channel if channel.encoding in ("cdr", "ros1")]
-    for block in container.blocks(chosen.channels, stamped):
-        read.add_block(block)
+    for message in container.messages(chosen.channels, stamped):
+        read.add(message)
     read.finish_poses()
     correct_clock_steps(read.every_stamps(), notes)
     set_common_clock(stamps for _, stamps in read.stamps())

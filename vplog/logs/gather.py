@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.errors import plural
-from vplog.logs.formats.container import Block, Notes
+from vplog.logs.formats.container import BRIEF, Message, Notes
 from vplog.logs.formats.loss_account import LossRuns
 from vplog.logs.messages.decode import decode, read_poses, stamp_of
 from vplog.logs.messages.records import (
@@ -30,11 +30,9 @@ from vplog.logs.tracks import FixTrack, GyroTrack, PoseTrack
 
 if TYPE_CHECKING:
     from vplog.data import Ints
-    from vplog.logs.formats.container import Channel, Message, Octets, Place
+    from vplog.logs.formats.container import Channel, Octets, Place
     from vplog.logs.topic_selection import Selection
 
-_SMALL = 512
-"""Bytes below which an image message may hold no image at all: header, frame and format take about 50."""
 _HEADER = 12
 """Bytes before the frame_id of a message with a header: encapsulation (CDR) or sequence number (ROS 1), and stamp."""
 PATH = "nav_msgs/Path"
@@ -59,17 +57,16 @@ class Images:
     rows: list[int] = field(default_factory=list)
     """Rows of `stream` that the places are."""
 
-    def add(self, block: Block, row: int, position: int) -> None:
-        """Add a message of a block. Raises BadMessageError."""
-        start, stop = block.starts[row], block.stops[row]
-        self.stream.append(block.places[row])
-        if stop - start < _SMALL:
-            record = decode(block.channels[row], block.data[start:stop]) if stop > start else None
+    def add(self, message: Message, position: int) -> None:
+        """Add a message. Raises BadMessageError."""
+        channel, log_ns, data, place = message
+        self.stream.append(place)
+        if len(data) < BRIEF:
+            record = decode(channel, data) if data else None
             if record is None or (isinstance(record, ImageMessage) and not record.data):
                 raise _EmptyImageError
-        stamp_ns = stamp_of(block.channels[row], memoryview(block.data)[start:stop])
-        self.stamps.add(stamp_ns, block.log_ns[row], position)
-        self.places.append(block.places[row])
+        self.stamps.add(stamp_of(channel, data), log_ns, position)
+        self.places.append(place)
         self.rows.append(len(self.stream) - 1)
 
     def finish(self, notes: Notes) -> tuple[Ints, list[Place], Ints]:
@@ -150,14 +147,14 @@ class TopicCollector:
         """Tracks of the topics that may be the odometry."""
         self.fixes = FixTrack(chosen.gps.topic) if chosen.gps else None
         self.gyro = GyroTrack(chosen.imu)
-        self._paths: dict[Channel, tuple[bytes, int]] = {}
-        """The last message of each topic of paths, which holds those before it, and its log time."""
+        self._paths: dict[Channel, Message] = {}
+        """The last message of each topic of paths, which holds those before it."""
         self.transforms: list[PoseMessage] = []
         self.dynamic = DynamicTransforms(store=any(source in chosen.tf for source in chosen.sources))
         self.lost: dict[tuple[str, str], LossRuns] = {}
         """Lost messages by reason and topic."""
         self._tf = chosen.tf
-        self._waiting: dict[Channel, tuple[list[bytes], list[int], list[int]]] = {}
+        self._waiting: defaultdict[Channel, list[tuple[bytes, int, int]]] = defaultdict(list)
         """Messages of odometry that are still to be added, their log times and their positions."""
         self._messages = 0
         """Read so far: the position of the next one in the order of the file."""
@@ -169,67 +166,57 @@ class TopicCollector:
         """The image topics in use."""
         return {one.channel: one for one in (self.masks, self.rights, self.depths, self.images) if one.channel}
 
-    def add_block(self, block: Block) -> None:
-        """Add the messages of a block, odometry in batches."""
-        rows: dict[Channel, list[int]] = {}
-        view, first = memoryview(block.data), self._messages
-        self._messages += len(block.channels)
-        for row, channel in enumerate(block.channels):
-            rows.setdefault(channel, []).append(row)
-        single: list[int] = []
-        for channel, mine in rows.items():
-            log_ns, positions = [block.log_ns[row] for row in mine], [first + row for row in mine]
-            if channel in self.by_channel:
-                single += mine
-            elif channel in self.poses and short_type(channel.type) == PATH:
-                self._paths[channel] = bytes(view[block.starts[mine[-1]] : block.stops[mine[-1]]]), log_ns[-1]
-            elif channel in self.poses:
-                data, waiting_ns, waiting_positions = self._waiting.setdefault(channel, ([], [], []))
-                data += [bytes(view[block.starts[row] : block.stops[row]]) for row in mine]
-                waiting_ns += log_ns
-                waiting_positions += positions
-                if len(data) >= _TOGETHER:
-                    self._add_poses(channel)
-            else:
-                self._others[channel].extend([0] * len(mine), log_ns, positions)
-                known = self.calibrations_of(channel)
-                single += [
-                    row for row in mine if not (known and known.repeats(view[block.starts[row] : block.stops[row]]))
-                ]
-        for row in sorted(single):
-            self._add_message(block, row, first + row)
+    def add(self, message: Message) -> None:
+        """Add a message; odometry in batches."""
+        channel, position = message.channel, self._messages
+        self._messages += 1
+        if channel in self.by_channel:
+            self._add_message(message, position)
+        elif channel in self.poses and short_type(channel.type) == PATH:
+            self._paths[channel] = message._replace(data=bytes(message.data))
+        elif channel in self.poses:
+            waiting = self._waiting[channel]
+            waiting.append((bytes(message.data), message.log_ns, position))
+            if len(waiting) >= _TOGETHER:
+                self._add_poses(channel)
+        else:
+            self._others[channel].add(0, message.log_ns, position)
+            known = self.calibrations_of(channel)
+            if not (known and known.repeats(message.data)):
+                self._add_message(message, position)
 
     def finish_poses(self) -> None:
         """Add the messages of odometry, and fixes of NMEA, that wait."""
         for channel in list(self._waiting):
             self._add_poses(channel)
-        for channel, (data, log_ns) in self._paths.items():
-            self._add_message(Block(data, [channel], [log_ns], [0], [len(data)], [()]), 0, self._messages)
+        for message in self._paths.values():
+            self._add_message(message, self._messages)
         if self.fixes:
             self.fixes.add_sentences()
 
     def _add_poses(self, channel: Channel) -> None:
         """Add those of one topic: at once where each is a pose, else one by one."""
-        data, log_ns, positions = self._waiting.pop(channel)
+        waiting = self._waiting.pop(channel)
+        data, log_ns, positions = map(list, zip(*waiting, strict=True))
         found = read_poses(channel, data)
         if found is not None:
             self.poses[channel].add_all(found, log_ns, positions)
             self._sound(channel.topic)
         else:
-            for one, time_ns, position in zip(data, log_ns, positions, strict=True):
-                self._add_message(Block(one, [channel], [time_ns], [0], [len(one)], [()]), 0, position)
+            for one, time_ns, position in waiting:
+                self._add_message(Message(channel, time_ns, one, ()), position)
 
-    def _add_message(self, block: Block, row: int, position: int) -> None:
+    def _add_message(self, message: Message, position: int) -> None:
         """Add a message, or count it among the lost ones."""
-        channel = block.channels[row]
+        channel = message.channel
         try:
             if images := self.by_channel.get(channel):
-                images.add(block, row, position)
+                images.add(message, position)
             else:
-                self._add(block.message(row), position)
+                self._add(message, position)
         except BadMessageError as error:
             reason = "empty_image" if isinstance(error, _EmptyImageError) else "undecodable"
-            self.lost.setdefault((reason, channel.topic), LossRuns()).add_lost(block.log_ns[row])
+            self.lost.setdefault((reason, channel.topic), LossRuns()).add_lost(message.log_ns)
         else:
             self._sound(channel.topic)
 

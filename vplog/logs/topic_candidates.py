@@ -6,7 +6,6 @@ import re
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from vplog.logs.formats.container import messages_in
 from vplog.logs.messages.decode import decode
 from vplog.logs.messages.pixels import is_depth, is_image, may_be_thermal
 from vplog.logs.messages.records import BadMessageError, CalibrationMessage, ImageMessage, kind_of
@@ -29,7 +28,7 @@ def read_candidates(container: Container, contents: Contents) -> list[Candidate]
     wanted = {c for c, kind in kinds.items() if kind in ("image", "camera_info") and contents.counts[c]}
     firsts: dict[Channel, ImageMessage | CalibrationMessage] = {}
     left = set(wanted)
-    for message in messages_in(container, wanted) if wanted else ():
+    for message in container.messages(wanted) if wanted else ():
         if message.channel not in left:
             continue
         try:

@@ -12,7 +12,7 @@ import numpy as np
 from vplog.errors import LogError
 from vplog.logs.datasets import ros1
 from vplog.logs.datasets.tables import numbers_of, rows_of, stamps_ns
-from vplog.logs.formats.container import Block, Channel, Contents, block_of, by_topic
+from vplog.logs.formats.container import BRIEF, Channel, Contents, Message, by_topic
 from vplog.logs.messages.pixels import scaled_depth_m
 from vplog.logs.messages.records import BadMessageError
 
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 BODY = "base_link"
 """Frame of the body, by its name in ROS REP 105."""
-_BRIEF = 4096
-"""Bytes of a message from which only its header is given, where that is enough."""
 _LATEST_NS = 2**32 * 10**9
 """ns; stamps of ROS 1 end in 2106."""
 
@@ -88,15 +86,15 @@ class DataSetContainer:
         }
         return Contents(dict(sorted(counts.items())), *span_ns, self._truth, BODY, self._names, files)
 
-    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
         """The messages in order of time."""
         numbers = [number for number, one in enumerate(self._streams) if one.channel in channels]
         at = [(int(ns), number, row) for number in numbers for row, ns in enumerate(self._streams[number].stamp_ns)]
         for stamp_ns, number, row in sorted(at):
             one = self._streams[number]
             length = 0 if one.length is None or one.channel not in brief else one.length(row)
-            data = ros1.header(stamp_ns) if length >= _BRIEF else one.message(row)
-            yield block_of(data, [(one.channel, stamp_ns, 0, max(length, len(data)), (number, row))])
+            data = ros1.header(stamp_ns).ljust(BRIEF, b"\0") if length >= BRIEF else one.message(row)
+            yield Message(one.channel, stamp_ns, data, (number, row))
 
     def read(self, place: Place) -> bytes:
         return self._streams[place[0]].message(place[1])

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 from mcap.opcode import Opcode
 
-from vplog.logs.formats.container import block_of
+from vplog.logs.formats.container import BRIEF, Message, part_of
 from vplog.logs.formats.mcap_layout import RECORD
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
-    from vplog.logs.formats.container import Block, Channel, Row
+    from vplog.logs.formats.container import Channel
 
 _MESSAGE = struct.Struct("<BQHIQQ")
 """Opcode and length; channel id, sequence, log time, publish time: a message record up to its data."""
@@ -23,8 +23,6 @@ _OUTSIDE = frozenset({0, *map(int, Opcode)}.difference(_DEFINES, [_IS_MESSAGE]))
 """Opcodes that no record in a chunk has; those not known yet are stepped over, as the specification requires."""
 _WINDOW = 4096
 """Bytes that are read of a chunk at once where most of its bytes are those of images, which are stepped over."""
-_BRIEF = 16
-"""Bytes of a message that are there where it is only wanted briefly: up to the stamp in a header of ROS."""
 
 
 class ChunkReader:
@@ -50,47 +48,41 @@ class ChunkReader:
         self._wanted, self._brief, self._cut = wanted, brief, cut
         self._used = {i: channel for i, channel in channels.items() if wanted is None or channel in wanted}
         self._ids: list[int] = []
-        self._rows: list[Row] = []
+        self._messages: list[Message] = []
 
     @property
     def counts(self) -> Counter[int]:
         """Messages by channel id."""
         return Counter(self._ids)
 
-    def whole(self, data: bytes) -> Block:
+    def whole(self, data: bytes) -> list[Message]:
         """The messages of the chunk, of which `data` are all bytes."""
-        self._go(data, 0)
-        return self._block(data)
+        self._go(data)
+        return self._sound()
 
-    def in_place(self, read: Callable[[int, int], bytes]) -> Block:
+    def in_place(self, read: Callable[[int, int], bytes]) -> list[Message]:
         """The messages of a chunk that is not packed, from what `read(start, length)` gives of its bytes."""
-        parts: list[bytes] = []
-        size = 0
         while (left := self.end - self.position) >= RECORD.size:
             before = self.position
             data = read(before, min(_WINDOW, left))
-            self._go(data, size)
+            self._go(data)
             if self.position == before:
                 length = RECORD.size + RECORD.unpack_from(data)[1] if len(data) >= RECORD.size else left + 1
                 if not len(data) < length <= left:
                     break
-                data = read(before, length)
-                self._go(data, size)
+                self._go(read(before, length))
                 if self.position == before:
                     break
-            parts.append(data)
-            size += len(data)
-        return self._block(b"".join(parts))
+        return self._sound()
 
-    def _block(self, data: bytes) -> Block:
+    def _sound(self) -> list[Message]:
         """The messages found, without the one before damage: its length may be what is damaged."""
         if self.position < self.end and not self._cut and self._ids and self._ids.pop() in self._used:
-            self._rows.pop()
-        return block_of(data, self._rows)
+            self._messages.pop()
+        return self._messages
 
-    def _go(self, data: bytes, shift: int) -> None:
-        """On through `data`, which lie at `position` in the chunk and at `shift` in the block, up to the first record
-        that more is needed of."""
+    def _go(self, data: bytes) -> None:
+        """On through `data`, which lie at `position` in the chunk, up to the first record that more is needed of."""
         base, at, size, left = self.position, 0, len(data), self.end - self.position
         used = self._used
         while at + _MESSAGE.size <= size:
@@ -107,7 +99,7 @@ class ChunkReader:
                 self.last_ns = log_ns
                 if channel_id in used:
                     place = self.number, base + start, base + stop
-                    self._rows.append((used[channel_id], log_ns, shift + start, shift + stop, place))
+                    self._messages.append(Message(used[channel_id], log_ns, part_of(data, start, stop), place))
             elif opcode in _DEFINES:
                 self._learn(opcode, data[at + RECORD.size : stop])
             at = stop
@@ -134,4 +126,4 @@ class ChunkReader:
 
     def _is_needed(self, channel: Channel | None, there: int, length: int) -> bool:
         """Whether more of a message is needed than the bytes that are there."""
-        return channel is not None and (channel not in self._brief or there < _BRIEF or length < _WINDOW)
+        return channel is not None and (channel not in self._brief or there < BRIEF or length < _WINDOW)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from pathlib import Path
 
-    from vplog.logs.formats.container import Block, Octets, Place
+    from vplog.logs.formats.container import Message, Octets, Place
     from vplog.logs.formats.layout import Chunk
 
 __all__ = ["MAGIC", "McapFile"]
@@ -84,14 +84,14 @@ class McapFile:
             else:
                 data = self._data(number)
                 reader = ChunkReader(number, len(data), self._channels, self._define, None, cut=chunk.cut)
-                times += sampled(reader.whole(data).log_ns)
+                times += sampled([message.log_ns for message in reader.whole(data)])
                 damaged = self._account_for_chunk(chunk, reader) or not data
                 counts.update(reader.counts | Counter(chunk.counts) if damaged else reader.counts)
                 if not damaged:
                     chunk.counts = dict(reader.counts)
         return counts, times
 
-    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
         wanted, chunks = set(channels), self._layout.chunks
         numbers = (number for number, chunk in enumerate(chunks) if self._losses.may_hold(chunk, wanted))
         for number, data in self._data.iterate(numbers, self._is_read_in_place if brief else None):
@@ -101,9 +101,9 @@ class McapFile:
             end = chunk.stop - chunk.start if data is None else len(data)
             reader = ChunkReader(number, end, self._channels, self._define, wanted, brief, chunk.cut)
             if data is None:
-                yield reader.in_place(lambda start, length, at=chunk.start: self._at(at + start, length))
+                yield from reader.in_place(lambda start, length, at=chunk.start: self._at(at + start, length))
             else:
-                yield reader.whole(data)
+                yield from reader.whole(data)
             self._account_for_chunk(chunk, reader)
 
     def read(self, place: Place) -> Octets:

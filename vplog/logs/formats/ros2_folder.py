@@ -12,14 +12,14 @@ import yaml
 import zstandard
 
 from vplog.logs.formats.compression import BadChunkError, unpack_zstd_message
-from vplog.logs.formats.container import Contents, Message, Notes, by_topic, in_blocks, messages_in
+from vplog.logs.formats.container import Contents, Notes, by_topic
 from vplog.logs.formats.loss_account import LossRuns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
-    from vplog.logs.formats.container import Block, Channel, Container, Octets, Place
+    from vplog.logs.formats.container import Channel, Container, Message, Octets, Place
 
 _MAX_METADATA = 4 * 2**20
 """Bytes of metadata.yaml that are parsed; real ones have some 10 kB."""
@@ -71,10 +71,10 @@ class Chain:
             self._reconcile(self._metadata, by_topic(counts))
         return Contents(dict(sorted(counts.items())), start_ns, max((end for _, end in spans), default=0))
 
-    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
         for number, part in enumerate(self._parts):
-            for block in part.blocks(channels, brief):
-                yield block._replace(places=[(number, *place) for place in block.places])
+            for message in part.messages(channels, brief):
+                yield message._replace(place=(number, *message.place))
 
     def read(self, place: Place) -> Octets:
         return self._parts[place[0]].read(place[1:])
@@ -101,19 +101,16 @@ class ZstdMessages:
     def contents(self) -> Contents:
         return self._packed.contents()
 
-    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
-        return in_blocks(self._unpacked(channels))
-
     def read(self, place: Place) -> bytes:
         try:
             return unpack_zstd_message(self._packed.read(place))
         except BadChunkError:
             return b""
 
-    def _unpacked(self, channels: Collection[Channel]) -> Iterator[Message]:
+    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
         lost: defaultdict[str, LossRuns] = defaultdict(LossRuns)
         reason = ""
-        for message in messages_in(self._packed, channels):
+        for message in self._packed.messages(channels):
             topic = message.channel.topic
             try:
                 yield message._replace(data=unpack_zstd_message(message.data))
@@ -129,7 +126,7 @@ def messages_unpacked(container: Container, contents: Contents, notes: Notes) ->
     """The container, or one that unpacks its messages where each is a zstd frame, as which no CDR begins: a storage
     file of rosbag2's compression mode MESSAGE without its metadata."""
     channels = [channel for channel in contents.counts if channel.encoding == "cdr"]
-    firsts = islice(messages_in(container, channels), _TRIED) if channels else ()
+    firsts = islice(container.messages(channels), _TRIED) if channels else ()
     packed = any(bytes(message.data[:4]) == zstandard.FRAME_HEADER for message in firsts)
     return ZstdMessages(container, notes) if packed else container
 

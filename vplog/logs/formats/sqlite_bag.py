@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError, plural
-from vplog.logs.formats.container import Channel, Contents, Message, Notes, by_topic, in_blocks
+from vplog.logs.formats.container import Channel, Contents, Message, Notes, by_topic
 from vplog.logs.formats.layout import ResyncSearch
 from vplog.logs.formats.loss_account import confirmed_span, main_span
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from vplog.logs.formats.container import Block, Place
+    from vplog.logs.formats.container import Place
 
 MAGIC = b"SQLite format 3\x00"
 _DAMAGE = (sqlite3.Error, OverflowError, UnicodeDecodeError)
@@ -117,10 +117,7 @@ class SqliteBag:
                 continue  # the index is what is damaged
         return most
 
-    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
-        return in_blocks(self._messages(channels))
-
-    def _messages(self, channels: Collection[Channel]) -> Iterator[Message]:
+    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
         ids = [topic for topic, channel in self._topics.items() if channel in channels]
         found: Counter[int] = Counter()
         for row, topic, time_ns, data in self._rows_of(ids):
