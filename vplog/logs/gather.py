@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,10 +30,13 @@ from vplog.logs.tracks import FixTrack, GyroTrack, PoseTrack
 if TYPE_CHECKING:
     from vplog.data import Ints
     from vplog.logs.formats.container import Channel, Octets, Place
+    from vplog.logs.messages.records import Record
     from vplog.logs.topic_selection import Selection
 
 _HEADER = 12
 """Bytes before the frame_id of a message with a header: encapsulation (CDR) or sequence number (ROS 1), and stamp."""
+PARTS = ("mask", "right", "depth", "image")
+"""Image topics of a selection; what is several of them is the last."""
 PATH = "nav_msgs/Path"
 """The type whose messages hold all poses up to then."""
 _TOGETHER = 1024
@@ -81,7 +83,7 @@ class Images:
 class Calibrations:
     """Calibrations of one topic that are set and differ from the one before."""
 
-    channel: Channel | None
+    channel: Channel
     found: list[CalibrationMessage] = field(default_factory=list)
     positions: list[int] = field(default_factory=list)
     """Positions of those in the order of the file."""
@@ -90,8 +92,8 @@ class Calibrations:
     _last: bytes = b""
     _first: CalibrationMessage | None = None
 
-    def add(self, calibration: CalibrationMessage, data: Octets, position: int) -> None:
-        self._last = bytes(data[_HEADER:])
+    def add(self, calibration: CalibrationMessage, data: Octets | Record, position: int) -> None:
+        self._last = bytes(data[_HEADER:]) if isinstance(data, bytes | memoryview) else b""
         self._first = self._first or calibration
         if not calibration.is_set:
             self.unset += not self.found
@@ -99,16 +101,17 @@ class Calibrations:
             self.found.append(calibration)
             self.positions.append(position)
 
-    def repeats(self, data: Octets) -> bool:
+    def repeats(self, data: Octets | Record) -> bool:
         """Whether a message of ROS is that before it but for its stamp."""
-        ros = self.channel is not None and self.channel.encoding in ("cdr", "ros1")
-        return ros and bool(self.found) and data[_HEADER:] == self._last
+        if not self.found or self.channel.encoding not in ("cdr", "ros1"):
+            return False
+        return isinstance(data, bytes | memoryview) and data[_HEADER:] == self._last
 
     def finish(self, images: Stamps, times: Stamps, notes: Notes) -> list[CalibrationMessage]:
         """The calibrations that are set; the first one where none is. Each with the stamp of the first of the `images`
         that it is of: the nearest by header stamps where these are of the images' clock, else by the log `times` of
         the topic."""
-        if self.unset and self.found and self.channel:
+        if self.unset and self.found:
             notes.add(
                 f"The first {plural(self.unset, 'calibration')} of {self.channel.topic} "
                 f"{'is' if self.unset == 1 else 'are'} not set (K is zero or NaN); the first that is set is used."
@@ -135,10 +138,9 @@ class TopicCollector:
     """Collects the messages of the topics of a selection."""
 
     def __init__(self, chosen: Selection) -> None:
-        self.images, self.depths, self.rights = Images(chosen.image), Images(chosen.depth), Images(chosen.right)
-        self.masks = Images(chosen.mask)
-        self.calibrations = Calibrations(chosen.camera_info)
-        self.right_calibrations = Calibrations(chosen.right_info)
+        self.images = {part: Images(getattr(chosen, part)) for part in PARTS}
+        self.by_channel = {one.channel: one for one in self.images.values() if one.channel}
+        self._calibrations = {one: Calibrations(one) for one in (chosen.camera_info, chosen.right_info) if one}
         self.poses = {
             source: PoseTrack(source.topic, chosen.geometry.get(source, (1.0, 1.0)))
             for source in chosen.sources
@@ -161,11 +163,6 @@ class TopicCollector:
         self._others: defaultdict[Channel, Stamps] = defaultdict(Stamps)
         """Log times of the topics that are not followed over time."""
 
-    @cached_property
-    def by_channel(self) -> dict[Channel, Images]:
-        """The image topics in use."""
-        return {one.channel: one for one in (self.masks, self.rights, self.depths, self.images) if one.channel}
-
     def add(self, message: Message) -> None:
         """Add a message; odometry in batches."""
         channel, position = message.channel, self._messages
@@ -181,7 +178,7 @@ class TopicCollector:
                 self._add_poses(channel)
         else:
             self._others[channel].add(0, message.log_ns, position)
-            known = self.calibrations_of(channel)
+            known = self._calibrations.get(channel)
             if not (known and known.repeats(message.data)):
                 self._add_message(message, position)
 
@@ -224,25 +221,16 @@ class TopicCollector:
         for runs in (runs for (_, lost), runs in self.lost.items() if lost == topic):
             runs.add_sound()
 
-    def calibrations_of(self, channel: Channel) -> Calibrations | None:
-        """The calibrations that a channel holds, if it is one of them."""
-        return next((one for one in (self.right_calibrations, self.calibrations) if one.channel == channel), None)
-
-    def finished(self, calibrations: Calibrations, notes: Notes) -> list[CalibrationMessage]:
-        """The calibrations of the camera or the right one, stamped as its images."""
-        images = self.rights if calibrations is self.right_calibrations else self.images
-        times = self._others[calibrations.channel] if calibrations.channel else Stamps()
-        return calibrations.finish(images.stamps, times, notes)
+    def calibrations(self, channel: Channel | None, part: str, notes: Notes) -> list[CalibrationMessage]:
+        """The calibrations of a channel, stamped as the images of this part."""
+        known = self._calibrations.get(channel) if channel else None
+        return known.finish(self.images[part].stamps, self._others[known.channel], notes) if known else []
 
     def stamps(self) -> list[tuple[str, Stamps]]:
         """Every topic that is followed over time, with its stamps."""
-        images = [
-            (one.channel.topic, one.stamps)
-            for one in (self.images, self.depths, self.rights, self.masks)
-            if one.channel
-        ]
-        gyro = [(self.gyro.topic, self.gyro.stamps)] if self.gyro.topic else []
-        return images + [(one.topic, one.stamps) for one in (*self.poses.values(), self.fixes) if one] + gyro
+        images = [(one.channel.topic, one.stamps) for one in reversed(self.images.values()) if one.channel]
+        tracks = (*self.poses.values(), self.fixes, self.gyro)
+        return images + [(one.topic, one.stamps) for one in tracks if one and one.topic]
 
     def every_stamps(self) -> list[Stamps]:
         """Stamps of every topic that was read, each pose with its position."""
@@ -263,7 +251,7 @@ class TopicCollector:
         """Raises BadMessageError."""
         channel = message.channel
         match decode(channel, message.data):
-            case CalibrationMessage() as calibration if known := self.calibrations_of(channel):
+            case CalibrationMessage() as calibration if known := self._calibrations.get(channel):
                 known.add(calibration, message.data, position)
             case PoseMessage() as pose if channel in self.poses:
                 self.poses[channel].add(pose, message.log_ns, position)

@@ -96,11 +96,11 @@ class RecordedLog:
         """Raises LogError where a stamp is not one of `stamps()`."""
         content, images, pair, camera = self._content, self._images, self._pair, self.camera()
         for row in rows_of(content.stamp_ns, stamp_ns, self.name):
-            right = None if pair is None else images.companion(self._selection.right, content.right_places, row)
-            depth = images.companion(self._depth, content.depth_places, row)
             at_ns, image = int(content.stamp_ns[row]), images.image(row)
-            own, mask = self._calibration_at(at_ns), images.companion(self._selection.mask, content.mask_places, row)
-            mask, right_mask = mask or self._masks[0].of(at_ns), self._masks[1].of(at_ns)
+            depth = images.companion("depth", row) if self._depth else None
+            right = images.companion("right", row) if pair else None
+            mask, right_mask = images.companion("mask", row) or self._masks[0].of(at_ns), self._masks[1].of(at_ns)
+            own = self._calibration_at(at_ns)
             yield RecordedFrame(at_ns, camera, image, depth, right, pair, self._notes, own, mask, right_mask)
 
     def file_names(self) -> list[str] | None:
@@ -251,14 +251,14 @@ class RecordedLog:
                 calibrations = [content.calibration, content.right_calibration]
             if calibrations[0] is None or calibrations[1] is None:
                 raise NoPairError(f"{right.topic} has no calibration")
-            other, size = self._images.first(right, content.right_places, self._path.name)
+            other, size = self._images.first(right, content.companions["right"], self._path.name)
             camera = camera_of(right.topic, calibrations[1], size, self._notes)
             left_side = Side(left, calibrations[0], is_rectified(image.topic))
             right_side = Side(camera, calibrations[1], is_rectified(right.topic))
             right_from_left = content.tree.between(other, frame) if other and frame else None
             right_from_left = self._sidecar.right_from_left(image.topic, right.topic) if known[0] else right_from_left
             pair = pair_of(left_side, right_side, right_from_left)
-            error_px = row_error_px(self._rectified(pair, right))
+            error_px = row_error_px(self._rectified(pair))
             if error_px is not None and error_px > MOST_ROWS_PX:
                 raise NoPairError(
                     f"rectified by its calibration, its rows lie {error_px:.1f} px off those of the left image"
@@ -268,12 +268,12 @@ class RecordedLog:
             self._notes.add(f"The right image is not used: {str(error).rstrip('.')}.")
             return None
 
-    def _rectified(self, pair: Pair, right: Channel) -> Iterator[tuple[Bytes, Bytes]]:
+    def _rectified(self, pair: Pair) -> Iterator[tuple[Bytes, Bytes]]:
         """Images of a few frames; what does not decode is left out."""
         content, images, camera = self._content, self._images, self._left[0]
-        rows = [row for row, place in enumerate(content.right_places) if place is not None]
+        rows = [row for row, place in enumerate(content.companions["right"]) if place is not None]
         for row in rows[:: max(len(rows) // CHECKED_FRAMES, 1)][:CHECKED_FRAMES]:
-            image, other = images.image(row), images.companion(right, content.right_places, row)
+            image, other = images.image(row), images.companion("right", row)
             stamp_ns = int(content.stamp_ns[row])
             try:  # not counted as lost: only a check
                 frame = RecordedFrame(stamp_ns, camera, image, None, other, pair, Notes()).decode()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from vplog.logs.datasets import colmap, euroc, kitti, tum_rgbd, utm_images, vslam_lab
-from vplog.logs.datasets.folders import below
+from vplog.logs.image_folder import below
 
 if TYPE_CHECKING:
     from pathlib import Path

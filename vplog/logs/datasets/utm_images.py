@@ -11,9 +11,8 @@ from vplog.data import Gps, Trajectory
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.geometry.utm_name import utm_name
-from vplog.logs.datasets.folders import image_files
 from vplog.logs.datasets.streams import DataSet, camera_streams, fix_stream
-from vplog.logs.image_folder import named_stamps, natural_order
+from vplog.logs.image_folder import image_files, named_stamps, natural_order
 
 if TYPE_CHECKING:
     from vplog.geometry.utm_name import UtmName

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from vplog.logs.formats.loss_account import LossAccount
 
@@ -39,7 +39,8 @@ class Message(NamedTuple):
 
     channel: Channel
     log_ns: int
-    data: Octets
+    data: Any
+    """Octets; of a published data set the record that they would be decoded to."""
     place: Place
 
 
@@ -102,8 +103,8 @@ class Container(Protocol):
         more than the first BRIEF bytes need be there; `read` gives them whole."""
         ...
 
-    def read(self, place: Place) -> Octets:
-        """The bytes of one message, from any place that `messages` gave."""
+    def read(self, place: Place) -> Any:
+        """The data of one message, from any place that `messages` gave."""
         ...
 
 
