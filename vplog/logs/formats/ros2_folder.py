@@ -44,8 +44,6 @@ class Metadata:
     """The storage files that are there, in order."""
     missing: list[str]
     """Names of those that are not."""
-    mode: str
-    """Compression: ``, `file` or `message`."""
     recorded: dict[str, int]
     """Messages by topic; empty where it does not say."""
     start_ns: int
@@ -123,8 +121,8 @@ class ZstdMessages:
 
 
 def messages_unpacked(container: Container, contents: Contents, notes: Notes) -> Container:
-    """The container, or one that unpacks its messages where each is a zstd frame, as which no CDR begins: a storage
-    file of rosbag2's compression mode MESSAGE without its metadata."""
+    """The container, or one that unpacks its messages where each is a zstd frame, as which no CDR begins: rosbag2's
+    compression mode MESSAGE, in a folder whose metadata say so or in a storage file alone."""
     channels = [channel for channel in contents.counts if channel.encoding == "cdr"]
     firsts = islice(container.messages(channels), _TRIED) if channels else ()
     packed = any(bytes(message.data[:4]) == zstandard.FRAME_HEADER for message in firsts)
@@ -142,10 +140,9 @@ def read_metadata(folder: Path) -> Metadata:
     if not files:
         lacks = ", ".join(missing[:3]) or "no storage file"
         raise MetadataError(f"{folder / 'metadata.yaml'} names {lacks}, and no such file is in the folder.")
-    mode = str(tree.get("compression_mode") or "").lower()
     start_ns, length_ns = _nanoseconds(tree.get("starting_time")), _nanoseconds(tree.get("duration"))
     end_ns = start_ns + length_ns if start_ns and length_ns else 0
-    return Metadata(files, missing, mode if mode in ("file", "message") else "", _recorded(tree), start_ns, end_ns)
+    return Metadata(files, missing, _recorded(tree), start_ns, end_ns)
 
 
 def _recorded(tree: dict) -> dict[str, int]:
