@@ -122,13 +122,26 @@ class RecordedFrame:
         channel, image = self.image.channel, None
         try:
             image = self.image.grey(self.stamp_ns)
-            if self.pair is None:
-                return image, affine_to_camera(channel.topic, image, self.camera, self.calibration, self.notes)
-            _check_size(channel, image, self.camera)
+            if self.pair is not None:
+                self._check_size(channel, image)
+                return image, None
+            affine = camera_from_image(self.camera, (image.shape[1], image.shape[0]), self.calibration)
+            size = f"{self.camera.width} x {self.camera.height} px"
+            if affine is None:
+                raise LogError(
+                    f"{channel.topic} has an image of {size_of(image)} px among those of {size}, of another shape and "
+                    "without a calibration of its own; it is left out."
+                )
         except LogError as error:
             self._count_undecodable(channel, "" if image is None else str(error))
             raise
-        return image, None
+        if image.shape == (self.camera.height, self.camera.width) and np.array_equal(affine, np.eye(2, 3)):
+            return image, None
+        self.notes.add(
+            f"The images of {channel.topic} change their size or region of interest; those unlike the first are "
+            f"resampled to its {size}."
+        )
+        return image, affine
 
     def _mask(self, image: Bytes) -> Bools | None:
         """(H, W) px of the image as it comes that count; None where all do. Raises LogError where its mask does not fit
@@ -165,12 +178,20 @@ class RecordedFrame:
             return None
         try:
             image = self.right.grey(self.stamp_ns)
-            _check_size(self.right.channel, image, self.camera)
+            self._check_size(self.right.channel, image)
             if self.right_mask is not None:
                 image = filled(image, self.right_mask.used((image.shape[1], image.shape[0])))
         except LogError:
             return self._count_undecodable(self.right.channel)
         return pair.rectify(image, 1)
+
+    def _check_size(self, channel: Channel, image: np.ndarray) -> None:
+        """Raises LogError where an image of a pair has another size than the camera."""
+        if image.shape != (self.camera.height, self.camera.width):
+            size = f"{self.camera.width} x {self.camera.height}"
+            raise LogError(
+                f"{channel.topic} has an image of {size_of(image)} px among those of {size} px; it is left out."
+            )
 
     def _count_undecodable(self, channel: Channel, detail: str = "") -> None:
         at = self.stamp_ns
@@ -181,25 +202,6 @@ def size_of(image: np.ndarray) -> str:
     return f"{image.shape[1]} x {image.shape[0]}"
 
 
-def affine_to_camera(
-    topic: str, image: Bytes, camera: Camera, calibration: CalibrationMessage | None, notes: Notes
-) -> Floats | None:
-    """(2, 3) from px of the image to those of the camera; None where they are the same. Raises LogError."""
-    found, same = camera_from_image(camera, (image.shape[1], image.shape[0]), calibration)
-    size = f"{camera.width} x {camera.height} px"
-    if found is None and not same:
-        raise LogError(
-            f"{topic} has an image of {size_of(image)} px among those of {size}, of another shape and without a "
-            "calibration of its own; it is left out."
-        )
-    if found is not None:
-        notes.add(
-            f"The images of {topic} change their size or region of interest; those unlike the first are resampled "
-            f"to its {size}."
-        )
-    return found
-
-
 def warped(image: Bytes, affine: Floats | None, camera: Camera) -> Bytes:
     """The image in px of the camera; what it does not show repeats its edge, which has no corners."""
     if affine is None:
@@ -208,12 +210,6 @@ def warped(image: Bytes, affine: Floats | None, camera: Camera) -> Bytes:
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), max((shrunk - 1) / 2, 1e-3)), np.uint8)
     size = (camera.width, camera.height)
     return np.asarray(cv2.warpAffine(image, affine, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
-
-
-def _check_size(channel: Channel, image: np.ndarray, camera: Camera) -> None:
-    if image.shape != (camera.height, camera.width):
-        size = f"{camera.width} x {camera.height}"
-        raise LogError(f"{channel.topic} has an image of {size_of(image)} px among those of {size} px; it is left out.")
 
 
 class ImageReader:
@@ -244,13 +240,13 @@ class ImageReader:
     @cached_property
     def _levels(self) -> Levels | None:
         """Black and white of 16 bits for the whole drive, by images spread over it: SIFT compares views by contrast."""
-        places = self.content.places
-        return None if self._image is None else levels_of(self._sampled(self._image, places[:: spread(len(places))]))
 
-    def _sampled(self, channel: Channel, places: list[Place]) -> Iterator[ImageMessage]:
-        for place in places:
-            with suppress(BadMessageError):
-                yield image_in(channel, self._container.read(place))
+        def sampled(image: Channel) -> Iterator[ImageMessage]:
+            for place in self.content.places[:: spread(len(self.content.places))]:
+                with suppress(BadMessageError):
+                    yield image_in(image, self._container.read(place))
+
+        return None if self._image is None else levels_of(sampled(self._image))
 
     def first(self, channel: Channel, places: list[Place | None], log: str) -> tuple[str, tuple[int, int]]:
         """Frame, and width and height of the first image that decodes. Raises LogError where none of the first few
@@ -271,15 +267,15 @@ class ImageReader:
 
     def first_depth(self, channel: Channel) -> Float32s | None:
         """The first depth image that decodes; None where no image has one. Raises LogError where none does."""
-        failures: list[LogError] = []
+        first: LogError | None = None
         found = [(row, place) for row, place in enumerate(self.content.companions["depth"]) if place is not None]
         for row, place in found[:_TRIED]:
             try:
                 return LoggedImage(channel, self._container.read(place)).depth_m(int(self.content.stamp_ns[row]))
             except LogError as error:
-                failures.append(error)
-        if failures:
-            raise failures[0]
+                first = first or error
+        if first is not None:
+            raise first
         return None
 
     def _stream(self, image: Channel, codec: str, content: Content, notes: Notes) -> VideoStream:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from vplog.data import LogInfo, Topic, Trajectory
 from vplog.errors import LogError
 from vplog.logs.calibration_file import SidecarFiles
-from vplog.logs.cameras import body_from_camera, camera_of, is_rectified
+from vplog.logs.cameras import body_from_camera, camera_of
 from vplog.logs.content import read_content
 from vplog.logs.formats.container import Notes
 from vplog.logs.formats.ros2_folder import messages_unpacked
@@ -195,14 +195,10 @@ class RecordedLog:
 
     @cached_property
     def _images(self) -> ImageReader:
-        image, content = self._selection.image, self._read()
-        known = self._candidate(image)
-        return ImageReader(self._container, image, known.codec if known else "", content, self._notes)
-
-    def _read(self) -> Content:
-        """Content of the topics, of images that between start and stop."""
+        image, known = self._selection.image, self._candidate(self._selection.image)
         found = read_content(self._container, self._contents, self._selection, self._notes)
-        return found.between(self._choice.start_s, self._choice.stop_s)
+        content = found.between(self._choice.start_s, self._choice.stop_s)
+        return ImageReader(self._container, image, known.codec if known else "", content, self._notes)
 
     @property
     def _content(self) -> Content:
@@ -245,19 +241,15 @@ class RecordedLog:
         try:
             if (candidate := self._candidate(right)) and candidate.codec:
                 raise NoPairError(f"{right.topic} is video; of a stereo pair, only the left images may be video")
-            known = [self._sidecar.camera(channel.topic) for channel in (image, right)]
-            calibrations = [camera.calibration if camera else None for camera in known]
-            if known[0] is None:
-                calibrations = [content.calibration, content.right_calibration]
-            if calibrations[0] is None or calibrations[1] is None:
+            known = [one.calibration for c in (image, right) if (one := self._sidecar.camera(c.topic))]
+            own, theirs = known or (content.calibration, content.right_calibration)
+            if own is None or theirs is None:
                 raise NoPairError(f"{right.topic} has no calibration")
             other, size = self._images.first(right, content.companions["right"], self._path.name)
-            camera = camera_of(right.topic, calibrations[1], size, self._notes)
-            left_side = Side(left, calibrations[0], is_rectified(image.topic))
-            right_side = Side(camera, calibrations[1], is_rectified(right.topic))
+            camera = camera_of(right.topic, theirs, size, self._notes)
             right_from_left = content.tree.between(other, frame) if other and frame else None
-            right_from_left = self._sidecar.right_from_left(image.topic, right.topic) if known[0] else right_from_left
-            pair = pair_of(left_side, right_side, right_from_left)
+            right_from_left = self._sidecar.right_from_left(image.topic, right.topic) if known else right_from_left
+            pair = pair_of(Side(left, own), Side(camera, theirs), right_from_left)
             error_px = row_error_px(self._rectified(pair))
             if error_px is not None and error_px > MOST_ROWS_PX:
                 raise NoPairError(

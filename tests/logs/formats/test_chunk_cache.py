@@ -15,8 +15,7 @@ from vplog.logs.formats import chunk_cache as chunks_module
 from vplog.logs.formats.chunk_cache import Chunks
 from vplog.logs.formats.compression import BadChunkError
 from vplog.logs.formats.container import BRIEF, Channel, Notes
-from vplog.logs.formats.mcap_chunk import ChunkReader
-from vplog.logs.formats.mcap_file import McapFile
+from vplog.logs.formats.mcap_file import ChunkReader, McapFile
 
 if TYPE_CHECKING:
     from pathlib import Path
