@@ -16,12 +16,11 @@ from vplog.logs.formats.container import Notes
 from vplog.logs.formats.ros2_folder import messages_unpacked
 from vplog.logs.frames import ImageReader, RecordedFrame, size_of
 from vplog.logs.masks import masks_of
-from vplog.logs.messages.records import GEOMETRY, short_type
 from vplog.logs.odometry_sources import PROPERTIES, is_truth
 from vplog.logs.rectification import CHECKED_FRAMES, MOST_ROWS_PX, NoPairError, Side, pair_of, row_error_px
 from vplog.logs.stamps import rows_of
 from vplog.logs.topic_candidates import read_candidates
-from vplog.logs.topic_selection import Candidate, TopicChoice, select
+from vplog.logs.topic_selection import Candidate, TopicChoice, select, wheel_options
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -100,7 +99,8 @@ class RecordedLog:
             depth = images.companion("depth", row) if self._depth else None
             right = images.companion("right", row) if pair else None
             mask, right_mask = images.companion("mask", row) or self._masks[0].of(at_ns), self._masks[1].of(at_ns)
-            own = self._calibration_at(at_ns)
+            later = bisect_right(self._later_calibrations, at_ns, key=lambda calibration: calibration.stamp_ns)
+            own = self._later_calibrations[later - 1] if later else None
             yield RecordedFrame(at_ns, camera, image, depth, right, pair, self._notes, own, mask, right_mask)
 
     def file_names(self) -> list[str] | None:
@@ -136,10 +136,8 @@ class RecordedLog:
         """Ways out where there is none: the sources that are not taken by themselves, and files."""
         content = self._content
         given = [f"--odometry {source.topic}: {PROPERTIES[source.kind]}" for source in content.sources]
-        wheels = [c for c in self._candidates if short_type(c.channel.type) in GEOMETRY and c.count]
-        for one in wheels:
-            needs = " and ".join(f"--{name.replace('_', '-')}" for name in GEOMETRY[short_type(one.channel.type)])
-            given.append(f"{needs} make odometry of {one.channel.topic}")
+        wheels = [c.channel for c in self._candidates if c.count]
+        given += [f"{needs} make odometry of {one.topic}" for one in wheels if (needs := wheel_options(one))]
         given += ["--odometry visual needs a calibrated camera with depth or a stereo pair"]
         return "; ".join([*given, "--odometry-file takes poses from a file; `vplog library` needs none"]) + "."
 
@@ -162,12 +160,6 @@ class RecordedLog:
         if not len(self._content.stamp_ns):
             raise LogError(f"No image of {self._selection.image.topic} can be read. Choose another with --image-topic.")
         return self._selection.image
-
-    def _calibration_at(self, stamp_ns: int) -> CalibrationMessage | None:
-        """The calibration in force at a stamp, where it is another than the camera's."""
-        found = self._later_calibrations
-        row = bisect_right(found, stamp_ns, key=lambda calibration: calibration.stamp_ns)
-        return found[row - 1] if row else None
 
     @cached_property
     def _later_calibrations(self) -> list[CalibrationMessage]:

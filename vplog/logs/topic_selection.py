@@ -251,9 +251,8 @@ def _sources(
     """The topics that may be the odometry, with `kind` one of SOURCES, `topic` or empty. Raises LogError where the
     requested one is speeds of wheels without their measures."""
     if requested is not None:
-        lacks = GEOMETRY.get(short_type(requested.channel.type))
-        if lacks and requested.channel not in geometry:
-            options = " and ".join(f"--{name.replace('_', '-')}" for name in lacks)
+        options = wheel_options(requested.channel)
+        if options and requested.channel not in geometry:
             raise LogError(f"{requested.channel.topic} is speeds of wheels; they are odometry with {options}, in m.")
         return [requested]
     if kind not in ("", "twist"):
@@ -261,6 +260,11 @@ def _sources(
     posed = [c for c in usable if c.role == "odometry"]
     found = [c for c in posed if c.channel in geometry or short_type(c.channel.type) not in GEOMETRY]
     return found if kind else [*found, *[c for c in usable if c.role == "tf"][:1]]
+
+
+def wheel_options(channel: Channel) -> str:
+    """Options that make odometry of speeds of wheels; empty for other types."""
+    return " and ".join(f"--{name.replace('_', '-')}" for name in GEOMETRY.get(short_type(channel.type), ()))
 
 
 def _geometry(c: Candidate, choice: TopicChoice) -> tuple[float, float] | None:

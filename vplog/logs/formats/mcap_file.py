@@ -61,7 +61,10 @@ class McapFile:
         self._sound = bytearray(len(self._layout.chunks))
         """1 for chunks whose checksum was found right."""
         sizes = [chunk.stop - chunk.start if _is_plain(chunk) else chunk.size for chunk in self._layout.chunks]
-        self._data = Chunks(self._unpack, self._add_damaged_chunk, sizes.__getitem__, self._is_cached, self._local)
+        # parts of what is not packed can be read again by themselves, unless each costs a request
+        cached = [not self._local or not _is_plain(chunk) for chunk in self._layout.chunks]
+        load, damaged = self._unpack, self._add_damaged_chunk
+        self._data = Chunks(load, damaged, sizes.__getitem__, cached.__getitem__, self._local)
 
     def contents(self) -> Contents:
         """Counted by the indexes behind the chunks; a chunk without is unpacked, as all are where the file's statistics
@@ -188,10 +191,6 @@ class McapFile:
         chunk = self._layout.chunks[number]
         span = chunk.first_ns, max(chunk.first_ns, chunk.last_ns)
         self._losses.add_chunk(chunk, {}, [span], self._unread[number])
-
-    def _is_cached(self, number: int) -> bool:
-        """Parts of what is not packed can be read again by themselves, unless each costs a request."""
-        return not self._local or not _is_plain(self._layout.chunks[number])
 
     def _is_read_in_place(self, number: int) -> bool:
         """Whether a chunk's messages can be found where they lie, without reading all of it."""

@@ -111,7 +111,7 @@ class Ros1Bag:
             if number(header, b"op") == CONNECTION:
                 self._connect(header, data[start:stop])
             else:
-                found.append((number(header, b"conn"), time_ns(header, b"time"), start, stop))
+                found.append((number(header, b"conn"), time_ns(header[b"time"]), start, stop))
             position = stop
         damaged = position < len(data) and not chunk.cut
         if damaged and found:
