@@ -176,12 +176,12 @@ def other_sources(gps: Gps | None, contents: Contents, chosen: Selection) -> dic
 
 def rank_sources(found: dict[Channel, SourceOdometry], camera_ns: Ints) -> list[tuple[OdometrySource, Channel]]:
     """Every source with a usable pose, the best first; of equal ones that with most poses, then by name."""
-    ends = [one.odometry.stamp_ns[[0, -1]] for one in found.values() if one.odometry is not None]
-    span_ns = np.array([min(end[0] for end in ends), max(end[1] for end in ends)]) if ends else NONE
+    usable = [(source, one, one.odometry) for source, one in found.items() if one.odometry is not None]
+    ends = np.array([odometry.stamp_ns[[0, -1]] for _, _, odometry in usable], np.int64).reshape(-1, 2)
+    span_ns = np.array([ends[:, 0].min(), ends[:, 1].max()]) if usable else NONE
     weighed = [
-        (score_source(source, one.frames, one.odometry, camera_ns, span_ns, one.kind), source)
-        for source, one in found.items()
-        if one.odometry is not None
+        (score_source(source, one.frames, odometry, camera_ns, span_ns, one.kind), source)
+        for source, one, odometry in usable
     ]
     return sorted(weighed, key=lambda one: (-one[0].score, -one[0].count, one[1]))
 
