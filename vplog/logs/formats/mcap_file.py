@@ -103,7 +103,7 @@ class McapFile:
     def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
         wanted, chunks = set(channels), self._layout.chunks
         numbers = (number for number, chunk in enumerate(chunks) if self._losses.may_hold(chunk, wanted))
-        for number, data in self._data.iterate(numbers, self._is_read_in_place if brief else None):
+        for number, data in self._data.iterate(numbers, lambda number: bool(brief) and self._is_read_in_place(number)):
             chunk = chunks[number]
             if not self._losses.may_hold(chunk, wanted):  # by a definition that came meanwhile
                 continue
