@@ -253,8 +253,8 @@ class FixTrack:
             bad = left_out(gps)
             if bad.any():
                 notes.add(f"{self.topic}: {int(bad.sum())} of {len(bad)} fixes left out: {why}.")
-                columns = gps.stamp_ns, gps.latitude_deg, gps.longitude_deg, gps.altitude_m, gps.covariance
-                gps = Gps(*(column[~bad] for column in columns))
+                columns = ("stamp_ns", "latitude_deg", "longitude_deg", "altitude_m", "covariance")
+                gps = replace(gps, **{name: getattr(gps, name)[~bad] for name in columns})
         return gps
 
 
