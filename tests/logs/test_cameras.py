@@ -7,9 +7,11 @@ import pytest
 
 from tests.logs.drives import store
 from vplog.logs.cameras import camera_of
-from vplog.logs.formats.container import Notes
+from vplog.logs.formats.container import Channel, Message, Notes
+from vplog.logs.gather import TopicCollector
 from vplog.logs.messages.records import CalibrationMessage
 from vplog.logs.messages.ros import decode_ros
+from vplog.logs.topic_selection import Selection
 
 K = np.array([[800.0, 0, 630.5], [0, 810.0, 470.25], [0, 0, 1]])
 
@@ -100,3 +102,13 @@ def test_other_lenses_are_said(name: str, count: int) -> None:
     calibration = CalibrationMessage(0, "", 1280, 960, name, np.full(count, 0.1), K, np.zeros((3, 4)))
     assert camera_of("/cam", calibration, (1280, 960), notes).matrix is None
     assert "which is none of plumb_bob, rational_polynomial, equidistant" in notes.lines[0]
+
+
+def test_one_calibration_for_both_cameras_of_a_pair_is_that_of_each() -> None:
+    left, right = (Channel(f"/{side}/image", "sensor_msgs/Image", "ros1") for side in ("left", "right"))
+    info = Channel("/camera_info", "sensor_msgs/CameraInfo", "ros1")
+    read = TopicCollector(Selection(image=left, right=right, camera_info=info, right_info=info))
+    read.add(Message(info, 0, CalibrationMessage(1, "c", 1280, 960, "plumb_bob", np.zeros(5), K, np.zeros((3, 4))), ()))
+    for part in ("image", "right"):
+        (found,) = read.calibrations(info, part, Notes())
+        np.testing.assert_array_equal(found.matrix, K)

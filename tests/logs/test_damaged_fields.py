@@ -19,7 +19,7 @@ from tests.logs.drives import START_NS, store
 from tests.logs.log_fields import FIELDS
 from vplog.errors import LogError
 from vplog.logs.detect import open_container
-from vplog.logs.formats.container import Notes, messages_in
+from vplog.logs.formats.container import Notes
 from vplog.logs.formats.ros2_folder import Chain, read_metadata
 
 if TYPE_CHECKING:
@@ -183,7 +183,7 @@ def problem(path: Path, written: Messages, form: Format, content: bool = True) -
         if form.folder:
             container = Chain([container], notes, read_metadata(path.parent))
         contents = container.contents()
-        read = Counter((m.channel.topic, m.log_ns, bytes(m.data)) for m in messages_in(container, contents.counts))
+        read = Counter((m.channel.topic, m.log_ns, bytes(m.data)) for m in container.messages(contents.counts))
     except LogError as error:
         # The first bytes tell what a log is.
         known = "which no log does" in str(error) or (form.rows and "ROS 2 bag" in str(error))
@@ -381,9 +381,7 @@ def test_what_is_behind_the_end_of_a_recording_is_said(name: str, tmp_path: Path
     notes = Notes()
     container, _ = open_container(path, notes)
     contents = container.contents()
-    assert (
-        Counter((m.channel.topic, m.log_ns, bytes(m.data)) for m in messages_in(container, contents.counts)) == WRITTEN
-    )
+    assert Counter((m.channel.topic, m.log_ns, bytes(m.data)) for m in container.messages(contents.counts)) == WRITTEN
     (loss,) = notes.account.losses
     assert (loss.reason, loss.messages) == ("appended", None)
     assert f"ends at byte {len(whole)} of {2 * len(whole)}" in loss.detail
@@ -499,7 +497,7 @@ def test_pages_of_a_database_in_each_others_place_are_accounted_for(tmp_path: Pa
 
 def every_message(path: Path, notes: Notes) -> list[Message]:
     container, _ = open_container(path, notes)
-    return list(messages_in(container, container.contents().counts))
+    return list(container.messages(container.contents().counts))
 
 
 def test_an_index_that_is_cut_off_ends_with_the_file(tmp_path: Path) -> None:

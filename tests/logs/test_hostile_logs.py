@@ -11,7 +11,7 @@ from mcap.writer import CompressionType, Writer
 
 from vplog import logs
 from vplog.errors import LogError
-from vplog.logs.formats.container import Channel, Notes, messages_in
+from vplog.logs.formats.container import Channel, Notes
 from vplog.logs.formats.mcap_file import McapFile
 
 if TYPE_CHECKING:
@@ -33,10 +33,10 @@ def write(path: Path, topics: int) -> Path:
 def test_channels_are_taken_as_they_come_in_a_chunk(tmp_path: Path) -> None:
     """One by one: a log of 20,000 topics took minutes when each made the table of all anew."""
     file = McapFile(write(tmp_path / "a.mcap", 300), Notes())
-    found = [(m.channel.topic, json.loads(bytes(m.data))["number"]) for m in messages_in(file, file.contents().counts)]
+    found = [(m.channel.topic, json.loads(bytes(m.data))["number"]) for m in file.messages(file.contents().counts)]
     assert found == [(f"/fix/{number}", number) for number in range(300)]
     wanted = {Channel(f"/fix/{number}", "foxglove.LocationFix", "json") for number in (7, 299)}
-    assert [m.log_ns for m in messages_in(file, wanted)] == [7, 299]
+    assert [m.log_ns for m in file.messages(wanted)] == [7, 299]
 
 
 @pytest.mark.parametrize("deep", ["[" * 50_000, "- " * 50_000, "{a: " * 20_000, "a: " + "[" * 50_000 + "]" * 50_000])

@@ -16,7 +16,7 @@ from rosbags import rosbag1
 
 from vplog import logs
 from vplog.errors import LogError
-from vplog.logs.formats.container import Channel, Notes, messages_in
+from vplog.logs.formats.container import Channel, Notes
 from vplog.logs.formats.mcap_file import McapFile
 from vplog.logs.formats.ros1_bag import Ros1Bag
 from vplog.logs.recorded_log import RecordedLog
@@ -113,7 +113,7 @@ def test_conformance_files_give_exactly_their_records() -> None:
         ]  # fmt: skip
         file = McapFile(path, notes := Notes())
         contents = file.contents()
-        found = list(messages_in(file, contents.counts))
+        found = list(file.messages(contents.counts))
         assert [(m.channel, m.log_ns, m.data) for m in found] == expected, path.name
         assert [file.read(m.place) for m in found] == [message for _, _, message in expected]
         assert contents.counts.keys() == set(channels.values()), path.name
@@ -161,7 +161,7 @@ def test_mcap_messages_are_those_of_the_reference_reader() -> None:
     compared = 0
     for path in files:
         file = McapFile(path, Notes())
-        ours = [(m.channel.topic, m.log_ns, m.data) for m in messages_in(file, file.contents().counts)]
+        ours = [(m.channel.topic, m.log_ns, m.data) for m in file.messages(file.contents().counts)]
         with path.open("rb") as stream:
             try:
                 theirs = [
@@ -185,7 +185,7 @@ def test_ros1_messages_are_those_of_the_reference_reader() -> None:
         except (rosbag1.ReaderError, AssertionError):
             continue
         bag = Ros1Bag(path, Notes())
-        messages = list(messages_in(bag, bag.contents().counts))
+        messages = list(bag.messages(bag.contents().counts))
         assert sorted((m.channel.topic, m.log_ns, m.data) for m in messages) == theirs, path.name
         assert bag.contents().messages == len(theirs)
         assert all(bag.read(m.place) == m.data for m in messages[:50])

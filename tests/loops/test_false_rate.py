@@ -11,8 +11,7 @@ import pytest
 from tests.loops import scene
 from vplog.data import Closures, Verdict
 from vplog.execution.execution import Execution
-from vplog.features.mirror import mirrored
-from vplog.features.sift import SiftSettings
+from vplog.features.sift import SiftSettings, mirrored
 from vplog.loops.candidate import Drive, VerifySettings
 from vplog.loops.false_rate import at_rate, certain_pairs, mirrored_evidence, p_false, with_p_false, wrong_poses
 from vplog.loops.verify import drive_of, verify_between

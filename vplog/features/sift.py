@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Literal
 
 import cv2
@@ -29,6 +30,10 @@ _LEAST_LEVELS = 3
 """Smoothed, what has fewer is noise, as of a covered lens."""
 _CLIP, _TILES = 4.0, (8, 8)
 """Clip limit and tile grid of CLAHE (Zuiderveld 1994): the contrast of a tile grows by four at most."""
+_CELLS, _BINS = 4, 8
+"""Cells on a side of a SIFT descriptor, and directions of the gradient in each (Lowe 2004, section 6.1)."""
+_OPPOSITE = -np.arange(_BINS) % _BINS
+"""In a mirror a gradient turns the other way round from the keypoint's own direction."""
 
 
 class SiftSettings(Settings):
@@ -134,3 +139,17 @@ def depth_at(points: NDArray[np.float32], depth_m: Float32s | None) -> Float32s:
     column = np.clip(np.rint(points[:, 0]).astype(np.int64), 0, depth_m.shape[1] - 1)
     row = np.clip(np.rint(points[:, 1]).astype(np.int64), 0, depth_m.shape[0] - 1)
     return depth_m[row, column]
+
+
+def mirrored(features: Features) -> Features:
+    """SIFT features of the image with left and right exchanged, without its pixels; the thumbnail is left out.
+
+    A keypoint's direction is mirrored with it, so its patch is, across that direction: rows of cells change places.
+    """
+    cells = features.descriptors.reshape(-1, _CELLS, _CELLS, _BINS)
+    return replace(
+        features,
+        points=features.points * np.array([-1, 1], np.float32) + np.array([features.width - 1, 0], np.float32),
+        descriptors=np.ascontiguousarray(cells[:, ::-1, :, _OPPOSITE]).reshape(features.descriptors.shape),
+        thumbnail=None,
+    )

@@ -64,23 +64,20 @@ def camera_of(name: str, calibration: CalibrationMessage | None, size: tuple[int
     return _fit(camera, matrix, calibration, notes)
 
 
-def camera_from_image(
-    camera: Camera, size: tuple[int, int], calibration: CalibrationMessage | None
-) -> tuple[Floats | None, bool]:
-    """(2, 3) from px of an image of `size` to px of the camera, and whether the two are the same, but for less than a
-    px. By the image's own calibration; else, where the shape is the same, by scale. None where it is another."""
+def camera_from_image(camera: Camera, size: tuple[int, int], calibration: CalibrationMessage | None) -> Floats | None:
+    """(2, 3) from px of an image of `size` to px of the camera, the identity where they differ by less than a px. By
+    the image's own calibration; else, where the shape is the same, by scale. None where it is another."""
     own = None if calibration is None else camera_of(camera.name, calibration, size, Notes())
     if camera.matrix is not None and own is not None and own.matrix is not None:
         found = (camera.matrix @ np.linalg.inv(own.matrix))[:2]
     else:
         x, y = camera.width / size[0], camera.height / size[1]
         if abs(x - y) > _SAME_SHAPE * max(x, y):
-            return None, False
+            return None
         found = resized(x, y)[:2]
     corners = np.array([[0, 0, 1], [size[0], 0, 1], [0, size[1], 1], [*size, 1]], np.float64)
     moved = np.abs(corners @ found.T - corners[:, :2]).max()
-    same = size == (camera.width, camera.height) and moved < _SAME_PX
-    return (None, True) if same else (found, False)
+    return np.eye(2, 3) if size == (camera.width, camera.height) and moved < _SAME_PX else found
 
 
 def resized(x: float, y: float) -> Floats:

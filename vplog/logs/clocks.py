@@ -6,6 +6,7 @@ difference, the skew, stays at one level.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -70,35 +71,21 @@ class Repaired:
     """Messages by the skew of the clock that they came on."""
 
 
-@dataclass(frozen=True)
-class _Levels:
-    """Runs of messages on one clock each."""
-
-    runs: list[slice]
-    clocks: list[int | None]
-    """The skew of the clock that each is on; None of runs too short to show one."""
-    limit: float
-    """ns; half the least step."""
-    unclear: list[int]
-    """ns by which the skew changes over gaps, by no more than messages may be late."""
-
-
 def align_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None) -> Repaired | None:
     """The header stamps without jumps of their clock; None where they follow no clock. Both (M,) in ns, M >= 1. Of
     several clocks, `reference_ns` is the skew of the one to end on; None takes that of most messages."""
     step, log_step = np.diff(header_ns), np.diff(log_ns)
     period = float(np.median(np.minimum(np.abs(step), np.abs(log_step)))) if len(step) else 0.0
     jump_ns = max(LEAST_JUMP_NS, _PERIODS * period)
-    found = None
-    for least_ns in (LEAST_STEP_NS, jump_ns):  # what steps without end, late messages for one, has no small steps
-        found = found or _levels(header_ns, log_ns, least_ns)
+    # what steps without end, late messages for one, has no small steps
+    found = _levels(header_ns, log_ns, LEAST_STEP_NS) or _levels(header_ns, log_ns, jump_ns)
     if found is None:
         return None
-    runs, clocks, limit = found.runs, found.clocks, found.limit
-    counts: dict[int, int] = {}
+    runs, clocks, limit, unclear = found
+    counts: Counter[int] = Counter()
     for run, clock in zip(runs, clocks, strict=True):
         if clock is not None:
-            counts[clock] = counts.get(clock, 0) + run.stop - run.start
+            counts[clock] += run.stop - run.start
     chosen = max(counts, key=lambda skew: (counts[skew], -skew))
     if reference_ns is not None and len(counts) > 1:
         near = min(counts, key=lambda skew: (abs(skew - reference_ns), skew))
@@ -113,7 +100,7 @@ def align_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None) 
     order = [clock for clock in clocks if clock is not None]
     jumps = [before - behind for before, behind in pairwise(order) if before != behind]
     log_jumps = _log_jumps(header_ns, log_ns, jump_ns)
-    return Repaired(stamp_ns, valid, chosen, jumps, log_jumps, found.unclear, counts)
+    return Repaired(stamp_ns, valid, chosen, jumps, log_jumps, unclear, counts)
 
 
 def _runs(header_ns: Ints, log_ns: Ints, least_ns: float) -> tuple[list[slice], set[int]]:
@@ -127,9 +114,13 @@ def _runs(header_ns: Ints, log_ns: Ints, least_ns: float) -> tuple[list[slice], 
     return [slice(a, b) for a, b in pairwise([0, *rows.tolist(), len(header_ns)])], set(gaps.tolist())
 
 
-def _levels(header_ns: Ints, log_ns: Ints, least_ns: float) -> _Levels | None:
-    """The runs and clocks with steps of `least_ns` or more; None where these leave the skew at no level. The clock of a
-    run is another than that before where the skew stays at another level, by more than it varies."""
+def _levels(
+    header_ns: Ints, log_ns: Ints, least_ns: float
+) -> tuple[list[slice], list[int | None], float, list[int]] | None:
+    """Runs of messages between steps of `least_ns` or more, the skew of the clock that each is on (None of runs too
+    short to show one), half the least step, and the ns by which the skew changes over gaps by no more than messages may
+    be late; None where the skew stays at no level. The clock of a run is another than that before where the skew stays
+    at another level, by more than it varies."""
     runs, gaps = _runs(header_ns, log_ns, least_ns)
     skew, lengths = log_ns - header_ns, [run.stop - run.start for run in runs]
     least = min(_LEAST_RUN, max(lengths))
@@ -160,7 +151,7 @@ def _levels(header_ns: Ints, log_ns: Ints, least_ns: float) -> _Levels | None:
     for level in levels:
         median = int(np.median(np.concatenate(level)))
         clocks.append(next((known for known in clocks if abs(known - median) <= least_ns), median))
-    return _Levels(runs, [None if one is None else clocks[one] for one in place], min(sizes) / 2, unclear)
+    return runs, [None if one is None else clocks[one] for one in place], min(sizes) / 2, unclear
 
 
 def _change(before_ns: Ints, behind_ns: Ints) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,12 +36,8 @@ class Content:
     """Places of all messages of the images' topic, in the order of the file: a video decodes in that order alone."""
     stream_rows: Ints
     """(F,) which of them the images are."""
-    depth_places: list[Place | None]
-    """Place of the depth image of each."""
-    right_places: list[Place | None]
-    """Place of the right image of each."""
-    mask_places: list[Place | None]
-    """Place of the mask of each."""
+    companions: dict[str, list[Place | None]]
+    """Places of the `depth` and `right` images and of the `mask` of each."""
     calibrations: list[CalibrationMessage]
     """Calibrations that are set and differ from the one before: the first is the camera's, a later one that of images
     behind its stamp."""
@@ -81,14 +78,11 @@ class Content:
 
     def with_images(self, wanted: np.ndarray) -> Content:
         """With those of the images for which (F,) `wanted` is true."""
-        rows = np.flatnonzero(wanted).tolist()
-        places, *others = (
-            [listed[row] for row in rows]
-            for listed in (self.places, self.depth_places, self.right_places, self.mask_places)
-        )
+        places = list(compress(self.places, wanted))
+        companions = {part: list(compress(found, wanted)) for part, found in self.companions.items()}
         return replace(
             self, stamp_ns=self.stamp_ns[wanted], places=places, stream_rows=self.stream_rows[wanted],
-            depth_places=others[0], right_places=others[1], mask_places=others[2],
+            companions=companions,
         )  # fmt: skip
 
 
@@ -100,15 +94,15 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     """Read the chosen topics once; what had to be repaired or left out is noted."""
     read = TopicCollector(chosen)
     stamped = [channel for channel in read.by_channel if channel.encoding in ("cdr", "ros1")]
-    for block in container.blocks(chosen.channels, stamped):
-        read.add_block(block)
+    for message in container.messages(chosen.channels, stamped):
+        read.add(message)
     read.finish_poses()
     correct_clock_steps(read.every_stamps(), notes)
     set_common_clock(stamps for _, stamps in read.stamps())
     gps_notes = Notes()
     gps = read.fixes.finish(gps_notes) if read.fixes else None
     found = read_sources(read, chosen) | other_sources(gps, contents, chosen)
-    sources = rank_sources(found, read.images.finish(Notes())[0])
+    sources = rank_sources(found, read.images["image"].finish(Notes())[0])
     rates_hz = read.rates_hz()
     chosen = chosen.with_odometry(choose_odometry(sources, chosen, notes))
     sources = [(replace(one, used=source == chosen.odometry), source) for one, source in sources]
@@ -119,13 +113,13 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     tree = FrameTree([*(read.dynamic.static() if chosen.tf else ()), *read.transforms])
     if tree.dropped:
         notes.add(f"{plural(tree.dropped, 'static transform')} with NaN or without a rotation left out.")
-    stamp_ns, places, rows = read.images.finish(notes)
-    paired = []
-    for name, images in (("depth", read.depths), ("right", read.rights), ("mask", read.masks)):
-        other_ns, other_places, _ = images.finish(notes)
+    stamp_ns, places, rows = read.images["image"].finish(notes)
+    companions = {}
+    for name in ("depth", "right", "mask"):
+        other_ns, other_places, _ = read.images[name].finish(notes)
         pairs = nearest(stamp_ns, other_ns)
-        paired.append([None if pair < 0 else other_places[pair] for pair in pairs.tolist()])
-        if images.channel and (alone := int((pairs < 0).sum())):
+        companions[name] = [None if pair < 0 else other_places[pair] for pair in pairs.tolist()]
+        if read.images[name].channel and (alone := int((pairs < 0).sum())):
             notes.add(f"{alone} of {plural(len(pairs), 'image')} without a {name} image within half a frame period.")
         both = pairs >= 0
         late_ns = np.abs(other_ns[pairs[both]] - stamp_ns[both])
@@ -145,9 +139,9 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     notes.extend(gps_notes)
     if gps is not None and read.fixes and body and (placed := tree.between(body, read.fixes.frame)) is not None:
         gps = replace(gps, antenna_m=placed[:3, 3])
-    calibrations = read.finished(read.calibrations, notes)
-    right_calibration = next(iter(read.finished(read.right_calibrations, notes)), None)
+    calibrations = read.calibrations(chosen.camera_info, "image", notes)
+    right_calibration = next(iter(read.calibrations(chosen.right_info, "right", notes)), None)
     return Content(
-        stamp_ns, places, read.images.stream, rows, paired[0], paired[1], paired[2], calibrations, right_calibration,
-        odometry, frames, gps, tree, read.skew_ms(), chosen, [source for source, _ in sources], rates_hz,
+        stamp_ns, places, read.images["image"].stream, rows, companions, calibrations, right_calibration, odometry,
+        frames, gps, tree, read.skew_ms(), chosen, [source for source, _ in sources], rates_hz,
     )  # fmt: skip

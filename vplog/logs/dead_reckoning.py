@@ -14,7 +14,7 @@ from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
 
 if TYPE_CHECKING:
-    from vplog.data import Bools, Floats, Gps, Ints
+    from vplog.data import Floats, Gps, Ints
 
 _LONGEST_S = 1.0
 """s; over a longer gap the last velocity is not held, as of a recorder that was paused."""
@@ -62,36 +62,23 @@ def dead_reckoned(stamp_ns: Ints, twists: Floats, variances: Floats) -> Odometry
     return Odometry(stamp_ns, poses, covariance)
 
 
-class Turned(NamedTuple):
-    """Velocities at the samples of a gyroscope."""
-
-    stamp_ns: Ints
-    """(K,)"""
-    twists: Floats
-    """(K, 6) linear, then angular."""
-    bias: float | None
-    """rad/s that the gyroscope is off at rest; None where the body never stands for long, and it is left in."""
-
-
-def turned_by_gyro(stamp_ns: Ints, twists: Floats, gyro_ns: Ints, gyro: Floats, body_from_imu: Floats) -> Turned:
+def turned_by_gyro(
+    stamp_ns: Ints, twists: Floats, gyro_ns: Ints, gyro: Floats, body_from_imu: Floats
+) -> tuple[Ints, Floats, float | None]:
     """Velocities (T, 6) at the samples of a gyroscope, whose rates (K, 3) rad/s replace the angular ones: a wheel's
-    scale and slip no longer turn the drive."""
+    scale and slip no longer turn the drive. Stamps (K,), velocities (K, 6), and the rad/s that the gyroscope is off at
+    rest; None where the body never stands for long, and it is left in."""
     inside = (gyro_ns >= stamp_ns[0]) & (gyro_ns <= stamp_ns[-1])
     at_ns, rates = gyro_ns[inside], gyro[inside] @ body_from_imu[:3, :3].T
     since = stamp_ns[0]
-    linear = np.stack([np.interp(at_ns - since, stamp_ns - since, column) for column in twists[:, :3].T], axis=1)
-    turning = np.stack([np.interp(at_ns - since, stamp_ns - since, column) for column in twists[:, 3:].T], axis=1)
-    standing = _standing(linear, turning)
+    moving = np.stack([np.interp(at_ns - since, stamp_ns - since, column) for column in twists.T], axis=1)
+    linear, turning = moving[:, :3], moving[:, 3:]
+    standing = (np.linalg.norm(linear, axis=1) < _STANDING_M_S) & (np.linalg.norm(turning, axis=1) < _STANDING_RAD_S)
     seconds = float(np.diff(at_ns)[standing[1:]].sum()) / 1e9 if len(at_ns) > 1 else 0.0
-    bias = np.median(rates[standing], axis=0) if seconds >= _LEAST_STANDING_S else np.zeros(3)
-    size = float(np.linalg.norm(bias)) if seconds >= _LEAST_STANDING_S else None
-    return Turned(at_ns, np.concatenate([linear, rates - bias], axis=1), size)
-
-
-def _standing(linear: Floats, turning: Floats) -> Bools:
-    """(K,) whether the wheels stand."""
-    slow = (np.linalg.norm(linear, axis=1) < _STANDING_M_S) & (np.linalg.norm(turning, axis=1) < _STANDING_RAD_S)
-    return np.asarray(slow)
+    if seconds < _LEAST_STANDING_S:
+        return at_ns, np.concatenate([linear, rates], axis=1), None
+    bias = np.median(rates[standing], axis=0)
+    return at_ns, np.concatenate([linear, rates - bias], axis=1), float(np.linalg.norm(bias))
 
 
 def odometry_of_fixes(gps: Gps) -> Odometry | None:
@@ -103,7 +90,8 @@ def odometry_of_fixes(gps: Gps) -> Odometry | None:
     variance = local.covariance[:, range(3), range(3)]
     known = np.isfinite(variance) & (variance > 0)
     variance = np.where(known, variance, np.array([1.0, 1.0, 4.0]) * RECEIVER_SIGMA_M**2)
-    if len(local) < _LEAST_FIXES or np.hypot(*np.ptp(local.enu_m[:, :2], axis=0)) < _LEAST_WAY * _sigma(variance):
+    sigma_m = float(np.sqrt(np.median(variance[:, :2])))  # horizontal, of the usual fix
+    if len(local) < _LEAST_FIXES or np.hypot(*np.ptp(local.enu_m[:, :2], axis=0)) < _LEAST_WAY * sigma_m:
         return None
     fixed_s, at_ns = (local.stamp_ns - local.stamp_ns[0]) / 1e9, _between(local.stamp_ns)
     at_s = (at_ns - local.stamp_ns[0]) / 1e9
@@ -118,11 +106,6 @@ def odometry_of_fixes(gps: Gps) -> Odometry | None:
     rates = _rates([level, height], float(fixed_s[-1]), np.maximum(speed, slow))
     each = rates * np.gradient(at_s)[:, None]
     return Odometry(at_ns, poses, each[:, :, None] * np.eye(6), drifts=False)
-
-
-def _sigma(variance: Floats) -> float:
-    """m, horizontal, of the usual fix."""
-    return float(np.sqrt(np.median(variance[:, :2])))
 
 
 def _between(stamp_ns: Ints) -> Ints:
@@ -181,8 +164,7 @@ def _rates(axes: list[_Smooth], seconds: float, speed: Floats) -> Floats:
     """
     noise = [one.variance * one.parameters / len(one.places) for one in axes]
     lasting_s = [seconds / one.parameters for one in axes]
-    yaw = 2 * noise[0] / (speed * lasting_s[0]) ** 2 / lasting_s[0]
-    moved = [2 * noise[i] / lasting_s[i] for i in (0, 0, 1)]
-    still = np.tile([2 * _LEVEL_RAD**2 / lasting_s[0], 2 * _LEVEL_RAD**2 / lasting_s[0], 0.0, *moved], (len(speed), 1))
-    still[:, 2] = yaw
-    return still
+    level = 2 * _LEVEL_RAD**2 / lasting_s[0]
+    rates = np.tile([level, level, 0.0, *(2 * noise[i] / lasting_s[i] for i in (0, 0, 1))], (len(speed), 1))
+    rates[:, 2] = 2 * noise[0] / (speed * lasting_s[0]) ** 2 / lasting_s[0]
+    return rates

@@ -5,15 +5,13 @@ from __future__ import annotations
 import os
 import weakref
 from contextlib import ExitStack
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from vplog.errors import LogError, nearest_path, plural
 from vplog.logs import image_folder
-from vplog.logs.datasets import video
-from vplog.logs.datasets.find import find_roots, read_folder
+from vplog.logs.datasets import colmap, euroc, kitti, tum_rgbd, utm_images, video, vslam_lab
 from vplog.logs.datasets.images import read as read_images
 from vplog.logs.datasets.streams import DataSetContainer
 from vplog.logs.formats import mcap_file, ros1_bag, sqlite_bag
@@ -25,7 +23,6 @@ from vplog.logs.formats.ros2_folder import (
     Chain,
     Metadata,
     MetadataError,
-    ZstdMessages,
     read_metadata,
     split_parts,
 )
@@ -47,6 +44,7 @@ _RESULTS = {"run.json": "a run", "map.json": "a map", "library.json": "a library
 _MAGIC = {mcap_file.MAGIC: "mcap", ros1_bag.MAGIC: "ros1", sqlite_bag.MAGIC: "db3", b"\x28\xb5\x2f\xfd": "zstd"}
 _READERS = {"mcap": McapFile, "ros1": Ros1Bag, "db3": SqliteBag}
 _KINDS = {"mcap": "mcap", "ros1": "ros1", "db3": "ros2-db3"}
+_DATA_SETS = (kitti, euroc, vslam_lab, tum_rgbd, colmap, utm_images)
 _LISTED = 5
 """Files that an error lists."""
 _DEEPEST, _MOST_FILES = 4, 10**6
@@ -79,7 +77,7 @@ def check_log(path: Path) -> None:
         if not path.is_dir():
             if not (_magic(path) or video.is_video(path)):
                 raise LogError(_no_log(path))
-        elif not (path / "metadata.yaml").is_file() and (isinstance(path, RemotePath) or not find_roots(path)):
+        elif not (path / "metadata.yaml").is_file() and not _data_sets(path):
             files = [file for file in path.iterdir() if file.is_file()]
             found = any(_magic(file) or image_folder.is_image(file) for file in files)
             if not found and not any(map(image_folder.is_image, _files_below(path))):
@@ -139,8 +137,7 @@ def open_container(path: Path, notes: Notes, name: str = "") -> tuple[Container,
     return container, kind
 
 
-@dataclass(frozen=True)
-class _Part:
+class _Part(NamedTuple):
     """One file of a drive."""
 
     path: Path
@@ -209,7 +206,8 @@ def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> Log:
             return _open_bag(path, read_metadata(path), choice, notes)
         except MetadataError as error:
             problem = str(error)
-    files = sorted((file for file in path.iterdir() if file.is_file()), key=_by_name)
+    files = [file for file in path.iterdir() if file.is_file()]
+    files.sort(key=lambda file: image_folder.natural_order(file.name))
     logs = [file for file in files if _magic(file) in (*_READERS, "zstd")]
     if [log.name for log in logs] == ["result.mcap"] and (path / "run.json").is_file():
         raise LogError(_no_folder(path, files))
@@ -217,9 +215,10 @@ def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> Log:
         return _open_found(path, logs, problem or f"{path.name} has no metadata.yaml", choice, notes)
     if problem:
         raise LogError(f"{problem} Copy the whole bag folder, or give a storage file itself.")
-    roots = [] if isinstance(path, RemotePath) else find_roots(path)  # to look around costs a request each
+    roots = _data_sets(path)
     if len(roots) == 1:
-        return _published(path, path.resolve().name, read_folder(roots[0]), notes, choice)
+        found = next(one.read(roots[0]) for one in _DATA_SETS if one.roots(roots[0]))
+        return _published(path, path.resolve().name, found, notes, choice)
     if roots:
         names = ", ".join(str(root.relative_to(path)) for root in roots[:_LISTED])
         raise LogError(f"{path} holds {len(roots)} drives of data sets. Give one of them: {names}.")
@@ -228,6 +227,17 @@ def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> Log:
         found = read_images(path, *images, choice)
         return _published(path, path.name, found, notes, choice.model_copy(update={"image": None}))
     raise LogError(_no_folder(path, files))
+
+
+def _data_sets(path: Path) -> list[Path]:
+    """The drives of data sets in a folder or, by their layout, below it; else those right below. Raises OSError."""
+    if isinstance(path, RemotePath):  # to look around costs a request each
+        return []
+    for folders in ([path], image_folder.below(path)):
+        each = (next((found for one in _DATA_SETS if (found := one.roots(folder))), []) for folder in folders)
+        if roots := [root for found in each for root in found]:
+            return roots
+    return []
 
 
 def open_images(files: Sequence[Path], choice: TopicChoice) -> Log:
@@ -243,10 +253,6 @@ def open_images(files: Sequence[Path], choice: TopicChoice) -> Log:
     root = Path(os.path.commonpath([path.absolute().parent for path in paths]))
     found = read_images(root, [path.absolute() for path in paths], (), choice.model_copy(update={"image": EVERY_IMAGE}))
     return _published(root, root.name, found, Notes(), choice.model_copy(update={"image": None}))
-
-
-def _by_name(path: Path) -> tuple:
-    return image_folder.natural_order(path.name)
 
 
 def _images_in(path: Path, files: list[Path]) -> tuple[list[Path], set[Path]] | None:
@@ -285,7 +291,7 @@ def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice,
         names = ", ".join(file.name for file in logs[:_LISTED])
         raise LogError(f"{problem.rstrip('.')}, and the folder holds {len(logs)} logs. Give one of them: {names}.")
     notes.add(f"{problem.rstrip('.')}; {plural(len(parts), 'storage file')} found by content.")
-    return _open_bag(path, Metadata(parts, [], "", {}, 0, 0), choice, notes)
+    return _open_bag(path, Metadata(parts, [], {}, 0, 0), choice, notes)
 
 
 def _open_bag(folder: Path, metadata: Metadata, choice: TopicChoice, notes: Notes) -> Log:
@@ -308,9 +314,8 @@ def _open_bag(folder: Path, metadata: Metadata, choice: TopicChoice, notes: Note
         detail = f"{name} lacks {missing}, which metadata.yaml names."
         notes.account.add("missing_file", None, (missing, 0), [], detail)
     chain = Chain([container for container, _ in parts], notes, metadata)
-    container = ZstdMessages(chain, notes) if metadata.mode == "message" else chain
     kind = "ros2-mcap" if any(kind == "mcap" for _, kind in parts) else "ros2-db3"
-    return _recorded(folder, name, kind, container, notes, choice)
+    return _recorded(folder, name, kind, chain, notes, choice)
 
 
 def _name(path: Path) -> str:

@@ -42,7 +42,7 @@ _TRIED = 10
 damaged has none before the next."""
 
 
-def image_in(channel: Channel, data: Octets) -> ImageMessage:
+def image_in(channel: Channel, data: Octets | ImageMessage) -> ImageMessage:
     """The image of a message. Raises BadMessageError."""
     message = decode(channel, data)
     if not isinstance(message, ImageMessage):
@@ -51,52 +51,36 @@ def image_in(channel: Channel, data: Octets) -> ImageMessage:
 
 
 @dataclass(frozen=True, eq=False)
-class EncodedImage:
-    """An image message as bytes."""
+class LoggedImage:
+    """An image message as it lies in the log; a frame of a video, which decodes in the order of the file alone, was
+    decoded where it was read."""
 
     channel: Channel
-    data: Octets
+    data: Octets | ImageMessage | VideoFrame | BadMessageError
     levels: Levels | None = None
     """Black and white of its topic, where that has 16 bits."""
 
     def grey(self, stamp_ns: int) -> Bytes:
         """(H, W) uint8. Raises LogError."""
-        return self._pixels(stamp_ns, partial(pixels.grey, levels=self.levels))
+        return self._pixels(stamp_ns, partial(pixels.grey, levels=self.levels), video.grey)
 
     def rgb(self, stamp_ns: int) -> Bytes:
         """(H, W, 3) uint8. Raises LogError."""
-        return self._pixels(stamp_ns, partial(pixels.rgb, levels=self.levels))
+        return self._pixels(stamp_ns, partial(pixels.rgb, levels=self.levels), video.rgb)
 
     def depth_m(self, stamp_ns: int) -> Float32s:
         """(H, W) float32 m, NaN where unknown. Raises LogError."""
-        return self._pixels(stamp_ns, depth_m)
+        return self._pixels(stamp_ns, depth_m, video.grey)
 
-    def _pixels(self, stamp_ns: int, convert: Callable[[ImageMessage], np.ndarray]) -> Any:
+    def _pixels(self, stamp_ns: int, of_message: Callable[[ImageMessage], Any], of_video: Callable[[Any], Any]) -> Any:
         try:
-            return convert(image_in(self.channel, self.data))
+            if isinstance(self.data, BadMessageError):
+                raise self.data
+            if isinstance(self.data, bytes | memoryview | ImageMessage):
+                return of_message(image_in(self.channel, self.data))
+            return of_video(self.data)
         except BadMessageError as error:
-            raise _undecodable(self.channel, stamp_ns, error) from None
-
-
-@dataclass(frozen=True, eq=False)
-class DecodedImage:
-    """A frame of a video, which decodes in the order of the file alone and so was decoded where it was read."""
-
-    channel: Channel
-    image: VideoFrame | BadMessageError
-
-    def grey(self, stamp_ns: int) -> Bytes:
-        """(H, W) uint8. Raises LogError."""
-        return video.grey(self._frame(stamp_ns))
-
-    def rgb(self, stamp_ns: int) -> Bytes:
-        """(H, W, 3) uint8. Raises LogError."""
-        return video.rgb(self._frame(stamp_ns))
-
-    def _frame(self, stamp_ns: int) -> VideoFrame:
-        if isinstance(self.image, BadMessageError):
-            raise _undecodable(self.channel, stamp_ns, self.image)
-        return self.image
+            raise LogError(f"{self.channel.topic} at {stamp_ns} ns cannot be decoded: {error}.") from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,15 +89,15 @@ class RecordedFrame:
 
     stamp_ns: int
     camera: Camera
-    image: EncodedImage | DecodedImage
-    depth: EncodedImage | None
-    right: EncodedImage | None
+    image: LoggedImage
+    depth: LoggedImage | None
+    right: LoggedImage | None
     pair: Pair | None
     notes: Notes
     """Notes of the log, where what does not decode is counted."""
     calibration: CalibrationMessage | None = None
     """The calibration of the image, where a later one differs from the camera's."""
-    mask: Mask | EncodedImage | None = None
+    mask: Mask | LoggedImage | None = None
     right_mask: Mask | None = None
 
     def decode(self, colour: bool = False) -> Frame:
@@ -138,27 +122,40 @@ class RecordedFrame:
         channel, image = self.image.channel, None
         try:
             image = self.image.grey(self.stamp_ns)
-            if self.pair is None:
-                return image, affine_to_camera(channel.topic, image, self.camera, self.calibration, self.notes)
-            _check_size(channel, image, self.camera)
+            if self.pair is not None:
+                self._check_size(channel, image)
+                return image, None
+            affine = camera_from_image(self.camera, (image.shape[1], image.shape[0]), self.calibration)
+            size = f"{self.camera.width} x {self.camera.height} px"
+            if affine is None:
+                raise LogError(
+                    f"{channel.topic} has an image of {size_of(image)} px among those of {size}, of another shape and "
+                    "without a calibration of its own; it is left out."
+                )
         except LogError as error:
             self._count_undecodable(channel, "" if image is None else str(error))
             raise
-        return image, None
+        if image.shape == (self.camera.height, self.camera.width) and np.array_equal(affine, np.eye(2, 3)):
+            return image, None
+        self.notes.add(
+            f"The images of {channel.topic} change their size or region of interest; those unlike the first are "
+            f"resampled to its {size}."
+        )
+        return image, affine
 
     def _mask(self, image: Bytes) -> Bools | None:
         """(H, W) px of the image as it comes that count; None where all do. Raises LogError where its mask does not fit
         or decode."""
         size = (image.shape[1], image.shape[0])
         try:
-            if not isinstance(self.mask, EncodedImage):
+            if not isinstance(self.mask, LoggedImage):
                 return None if self.mask is None else self.mask.used(size)
             return resized_mask(self.mask.grey(self.stamp_ns) > 0, size, self.mask.channel.topic)
         except LogError as error:
             self._count_undecodable(self.image.channel, str(error))
             raise
 
-    def _registered(self, depth: EncodedImage, image: Bytes, affine: Floats | None) -> Float32s | None:
+    def _registered(self, depth: LoggedImage, image: Bytes, affine: Floats | None) -> Float32s | None:
         """The depth of the camera's px, NaN beyond the image; None, and counted, where it does not decode or has
         another size than the image."""
         detail, found = "", None
@@ -181,43 +178,28 @@ class RecordedFrame:
             return None
         try:
             image = self.right.grey(self.stamp_ns)
-            _check_size(self.right.channel, image, self.camera)
+            self._check_size(self.right.channel, image)
             if self.right_mask is not None:
                 image = filled(image, self.right_mask.used((image.shape[1], image.shape[0])))
         except LogError:
             return self._count_undecodable(self.right.channel)
         return pair.rectify(image, 1)
 
+    def _check_size(self, channel: Channel, image: np.ndarray) -> None:
+        """Raises LogError where an image of a pair has another size than the camera."""
+        if image.shape != (self.camera.height, self.camera.width):
+            size = f"{self.camera.width} x {self.camera.height}"
+            raise LogError(
+                f"{channel.topic} has an image of {size_of(image)} px among those of {size} px; it is left out."
+            )
+
     def _count_undecodable(self, channel: Channel, detail: str = "") -> None:
         at = self.stamp_ns
         self.notes.account.add("undecodable_image", {channel.topic: 1}, (channel.topic, at), [(at, at)], detail)
 
 
-def _undecodable(channel: Channel, stamp_ns: int, reason: BadMessageError) -> LogError:
-    return LogError(f"{channel.topic} at {stamp_ns} ns cannot be decoded: {reason}.")
-
-
 def size_of(image: np.ndarray) -> str:
     return f"{image.shape[1]} x {image.shape[0]}"
-
-
-def affine_to_camera(
-    topic: str, image: Bytes, camera: Camera, calibration: CalibrationMessage | None, notes: Notes
-) -> Floats | None:
-    """(2, 3) from px of the image to those of the camera; None where they are the same. Raises LogError."""
-    found, same = camera_from_image(camera, (image.shape[1], image.shape[0]), calibration)
-    size = f"{camera.width} x {camera.height} px"
-    if found is None and not same:
-        raise LogError(
-            f"{topic} has an image of {size_of(image)} px among those of {size}, of another shape and without a "
-            "calibration of its own; it is left out."
-        )
-    if found is not None:
-        notes.add(
-            f"The images of {topic} change their size or region of interest; those unlike the first are resampled "
-            f"to its {size}."
-        )
-    return found
 
 
 def warped(image: Bytes, affine: Floats | None, camera: Camera) -> Bytes:
@@ -230,12 +212,6 @@ def warped(image: Bytes, affine: Floats | None, camera: Camera) -> Bytes:
     return np.asarray(cv2.warpAffine(image, affine, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def _check_size(channel: Channel, image: np.ndarray, camera: Camera) -> None:
-    if image.shape != (camera.height, camera.width):
-        size = f"{camera.width} x {camera.height}"
-        raise LogError(f"{channel.topic} has an image of {size_of(image)} px among those of {size} px; it is left out.")
-
-
 class ImageReader:
     """Reads images by their place in the container."""
 
@@ -246,35 +222,31 @@ class ImageReader:
         self.content = content if self._video is None else self._from_first_key(self._video, content, notes)
         """Content of the log, without the images before a video's first key frame."""
 
-    def image(self, row: int) -> EncodedImage | DecodedImage:
+    def image(self, row: int) -> LoggedImage:
         if self._image is None:
             raise LogError("No image topic is chosen. Choose one with --image-topic.")
         if self._video is None:
-            return EncodedImage(self._image, self._container.read(self.content.places[row]), self._levels)
+            return LoggedImage(self._image, self._container.read(self.content.places[row]), self._levels)
         try:
-            return DecodedImage(self._image, self._video.frame(int(self.content.stream_rows[row])))
+            return LoggedImage(self._image, self._video.frame(int(self.content.stream_rows[row])))
         except BadMessageError as error:
-            return DecodedImage(self._image, error)
+            return LoggedImage(self._image, error)
 
-    def companion(self, channel: Channel | None, places: list[Place | None], row: int) -> EncodedImage | None:
-        """The depth or right image of a row; None where there is none."""
-        place = places[row]
-        return (
-            None
-            if channel is None or place is None
-            else EncodedImage(channel, self._container.read(place), self._levels)
-        )
+    def companion(self, part: str, row: int) -> LoggedImage | None:
+        """The `depth` or `right` image or the `mask` of a row; None where there is none."""
+        channel, place = getattr(self.content.chosen, part), self.content.companions[part][row]
+        return None if place is None else LoggedImage(channel, self._container.read(place), self._levels)
 
     @cached_property
     def _levels(self) -> Levels | None:
         """Black and white of 16 bits for the whole drive, by images spread over it: SIFT compares views by contrast."""
-        places = self.content.places
-        return None if self._image is None else levels_of(self._sampled(self._image, places[:: spread(len(places))]))
 
-    def _sampled(self, channel: Channel, places: list[Place]) -> Iterator[ImageMessage]:
-        for place in places:
-            with suppress(BadMessageError):
-                yield image_in(channel, self._container.read(place))
+        def sampled(image: Channel) -> Iterator[ImageMessage]:
+            for place in self.content.places[:: spread(len(self.content.places))]:
+                with suppress(BadMessageError):
+                    yield image_in(image, self._container.read(place))
+
+        return None if self._image is None else levels_of(sampled(self._image))
 
     def first(self, channel: Channel, places: list[Place | None], log: str) -> tuple[str, tuple[int, int]]:
         """Frame, and width and height of the first image that decodes. Raises LogError where none of the first few
@@ -295,15 +267,15 @@ class ImageReader:
 
     def first_depth(self, channel: Channel) -> Float32s | None:
         """The first depth image that decodes; None where no image has one. Raises LogError where none does."""
-        failures: list[LogError] = []
-        found = [(row, place) for row, place in enumerate(self.content.depth_places) if place is not None]
+        first: LogError | None = None
+        found = [(row, place) for row, place in enumerate(self.content.companions["depth"]) if place is not None]
         for row, place in found[:_TRIED]:
             try:
-                return EncodedImage(channel, self._container.read(place)).depth_m(int(self.content.stamp_ns[row]))
+                return LoggedImage(channel, self._container.read(place)).depth_m(int(self.content.stamp_ns[row]))
             except LogError as error:
-                failures.append(error)
-        if failures:
-            raise failures[0]
+                first = first or error
+        if first is not None:
+            raise first
         return None
 
     def _stream(self, image: Channel, codec: str, content: Content, notes: Notes) -> VideoStream:

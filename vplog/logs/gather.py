@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vplog.errors import plural
-from vplog.logs.formats.container import Block, Notes
+from vplog.logs.formats.container import BRIEF, Message, Notes
 from vplog.logs.formats.loss_account import LossRuns
 from vplog.logs.messages.decode import decode, read_poses, stamp_of
 from vplog.logs.messages.records import (
@@ -30,13 +29,14 @@ from vplog.logs.tracks import FixTrack, GyroTrack, PoseTrack
 
 if TYPE_CHECKING:
     from vplog.data import Ints
-    from vplog.logs.formats.container import Channel, Message, Octets, Place
+    from vplog.logs.formats.container import Channel, Octets, Place
+    from vplog.logs.messages.records import Record
     from vplog.logs.topic_selection import Selection
 
-_SMALL = 512
-"""Bytes below which an image message may hold no image at all: header, frame and format take about 50."""
 _HEADER = 12
 """Bytes before the frame_id of a message with a header: encapsulation (CDR) or sequence number (ROS 1), and stamp."""
+PARTS = ("mask", "right", "depth", "image")
+"""Image topics of a selection; what is several of them is the last."""
 PATH = "nav_msgs/Path"
 """The type whose messages hold all poses up to then."""
 _TOGETHER = 1024
@@ -59,17 +59,16 @@ class Images:
     rows: list[int] = field(default_factory=list)
     """Rows of `stream` that the places are."""
 
-    def add(self, block: Block, row: int, position: int) -> None:
-        """Add a message of a block. Raises BadMessageError."""
-        start, stop = block.starts[row], block.stops[row]
-        self.stream.append(block.places[row])
-        if stop - start < _SMALL:
-            record = decode(block.channels[row], block.data[start:stop]) if stop > start else None
+    def add(self, message: Message, position: int) -> None:
+        """Add a message. Raises BadMessageError."""
+        channel, log_ns, data, place = message
+        self.stream.append(place)
+        if len(data) < BRIEF:
+            record = decode(channel, data) if data else None
             if record is None or (isinstance(record, ImageMessage) and not record.data):
                 raise _EmptyImageError
-        stamp_ns = stamp_of(block.channels[row], memoryview(block.data)[start:stop])
-        self.stamps.add(stamp_ns, block.log_ns[row], position)
-        self.places.append(block.places[row])
+        self.stamps.add(stamp_of(channel, data), log_ns, position)
+        self.places.append(place)
         self.rows.append(len(self.stream) - 1)
 
     def finish(self, notes: Notes) -> tuple[Ints, list[Place], Ints]:
@@ -84,7 +83,7 @@ class Images:
 class Calibrations:
     """Calibrations of one topic that are set and differ from the one before."""
 
-    channel: Channel | None
+    channel: Channel
     found: list[CalibrationMessage] = field(default_factory=list)
     positions: list[int] = field(default_factory=list)
     """Positions of those in the order of the file."""
@@ -93,8 +92,8 @@ class Calibrations:
     _last: bytes = b""
     _first: CalibrationMessage | None = None
 
-    def add(self, calibration: CalibrationMessage, data: Octets, position: int) -> None:
-        self._last = bytes(data[_HEADER:])
+    def add(self, calibration: CalibrationMessage, data: Octets | Record, position: int) -> None:
+        self._last = bytes(data[_HEADER:]) if isinstance(data, bytes | memoryview) else b""
         self._first = self._first or calibration
         if not calibration.is_set:
             self.unset += not self.found
@@ -102,16 +101,17 @@ class Calibrations:
             self.found.append(calibration)
             self.positions.append(position)
 
-    def repeats(self, data: Octets) -> bool:
+    def repeats(self, data: Octets | Record) -> bool:
         """Whether a message of ROS is that before it but for its stamp."""
-        ros = self.channel is not None and self.channel.encoding in ("cdr", "ros1")
-        return ros and bool(self.found) and data[_HEADER:] == self._last
+        if not self.found or self.channel.encoding not in ("cdr", "ros1"):
+            return False
+        return isinstance(data, bytes | memoryview) and data[_HEADER:] == self._last
 
     def finish(self, images: Stamps, times: Stamps, notes: Notes) -> list[CalibrationMessage]:
         """The calibrations that are set; the first one where none is. Each with the stamp of the first of the `images`
         that it is of: the nearest by header stamps where these are of the images' clock, else by the log `times` of
         the topic."""
-        if self.unset and self.found and self.channel:
+        if self.unset and self.found:
             notes.add(
                 f"The first {plural(self.unset, 'calibration')} of {self.channel.topic} "
                 f"{'is' if self.unset == 1 else 'are'} not set (K is zero or NaN); the first that is set is used."
@@ -138,10 +138,9 @@ class TopicCollector:
     """Collects the messages of the topics of a selection."""
 
     def __init__(self, chosen: Selection) -> None:
-        self.images, self.depths, self.rights = Images(chosen.image), Images(chosen.depth), Images(chosen.right)
-        self.masks = Images(chosen.mask)
-        self.calibrations = Calibrations(chosen.camera_info)
-        self.right_calibrations = Calibrations(chosen.right_info)
+        self.images = {part: Images(getattr(chosen, part)) for part in PARTS}
+        self.by_channel = {one.channel: one for one in self.images.values() if one.channel}
+        self._calibrations = {one: Calibrations(one) for one in (chosen.camera_info, chosen.right_info) if one}
         self.poses = {
             source: PoseTrack(source.topic, chosen.geometry.get(source, (1.0, 1.0)))
             for source in chosen.sources
@@ -150,86 +149,71 @@ class TopicCollector:
         """Tracks of the topics that may be the odometry."""
         self.fixes = FixTrack(chosen.gps.topic) if chosen.gps else None
         self.gyro = GyroTrack(chosen.imu)
-        self._paths: dict[Channel, tuple[bytes, int]] = {}
-        """The last message of each topic of paths, which holds those before it, and its log time."""
+        self._paths: dict[Channel, Message] = {}
+        """The last message of each topic of paths, which holds those before it."""
         self.transforms: list[PoseMessage] = []
         self.dynamic = DynamicTransforms(store=any(source in chosen.tf for source in chosen.sources))
         self.lost: dict[tuple[str, str], LossRuns] = {}
         """Lost messages by reason and topic."""
         self._tf = chosen.tf
-        self._waiting: dict[Channel, tuple[list[bytes], list[int], list[int]]] = {}
+        self._waiting: defaultdict[Channel, list[tuple[bytes, int, int]]] = defaultdict(list)
         """Messages of odometry that are still to be added, their log times and their positions."""
         self._messages = 0
         """Read so far: the position of the next one in the order of the file."""
         self._others: defaultdict[Channel, Stamps] = defaultdict(Stamps)
         """Log times of the topics that are not followed over time."""
 
-    @cached_property
-    def by_channel(self) -> dict[Channel, Images]:
-        """The image topics in use."""
-        return {one.channel: one for one in (self.masks, self.rights, self.depths, self.images) if one.channel}
-
-    def add_block(self, block: Block) -> None:
-        """Add the messages of a block, odometry in batches."""
-        rows: dict[Channel, list[int]] = {}
-        view, first = memoryview(block.data), self._messages
-        self._messages += len(block.channels)
-        for row, channel in enumerate(block.channels):
-            rows.setdefault(channel, []).append(row)
-        single: list[int] = []
-        for channel, mine in rows.items():
-            log_ns, positions = [block.log_ns[row] for row in mine], [first + row for row in mine]
-            if channel in self.by_channel:
-                single += mine
-            elif channel in self.poses and short_type(channel.type) == PATH:
-                self._paths[channel] = bytes(view[block.starts[mine[-1]] : block.stops[mine[-1]]]), log_ns[-1]
-            elif channel in self.poses:
-                data, waiting_ns, waiting_positions = self._waiting.setdefault(channel, ([], [], []))
-                data += [bytes(view[block.starts[row] : block.stops[row]]) for row in mine]
-                waiting_ns += log_ns
-                waiting_positions += positions
-                if len(data) >= _TOGETHER:
-                    self._add_poses(channel)
-            else:
-                self._others[channel].extend([0] * len(mine), log_ns, positions)
-                known = self.calibrations_of(channel)
-                single += [
-                    row for row in mine if not (known and known.repeats(view[block.starts[row] : block.stops[row]]))
-                ]
-        for row in sorted(single):
-            self._add_message(block, row, first + row)
+    def add(self, message: Message) -> None:
+        """Add a message; odometry in batches."""
+        channel, position = message.channel, self._messages
+        self._messages += 1
+        if channel in self.by_channel:
+            self._add_message(message, position)
+        elif channel in self.poses and short_type(channel.type) == PATH:
+            self._paths[channel] = message._replace(data=bytes(message.data))
+        elif channel in self.poses:
+            waiting = self._waiting[channel]
+            waiting.append((bytes(message.data), message.log_ns, position))
+            if len(waiting) >= _TOGETHER:
+                self._add_poses(channel)
+        else:
+            self._others[channel].add(0, message.log_ns, position)
+            known = self._calibrations.get(channel)
+            if not (known and known.repeats(message.data)):
+                self._add_message(message, position)
 
     def finish_poses(self) -> None:
         """Add the messages of odometry, and fixes of NMEA, that wait."""
         for channel in list(self._waiting):
             self._add_poses(channel)
-        for channel, (data, log_ns) in self._paths.items():
-            self._add_message(Block(data, [channel], [log_ns], [0], [len(data)], [()]), 0, self._messages)
+        for message in self._paths.values():
+            self._add_message(message, self._messages)
         if self.fixes:
             self.fixes.add_sentences()
 
     def _add_poses(self, channel: Channel) -> None:
         """Add those of one topic: at once where each is a pose, else one by one."""
-        data, log_ns, positions = self._waiting.pop(channel)
+        waiting = self._waiting.pop(channel)
+        data, log_ns, positions = map(list, zip(*waiting, strict=True))
         found = read_poses(channel, data)
         if found is not None:
             self.poses[channel].add_all(found, log_ns, positions)
             self._sound(channel.topic)
         else:
-            for one, time_ns, position in zip(data, log_ns, positions, strict=True):
-                self._add_message(Block(one, [channel], [time_ns], [0], [len(one)], [()]), 0, position)
+            for one, time_ns, position in waiting:
+                self._add_message(Message(channel, time_ns, one, ()), position)
 
-    def _add_message(self, block: Block, row: int, position: int) -> None:
+    def _add_message(self, message: Message, position: int) -> None:
         """Add a message, or count it among the lost ones."""
-        channel = block.channels[row]
+        channel = message.channel
         try:
             if images := self.by_channel.get(channel):
-                images.add(block, row, position)
+                images.add(message, position)
             else:
-                self._add(block.message(row), position)
+                self._add(message, position)
         except BadMessageError as error:
             reason = "empty_image" if isinstance(error, _EmptyImageError) else "undecodable"
-            self.lost.setdefault((reason, channel.topic), LossRuns()).add_lost(block.log_ns[row])
+            self.lost.setdefault((reason, channel.topic), LossRuns()).add_lost(message.log_ns)
         else:
             self._sound(channel.topic)
 
@@ -237,25 +221,16 @@ class TopicCollector:
         for runs in (runs for (_, lost), runs in self.lost.items() if lost == topic):
             runs.add_sound()
 
-    def calibrations_of(self, channel: Channel) -> Calibrations | None:
-        """The calibrations that a channel holds, if it is one of them."""
-        return next((one for one in (self.right_calibrations, self.calibrations) if one.channel == channel), None)
-
-    def finished(self, calibrations: Calibrations, notes: Notes) -> list[CalibrationMessage]:
-        """The calibrations of the camera or the right one, stamped as its images."""
-        images = self.rights if calibrations is self.right_calibrations else self.images
-        times = self._others[calibrations.channel] if calibrations.channel else Stamps()
-        return calibrations.finish(images.stamps, times, notes)
+    def calibrations(self, channel: Channel | None, part: str, notes: Notes) -> list[CalibrationMessage]:
+        """The calibrations of a channel, stamped as the images of this part."""
+        known = self._calibrations.get(channel) if channel else None
+        return known.finish(self.images[part].stamps, self._others[known.channel], notes) if known else []
 
     def stamps(self) -> list[tuple[str, Stamps]]:
         """Every topic that is followed over time, with its stamps."""
-        images = [
-            (one.channel.topic, one.stamps)
-            for one in (self.images, self.depths, self.rights, self.masks)
-            if one.channel
-        ]
-        gyro = [(self.gyro.topic, self.gyro.stamps)] if self.gyro.topic else []
-        return images + [(one.topic, one.stamps) for one in (*self.poses.values(), self.fixes) if one] + gyro
+        images = [(one.channel.topic, one.stamps) for one in reversed(self.images.values()) if one.channel]
+        tracks = (*self.poses.values(), self.fixes, self.gyro)
+        return images + [(one.topic, one.stamps) for one in tracks if one and one.topic]
 
     def every_stamps(self) -> list[Stamps]:
         """Stamps of every topic that was read, each pose with its position."""
@@ -276,7 +251,7 @@ class TopicCollector:
         """Raises BadMessageError."""
         channel = message.channel
         match decode(channel, message.data):
-            case CalibrationMessage() as calibration if known := self.calibrations_of(channel):
+            case CalibrationMessage() as calibration if known := self._calibrations.get(channel):
                 known.add(calibration, message.data, position)
             case PoseMessage() as pose if channel in self.poses:
                 self.poses[channel].add(pose, message.log_ns, position)

@@ -50,6 +50,20 @@ def _head(path: Path, count: int) -> bytes:
         return file.read(count)
 
 
+def below(path: Path) -> list[Path]:
+    """The folders right below, by name; none where there is no such folder."""
+    return sorted(folder for folder in path.iterdir() if folder.is_dir()) if path.is_dir() else []
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The images of a folder in natural order, and files that are only named like them; none where there is no such
+    folder."""
+    files = sorted(folder.iterdir(), key=lambda file: natural_order(file.name)) if folder.is_dir() else []
+    files = [file for file in files if file.is_file() and not file.name.startswith(".")]
+    endings = {file.suffix for file in files if file.suffix and is_image(file)}
+    return [file for file in files if file.suffix in endings or is_image(file)]
+
+
 def natural_order(name: str) -> tuple:
     """Sorts `2.png` before `10.png`."""
     return tuple((int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", name))

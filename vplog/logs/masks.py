@@ -21,7 +21,7 @@ from vplog.storage.image_file import JPEG, BadImageError, decode_image, image_si
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from vplog.data import Bools, Bytes
+    from vplog.data import Bools
     from vplog.logs.formats.container import Channel, Notes
 
 _HALF = 128
@@ -38,16 +38,21 @@ class Mask:
 
     def used(self, size: tuple[int, int]) -> Bools:
         """(H, W) px that count, of images of this width and height. Raises LogError where the mask does not fit."""
-        return resized_mask(self._used, size, str(self.path))
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height in px. Raises LogError."""
-        return self._used.shape[1], self._used.shape[0]
+        return resized_mask(self.own, size, str(self.path))
 
     @cached_property
-    def _used(self) -> Bools:
-        return _read(self.path) > 0
+    def own(self) -> Bools:
+        """(H, W) px that count, as the file has them. Raises LogError."""
+        try:
+            data = self.path.read_bytes()
+            if image_size(data) is None:
+                raise LogError(f"{self.path} is no whole image, so it is no mask. Write it as PNG.")
+            image = decode_image(data)
+        except OSError as error:
+            raise LogError(f"Cannot read the mask {self.path}: {error.strerror or error}.") from None
+        except BadImageError as error:
+            raise LogError(f"The mask {self.path} cannot be decoded: {error}. Write it as PNG.") from None
+        return image >= _HALF if data[:2] == JPEG else image > 0
 
 
 class Masks:
@@ -86,7 +91,7 @@ class Masks:
                 f"No mask in {self._path} is of an image of {self._topic}: the mask of an image is called like it, "
                 "that of a recorded image by its stamp in ns."
             )
-        used, own = first.used(size), first.size
+        used, own = first.used(size), first.own.shape[::-1]
         if not used.any():
             raise LogError(f"{first.path} is black, which masks all of {self._topic}: zero is masked. Invert it.")
         if own != size:
@@ -117,13 +122,10 @@ def masks_of(
             raise LogError(
                 f"There is no mask at {path}: --mask takes an image or a folder of them.{nearest_path(path)}"
             )
-    found = []
-    for number, image in enumerate(images):
-        topic = image.topic if image else ""
-        path = given.get(topic) if topic else None
-        path = path or (given.get("") if not number else None)
-        found.append(Masks(path, topic, topics.get(topic, {})))
-    return found
+    named = [image.topic if image else "" for image in images]
+    paths = [given.get(topic) if topic else None for topic in named]
+    paths[0] = paths[0] or given.get("")
+    return [Masks(path, topic, topics.get(topic, {})) for path, topic in zip(paths, named, strict=True)]
 
 
 def resized_mask(used: Bools, size: tuple[int, int], name: str) -> Bools:
@@ -138,17 +140,3 @@ def resized_mask(used: Bools, size: tuple[int, int], name: str) -> Bools:
             "Draw it on an image of this camera."
         )
     return np.asarray(cv2.resize(used.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT)) > 0
-
-
-def _read(path: Path) -> Bytes:
-    """(H, W), zero where masked. Raises LogError."""
-    try:
-        data = path.read_bytes()
-        if image_size(data) is None:
-            raise LogError(f"{path} is no whole image, so it is no mask. Write it as PNG.")
-        image = decode_image(data)
-    except OSError as error:
-        raise LogError(f"Cannot read the mask {path}: {error.strerror or error}.") from None
-    except BadImageError as error:
-        raise LogError(f"The mask {path} cannot be decoded: {error}. Write it as PNG.") from None
-    return image >= _HALF if data[:2] == JPEG else image

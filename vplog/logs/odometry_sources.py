@@ -148,11 +148,12 @@ def _by_twists(
         return dead_reckoned(stamp_ns, moving, variances)
     if placed is None and clean(read.gyro.frame) not in ("", track.child, "base_link"):
         notes.add(f"{read.gyro.topic}: its frame has no static transform; it is taken to be mounted as the body is.")
-    turned = turned_by_gyro(stamp_ns, moving, gyro_ns, gyro, np.eye(4) if placed is None else placed)
+    body_from_imu = np.eye(4) if placed is None else placed
+    stamp_ns, turned, off = turned_by_gyro(stamp_ns, moving, gyro_ns, gyro, body_from_imu)
     bias = "its bias unknown, as the body never stands still for a second"
-    bias = bias if turned.bias is None else f"less a bias of {np.degrees(turned.bias):.3f} deg/s at rest"
+    bias = bias if off is None else f"less a bias of {np.degrees(off):.3f} deg/s at rest"
     notes.add(f"{text}; it turns by the gyroscope of {read.gyro.topic}, {bias}.")
-    return dead_reckoned(turned.stamp_ns, turned.twists, np.full_like(turned.twists, np.nan))
+    return dead_reckoned(stamp_ns, turned, np.full_like(turned, np.nan))
 
 
 def other_sources(gps: Gps | None, contents: Contents, chosen: Selection) -> dict[Channel, SourceOdometry]:
@@ -175,12 +176,12 @@ def other_sources(gps: Gps | None, contents: Contents, chosen: Selection) -> dic
 
 def rank_sources(found: dict[Channel, SourceOdometry], camera_ns: Ints) -> list[tuple[OdometrySource, Channel]]:
     """Every source with a usable pose, the best first; of equal ones that with most poses, then by name."""
-    ends = [one.odometry.stamp_ns[[0, -1]] for one in found.values() if one.odometry is not None]
-    span_ns = np.array([min(end[0] for end in ends), max(end[1] for end in ends)]) if ends else NONE
+    usable = [(source, one, one.odometry) for source, one in found.items() if one.odometry is not None]
+    ends = np.array([odometry.stamp_ns[[0, -1]] for _, _, odometry in usable], np.int64).reshape(-1, 2)
+    span_ns = np.array([ends[:, 0].min(), ends[:, 1].max()]) if usable else NONE
     weighed = [
-        (score_source(source, one.frames, one.odometry, camera_ns, span_ns, one.kind), source)
-        for source, one in found.items()
-        if one.odometry is not None
+        (score_source(source, one.frames, odometry, camera_ns, span_ns, one.kind), source)
+        for source, one, odometry in usable
     ]
     return sorted(weighed, key=lambda one: (-one[0].score, -one[0].count, one[1]))
 
@@ -225,16 +226,16 @@ def _note_doubts(source: OdometrySource, requested: bool, has_images: bool, note
             f"{source.topic} is a command by its name (where the robot should be), but moves {source.frames[-1]}, "
             "and no other source is better; --odometry-file takes one from a file."
         )
-    if any(map(_TRUTH.search, (source.topic, *source.frames))):
+    if is_truth(source.topic, *source.frames):
         notes.add(
             f"{source.topic} is ground truth by its name{'' if requested else ', and the best that the log has'}; "
             "an evaluation with it tells nothing about real odometry."
         )
 
 
-def is_truth(topic: str) -> bool:
-    """Whether a topic is ground truth by its name."""
-    return _TRUTH.search(topic) is not None
+def is_truth(*names: str) -> bool:
+    """Whether a topic, or a frame of it, is ground truth by its name."""
+    return any(map(_TRUTH.search, names))
 
 
 def evidence_text(source: OdometrySource) -> str:
@@ -261,7 +262,7 @@ def _evidence_by_name(topic: str, kind: str, frames: list[str], source_kind: str
         found[f"moves {child}, not the body"] = 0.1
     elif child and child not in _BODIES:
         found[f"moves {child}, not base_link"] = 0.9
-    if any(map(_TRUTH.search, (topic, *frames))):
+    if is_truth(topic, *frames):
         found["is ground truth by its name"] = _LEAST_FACTOR
     if _COMMAND.search(topic):  # a goal names the frame that it lies in, none that moves
         found |= {_MAYBE_COMMANDED: 0.1} if child else {_COMMANDED: _LEAST_FACTOR}

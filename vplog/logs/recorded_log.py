@@ -10,18 +10,17 @@ from typing import TYPE_CHECKING
 from vplog.data import LogInfo, Topic, Trajectory
 from vplog.errors import LogError
 from vplog.logs.calibration_file import SidecarFiles
-from vplog.logs.cameras import body_from_camera, camera_of, is_rectified
+from vplog.logs.cameras import body_from_camera, camera_of
 from vplog.logs.content import read_content
 from vplog.logs.formats.container import Notes
 from vplog.logs.formats.ros2_folder import messages_unpacked
 from vplog.logs.frames import ImageReader, RecordedFrame, size_of
 from vplog.logs.masks import masks_of
-from vplog.logs.messages.records import GEOMETRY, short_type
 from vplog.logs.odometry_sources import PROPERTIES, is_truth
 from vplog.logs.rectification import CHECKED_FRAMES, MOST_ROWS_PX, NoPairError, Side, pair_of, row_error_px
 from vplog.logs.stamps import rows_of
 from vplog.logs.topic_candidates import read_candidates
-from vplog.logs.topic_selection import Candidate, TopicChoice, select
+from vplog.logs.topic_selection import Candidate, TopicChoice, select, wheel_options
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -96,11 +95,12 @@ class RecordedLog:
         """Raises LogError where a stamp is not one of `stamps()`."""
         content, images, pair, camera = self._content, self._images, self._pair, self.camera()
         for row in rows_of(content.stamp_ns, stamp_ns, self.name):
-            right = None if pair is None else images.companion(self._selection.right, content.right_places, row)
-            depth = images.companion(self._depth, content.depth_places, row)
             at_ns, image = int(content.stamp_ns[row]), images.image(row)
-            own, mask = self._calibration_at(at_ns), images.companion(self._selection.mask, content.mask_places, row)
-            mask, right_mask = mask or self._masks[0].of(at_ns), self._masks[1].of(at_ns)
+            depth = images.companion("depth", row) if self._depth else None
+            right = images.companion("right", row) if pair else None
+            mask, right_mask = images.companion("mask", row) or self._masks[0].of(at_ns), self._masks[1].of(at_ns)
+            later = bisect_right(self._later_calibrations, at_ns, key=lambda calibration: calibration.stamp_ns)
+            own = self._later_calibrations[later - 1] if later else None
             yield RecordedFrame(at_ns, camera, image, depth, right, pair, self._notes, own, mask, right_mask)
 
     def file_names(self) -> list[str] | None:
@@ -136,10 +136,8 @@ class RecordedLog:
         """Ways out where there is none: the sources that are not taken by themselves, and files."""
         content = self._content
         given = [f"--odometry {source.topic}: {PROPERTIES[source.kind]}" for source in content.sources]
-        wheels = [c for c in self._candidates if short_type(c.channel.type) in GEOMETRY and c.count]
-        for one in wheels:
-            needs = " and ".join(f"--{name.replace('_', '-')}" for name in GEOMETRY[short_type(one.channel.type)])
-            given.append(f"{needs} make odometry of {one.channel.topic}")
+        wheels = [c.channel for c in self._candidates if c.count]
+        given += [f"{needs} make odometry of {one.topic}" for one in wheels if (needs := wheel_options(one))]
         given += ["--odometry visual needs a calibrated camera with depth or a stereo pair"]
         return "; ".join([*given, "--odometry-file takes poses from a file; `vplog library` needs none"]) + "."
 
@@ -162,12 +160,6 @@ class RecordedLog:
         if not len(self._content.stamp_ns):
             raise LogError(f"No image of {self._selection.image.topic} can be read. Choose another with --image-topic.")
         return self._selection.image
-
-    def _calibration_at(self, stamp_ns: int) -> CalibrationMessage | None:
-        """The calibration in force at a stamp, where it is another than the camera's."""
-        found = self._later_calibrations
-        row = bisect_right(found, stamp_ns, key=lambda calibration: calibration.stamp_ns)
-        return found[row - 1] if row else None
 
     @cached_property
     def _later_calibrations(self) -> list[CalibrationMessage]:
@@ -195,14 +187,10 @@ class RecordedLog:
 
     @cached_property
     def _images(self) -> ImageReader:
-        image, content = self._selection.image, self._read()
-        known = self._candidate(image)
-        return ImageReader(self._container, image, known.codec if known else "", content, self._notes)
-
-    def _read(self) -> Content:
-        """Content of the topics, of images that between start and stop."""
+        image, known = self._selection.image, self._candidate(self._selection.image)
         found = read_content(self._container, self._contents, self._selection, self._notes)
-        return found.between(self._choice.start_s, self._choice.stop_s)
+        content = found.between(self._choice.start_s, self._choice.stop_s)
+        return ImageReader(self._container, image, known.codec if known else "", content, self._notes)
 
     @property
     def _content(self) -> Content:
@@ -245,20 +233,16 @@ class RecordedLog:
         try:
             if (candidate := self._candidate(right)) and candidate.codec:
                 raise NoPairError(f"{right.topic} is video; of a stereo pair, only the left images may be video")
-            known = [self._sidecar.camera(channel.topic) for channel in (image, right)]
-            calibrations = [camera.calibration if camera else None for camera in known]
-            if known[0] is None:
-                calibrations = [content.calibration, content.right_calibration]
-            if calibrations[0] is None or calibrations[1] is None:
+            known = [one.calibration for c in (image, right) if (one := self._sidecar.camera(c.topic))]
+            own, theirs = known or (content.calibration, content.right_calibration)
+            if own is None or theirs is None:
                 raise NoPairError(f"{right.topic} has no calibration")
-            other, size = self._images.first(right, content.right_places, self._path.name)
-            camera = camera_of(right.topic, calibrations[1], size, self._notes)
-            left_side = Side(left, calibrations[0], is_rectified(image.topic))
-            right_side = Side(camera, calibrations[1], is_rectified(right.topic))
+            other, size = self._images.first(right, content.companions["right"], self._path.name)
+            camera = camera_of(right.topic, theirs, size, self._notes)
             right_from_left = content.tree.between(other, frame) if other and frame else None
-            right_from_left = self._sidecar.right_from_left(image.topic, right.topic) if known[0] else right_from_left
-            pair = pair_of(left_side, right_side, right_from_left)
-            error_px = row_error_px(self._rectified(pair, right))
+            right_from_left = self._sidecar.right_from_left(image.topic, right.topic) if known else right_from_left
+            pair = pair_of(Side(left, own), Side(camera, theirs), right_from_left)
+            error_px = row_error_px(self._rectified(pair))
             if error_px is not None and error_px > MOST_ROWS_PX:
                 raise NoPairError(
                     f"rectified by its calibration, its rows lie {error_px:.1f} px off those of the left image"
@@ -268,12 +252,12 @@ class RecordedLog:
             self._notes.add(f"The right image is not used: {str(error).rstrip('.')}.")
             return None
 
-    def _rectified(self, pair: Pair, right: Channel) -> Iterator[tuple[Bytes, Bytes]]:
+    def _rectified(self, pair: Pair) -> Iterator[tuple[Bytes, Bytes]]:
         """Images of a few frames; what does not decode is left out."""
         content, images, camera = self._content, self._images, self._left[0]
-        rows = [row for row, place in enumerate(content.right_places) if place is not None]
+        rows = [row for row, place in enumerate(content.companions["right"]) if place is not None]
         for row in rows[:: max(len(rows) // CHECKED_FRAMES, 1)][:CHECKED_FRAMES]:
-            image, other = images.image(row), images.companion(right, content.right_places, row)
+            image, other = images.image(row), images.companion("right", row)
             stamp_ns = int(content.stamp_ns[row])
             try:  # not counted as lost: only a check
                 frame = RecordedFrame(stamp_ns, camera, image, None, other, pair, Notes()).decode()

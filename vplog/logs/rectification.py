@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from vplog.geometry import se3
-from vplog.logs.cameras import resized
+from vplog.logs.cameras import is_rectified, resized
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -51,8 +51,11 @@ class Side:
     camera: Camera
     """With its matrix and distortion for the images as they come."""
     calibration: CalibrationMessage
-    rectified: bool
-    """The images are named as rectified already."""
+
+    @property
+    def rectified(self) -> bool:
+        """The images are named as rectified already."""
+        return is_rectified(self.camera.name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +108,10 @@ def pair_of(left: Side, right: Side, right_from_left: Floats | None) -> Pair:
     if not _BASELINES_M[0] < baseline_m < _BASELINES_M[1]:
         raise NoPairError(f"its distance of {baseline_m:.3g} m to the left camera is not a plausible baseline")
     matrices = [p[:, :3] for p in projections]
-    _check_rows(matrices, right)
+    (left_fy, left_cy), (right_fy, right_cy) = ((k[1, 1], k[1, 2]) for k in matrices)
+    height = right.camera.height  # rows of rectified images correspond only where these parts of the matrices are equal
+    if abs(left_cy - right_cy) + abs(left_fy / right_fy - 1) * height / 2 > 1.0:  # px at the edge: half of rows_px
+        raise NoPairError(f"P of the calibration of {right.camera.name} does not put the two images on common rows")
     maps = tuple(_maps(side, r, k) for side, r, k in zip((left, right), rotations, matrices, strict=True))
     turned = np.eye(4) if maps[0] is None else se3.pose(rotations[0].T, np.zeros(3))
     camera = replace(
@@ -132,14 +138,6 @@ def row_error_px(rectified: Iterable[tuple[Bytes, Bytes]]) -> float | None:
         good = (match for match in matcher.match(found, theirs) if match.distance <= _NEAR_BITS)
         apart += [abs(points[m.queryIdx].pt[1] - others[m.trainIdx].pt[1]) for m in good]
     return float(np.median(apart)) if len(apart) >= _LEAST_MATCHES else None
-
-
-def _check_rows(matrices: list[Floats], right: Side) -> None:
-    """Rows of rectified images correspond only where the vertical parts of the matrices are the same."""
-    (left_fy, left_cy), (right_fy, right_cy) = ((k[1, 1], k[1, 2]) for k in matrices)
-    height = right.camera.height
-    if abs(left_cy - right_cy) + abs(left_fy / right_fy - 1) * height / 2 > 1.0:  # px at the edge: half of rows_px
-        raise NoPairError(f"P of the calibration of {right.camera.name} does not put the two images on common rows")
 
 
 def _projection(side: Side) -> Floats:

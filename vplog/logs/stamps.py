@@ -60,7 +60,9 @@ class Stamps:
     """The one clock of so many messages."""
 
     def add(self, header_ns: int, log_ns: int, position: int | None = None) -> None:
-        self.extend([header_ns], [log_ns], None if position is None else [position])
+        self._positions.append(len(self.log_ns) if position is None else position)
+        self.header_ns.append(header_ns)
+        self.log_ns.append(min(log_ns, _LAST_NS))
 
     def extend(self, header_ns: list[int], log_ns: list[int], positions: list[int] | None = None) -> None:
         """Add messages by their stamps, log times and positions in the file; None is one behind the other."""

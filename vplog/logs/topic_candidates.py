@@ -6,7 +6,6 @@ import re
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from vplog.logs.formats.container import messages_in
 from vplog.logs.messages.decode import decode
 from vplog.logs.messages.pixels import is_depth, is_image, may_be_thermal
 from vplog.logs.messages.records import BadMessageError, CalibrationMessage, ImageMessage, kind_of
@@ -29,7 +28,7 @@ def read_candidates(container: Container, contents: Contents) -> list[Candidate]
     wanted = {c for c, kind in kinds.items() if kind in ("image", "camera_info") and contents.counts[c]}
     firsts: dict[Channel, ImageMessage | CalibrationMessage] = {}
     left = set(wanted)
-    for message in messages_in(container, wanted) if wanted else ():
+    for message in container.messages(wanted) if wanted else ():
         if message.channel not in left:
             continue
         try:
@@ -56,7 +55,10 @@ def _candidate(channel: Channel, count: int, kind: str, first: ImageMessage | Ca
     if isinstance(first, ImageMessage):
         codec, encoding = codec_of(first.encoding) if first.compressed else "", first.encoding
         size = image_size(first.data) if first.compressed else (first.width, first.height)
-        if not codec and (is_depth(first) or _named_depth(channel.topic, first)):
+        # by their name where encodings are ambiguous: old compressedDepth is `png`, RealSense records mono16
+        named = channel.topic.endswith("/compressedDepth")
+        named |= first.encoding == "mono16" and "depth" in channel.topic.lower()
+        if not codec and (is_depth(first) or named):
             role = "depth"
     calibrated = isinstance(first, CalibrationMessage) and bool(first.matrix[0, 0] > 0)
     frame = clean(first.frame) if first else ""
@@ -73,8 +75,3 @@ def _is_thermal(candidate: Candidate, first: object, candidates: list[Candidate]
     if "depth" in words or _THERMAL.search(words):
         return "depth" not in words
     return not any(c.role == "image" and c.frame == candidate.frame for c in candidates)
-
-
-def _named_depth(topic: str, first: ImageMessage) -> bool:
-    """Whether ambiguous encodings are depth by their name: old compressedDepth is `png`, RealSense records mono16."""
-    return topic.endswith("/compressedDepth") or (first.encoding == "mono16" and "depth" in topic.lower())

@@ -19,8 +19,9 @@ other parts the first by these rules does, unless TopicChoice names another:
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
@@ -106,6 +107,9 @@ class Candidate:
     """Whether images of its encoding can be decoded to grey."""
 
 
+_PARTS = ("image", "depth", "camera_info", "odometry", "gps", "right", "right_info", "imu", "mask")
+
+
 @dataclass(frozen=True)
 class Selection:
     """The topics in use, None where no topic plays the part."""
@@ -115,28 +119,27 @@ class Selection:
     camera_info: Channel | None = None
     odometry: Channel | None = None
     """As requested, or as chosen among `sources` once these are read."""
+    gps: Channel | None = None
+    right: Channel | None = None
+    right_info: Channel | None = None
+    imu: Channel | None = None
+    """The IMU whose gyroscope turns velocities, where these are the odometry."""
+    mask: Channel | None = None
     sources: tuple[Channel, ...] = ()
     """Topics that may be the odometry; the transforms over time are one source, named by the largest topic."""
     kind: str = ""
     """The one of SOURCES that is requested, `topic` of a topic or none at all, or empty."""
     geometry: dict[Channel, tuple[float, float]] = field(default_factory=dict)
     """Factors of the linear and angular velocities of sources that are wheel speeds."""
-    imu: Channel | None = None
-    """The IMU whose gyroscope turns velocities, where these are the odometry."""
-    gps: Channel | None = None
     tf_static: tuple[Channel, ...] = ()
     tf: tuple[Channel, ...] = ()
     """Transforms over time: read where odometry may come from them, or where no topic is of static ones alone."""
-    right: Channel | None = None
-    right_info: Channel | None = None
-    mask: Channel | None = None
 
     @property
     def parts(self) -> dict[Channel, str]:
         """Part of each topic in use, as in `vplog.data.Topic.part`."""
-        named = ("image", "depth", "camera_info", "odometry", "gps", "right", "right_info", "imu", "mask")
         many = [(channel, name) for name in ("tf_static", "tf") for channel in getattr(self, name)]
-        one = [(channel, name) for name in named if (channel := getattr(self, name)) is not None]
+        one = [(channel, name) for name in _PARTS if (channel := getattr(self, name)) is not None]
         return dict(many) | dict(one)
 
     @property
@@ -146,7 +149,7 @@ class Selection:
 
     @property
     def channels(self) -> list[Channel]:
-        return list(dict.fromkeys((*self.parts, *self.sources, *([self.imu] if self.imu else ()))))
+        return list(dict.fromkeys((*self.parts, *self.sources)))
 
     def with_odometry(self, odometry: Channel | None) -> Selection:
         """The selection once the source of odometry is known."""
@@ -167,37 +170,22 @@ _PAIRS = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("infra1", "i
 
 def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Selection:
     """The topics to use by the rules above. Raises LogError where a topic named in `choice` cannot play its part."""
-
-    def pick(
-        role: str, key: Callable[[Candidate], tuple], also: str = "", taken: Candidate | None = None
-    ) -> Candidate | None:
-        wanted = getattr(choice, role)
-        found = sorted((c for c in candidates if c.role == _ROLES.get(role, role) and c.count), key=key)
-        found = [c for c in found if c is not taken and (role == "mask" or c.channel.topic != choice.mask)]
-        if wanted is None:
-            return found[0] if found else None
-        if wanted == "":
-            return None
-        named = [c for c in candidates if c.channel.topic == wanted]
-        fitting = sorted((c for c in named if c.role in (_ROLES.get(role, role), also)), key=key)
-        if not fitting:
-            raise LogError(_no_topic(named, wanted, role, [c.channel.topic for c in found], log))
-        return fitting[0]
-
-    def calibrations(image: Candidate) -> list[Candidate]:
-        return _calibrations(image, [c for c in candidates if c.role == "camera_info" and c.count])
+    _check_files(choice)
+    candidates = sorted(candidates, key=lambda c: (-c.count, c.channel))
+    usable, pick = [c for c in candidates if c.count], partial(_pick, candidates, choice, log)
 
     def as_image(c: Candidate) -> tuple:
-        uncalibrated = not any(info.calibrated for info in calibrations(c)[:1])
+        info = _calibration(c, usable)
         sixteen_bits = c.encoding.startswith("16UC1")  # a thermal camera comes behind one that sees
-        return not c.supported, sixteen_bits, uncalibrated, _partner(c, candidates, back=True) is not None, *_by_size(c)
+        is_right = _partner(c, usable, back=True) is not None
+        return not c.supported, sixteen_bits, not (info and info.calibrated), is_right
 
-    image = _image_alone(pick("image", as_image, "depth"), choice, log)
+    image = pick("image", "depth", as_image)
     depth = calibration = right = right_info = None
     if image is not None:
         if choice.depth is not None or not choice.right:
-            depth = pick("depth", lambda c: (c.frame != image.frame, -_shared(c, image), *_by_size(c)), "image", image)
-        right = pick("right", _by_size) if choice.right is not None else _partner(image, candidates)
+            depth = pick("depth", "image", lambda c: (c.frame != image.frame, -_shared(c, image)), image)
+        right = pick("right", image=image) if choice.right is not None else _partner(image, usable)
         if right is not None and depth is not None:
             if choice.right and choice.depth:
                 raise LogError(
@@ -205,68 +193,78 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
                     f"{choice.right}, not both. Leave out --depth-topic or --right-topic."
                 )
             right = None
-        right_info = next(iter(calibrations(right)), None) if right is not None else None
-        calibration = next(iter(calibrations(image)), None)
-        if choice.calibration_file is not None:
-            if choice.camera_info:
-                raise LogError(
-                    _conflict("calibration", choice.camera_info, choice.calibration_file, "camera-info-topic")
-                )
-            calibration = right_info = None
-        elif choice.camera_info is not None:
-            calibration = pick("camera_info", _by_size)
-    if choice.odometry_file is not None:
-        if choice.odometry:
-            raise LogError(_conflict("odometry", choice.odometry, choice.odometry_file, "odometry-topic"))
-        choice = choice.model_copy(update={"odometry": ""})
-    named = choice.odometry in SOURCES and all(c.channel.topic != choice.odometry for c in candidates)
-    kind = "" if choice.odometry is None else choice.odometry if named else "topic"
-    requested = pick("odometry", _by_size, "tf") if kind == "topic" else None
+        if choice.calibration_file is None:
+            right_info = _calibration(right, usable) if right is not None else None
+            calibration = _calibration(image, usable) if choice.camera_info is None else pick("camera_info")
+    mask = pick("mask", "depth", image=image) if choice.mask else None
+    asked = choice.odometry if choice.odometry_file is None else ""
+    named = asked in SOURCES and all(c.channel.topic != asked for c in candidates)
+    kind = "" if asked is None else asked if named else "topic"
+    requested = pick("odometry", "tf") if asked and not named else None
     geometry = {c.channel: factors for c in candidates if (factors := _geometry(c, choice))}
-    sources = _sources(candidates, kind, requested, geometry)
+    sources = _sources(usable, kind, requested, geometry)
     turned = kind == "twist" or all(short_type(c.channel.type) in (*TWISTS, *GEOMETRY) for c in sources)
-    imu = pick("imu", _by_size) if sources and turned else None
-    gps = pick("gps", lambda c: (short_type(c.channel.type) == NMEA, *_by_size(c)))
+    imu = pick("imu") if sources and turned else None
+    gps = pick("gps", key=lambda c: short_type(c.channel.type) == NMEA)
+    each = zip(_PARTS, (image, depth, calibration, requested, gps, right, right_info, imu, mask), strict=True)
+    found = {part: c.channel for part, c in each if c is not None}
     static = tuple(sorted(c.channel for c in candidates if c.role == "tf_static"))
-    parts = {
-        "image": image, "depth": depth, "camera_info": calibration, "odometry": requested, "gps": gps,
-        "right": right, "right_info": right_info, "imu": imu,
-        "mask": pick("mask", _by_size, "depth") if choice.mask else None,
-    }  # fmt: skip
-    found = {name: part.channel for name, part in parts.items() if part is not None}
-    moving = tuple(c.channel for c in sorted((c for c in candidates if c.role == "tf" and c.count), key=_by_size))
+    moving = tuple(c.channel for c in usable if c.role == "tf")
     tf = moving if not static or any(c.role == "tf" for c in sources) else ()
     return Selection(
         **found, sources=tuple(c.channel for c in sources), tf_static=static, tf=tf, kind=kind, geometry=geometry
     )
 
 
-def _image_alone(image: Candidate | None, choice: TopicChoice, log: str) -> Candidate | None:
-    """The image. Raises LogError where the image topic is asked to be another part, too."""
-    for role in ("depth", "right", "mask"):
-        if image is not None and getattr(choice, role) == image.channel.topic:
-            option = f"--{role}-topic"
-            raise LogError(f"{getattr(choice, role)} is the image topic of {log}. Choose another with {option}.")
-    return image
+def _check_files(choice: TopicChoice) -> None:
+    """Raises LogError where a file and a topic are to be the same."""
+    for what, topic, file, option in (
+        ("calibration", choice.camera_info, choice.calibration_file, "camera-info-topic"),
+        ("odometry", choice.odometry, choice.odometry_file, "odometry-topic"),
+    ):
+        if topic and file is not None:
+            raise LogError(f"The {what} is either {topic} or {file}. Leave out --{option} or the file.")
+
+
+def _pick(
+    candidates: list[Candidate], choice: TopicChoice, log: str, role: str, also: str = "",
+    key: Callable[[Candidate], Any] = lambda _: 0, image: Candidate | None = None,
+) -> Candidate | None:  # fmt: skip
+    """The first of a role by `key`, then by size, beside the `image`; a requested one may have the role `also`."""
+    wanted, own = getattr(choice, role), _ROLES.get(role, role)
+    if image is not None and wanted == image.channel.topic:
+        raise LogError(f"{wanted} is the image topic of {log}. Choose another with --{role}-topic.")
+    found = [c for c in candidates if c.role == own and c.count and (role != "depth" or c is not image)]
+    found = [c for c in found if role == "mask" or c.channel.topic != choice.mask]
+    if not wanted:
+        return min(found, key=key, default=None) if wanted is None else None
+    named = [c for c in candidates if c.channel.topic == wanted]
+    fitting = [c for c in named if c.role in (own, also)]
+    if not fitting:
+        raise LogError(_no_topic(named, wanted, role, [c.channel.topic for c in found], log))
+    return min(fitting, key=key)
 
 
 def _sources(
-    candidates: list[Candidate], kind: str, requested: Candidate | None, geometry: dict[Channel, tuple[float, float]]
+    usable: list[Candidate], kind: str, requested: Candidate | None, geometry: dict[Channel, tuple[float, float]]
 ) -> list[Candidate]:
     """The topics that may be the odometry, with `kind` one of SOURCES, `topic` or empty. Raises LogError where the
     requested one is speeds of wheels without their measures."""
     if requested is not None:
-        lacks = GEOMETRY.get(short_type(requested.channel.type))
-        if lacks and requested.channel not in geometry:
-            options = " and ".join(f"--{name.replace('_', '-')}" for name in lacks)
+        options = wheel_options(requested.channel)
+        if options and requested.channel not in geometry:
             raise LogError(f"{requested.channel.topic} is speeds of wheels; they are odometry with {options}, in m.")
         return [requested]
     if kind not in ("", "twist"):
         return []
-    posed = sorted((c for c in candidates if c.role == "odometry" and c.count), key=_by_size)
+    posed = [c for c in usable if c.role == "odometry"]
     found = [c for c in posed if c.channel in geometry or short_type(c.channel.type) not in GEOMETRY]
-    moving = sorted((c for c in candidates if c.role == "tf" and c.count), key=_by_size)
-    return [*found, *([] if kind else moving[:1])]
+    return found if kind else [*found, *[c for c in usable if c.role == "tf"][:1]]
+
+
+def wheel_options(channel: Channel) -> str:
+    """Options that make odometry of speeds of wheels; empty for other types."""
+    return " and ".join(f"--{name.replace('_', '-')}" for name in GEOMETRY.get(short_type(channel.type), ()))
 
 
 def _geometry(c: Candidate, choice: TopicChoice) -> tuple[float, float] | None:
@@ -278,44 +276,41 @@ def _geometry(c: Candidate, choice: TopicChoice) -> tuple[float, float] | None:
     return (1.0, 1.0 / (choice.wheelbase_m or 1.0)) if kind != WHEELS else (radius, radius / (choice.track_m or 1.0))
 
 
-def _by_size(c: Candidate) -> tuple:
-    return -c.count, c.channel
-
-
-def _partner(image: Candidate, candidates: list[Candidate], back: bool = False) -> Candidate | None:
+def _partner(image: Candidate, usable: list[Candidate], back: bool = False) -> Candidate | None:
     """The right image topic of a pair whose left one is `image`, or back, the left one of the right."""
     for left, right in _PAIRS:
         here, there = (right, left) if back else (left, right)
         name = image.channel.topic.replace(here, there)
         if here in image.channel.topic:
-            found = [c for c in candidates if c.channel.topic == name and c.role == "image" and c.count]
+            found = (c for c in usable if c.channel.topic == name and c.role == "image")
             return min(found, key=lambda c: c.channel, default=None)
     return None
 
 
-def _calibrations(image: Candidate, infos: list[Candidate]) -> list[Candidate]:
-    """The calibrations that belong to an image, the most likely first."""
+def _calibration(image: Candidate, usable: list[Candidate]) -> Candidate | None:
+    """The calibration that most likely belongs to an image."""
+    infos = [c for c in usable if c.role == "camera_info"]
     same_frame = [c for c in infos if c.frame and c.frame == image.frame]
     alone = [c for c in infos if not c.frame and "/" not in c.channel.topic.strip("/")]  # `/camera_info`, no frame_id
     best = [c for c in infos if _above(c, image)] or same_frame or alone
-    return sorted(best, key=lambda c: (-_shared(c, image), c.frame != image.frame, not c.calibrated, *_by_size(c)))
+    return min(best, key=lambda c: (-_shared(c, image), c.frame != image.frame, not c.calibrated), default=None)
 
 
 def _above(info: Candidate, image: Candidate) -> bool:
     """The image lies in the calibration's namespace: `/cam0/camera_info` and `/cam0/image_raw/compressed`."""
-    space = info.channel.topic.strip("/").split("/")[:-1]
+    space = _namespace(info)
     space = space[:-1] if space[-1:] == ["info"] else space  # RealSense: /Color_0/info/camera_info, /Color_0/image/data
     return bool(space) and _shared(info, image) >= len(space)
 
 
+def _namespace(c: Candidate) -> list[str]:
+    return c.channel.topic.strip("/").split("/")[:-1]
+
+
 def _shared(a: Candidate, b: Candidate) -> int:
-    """Levels of the namespace that two topics have in common, their own names left out."""
-    x, y = (c.channel.topic.strip("/").split("/")[:-1] for c in (a, b))
+    """Levels of the namespace that two topics have in common."""
+    x, y = _namespace(a), _namespace(b)
     return next((i for i, (p, q) in enumerate(zip(x, y, strict=False)) if p != q), min(len(x), len(y)))
-
-
-def _conflict(what: str, topic: str, file: Path, option: str) -> str:
-    return f"The {what} is either {topic} or {file}. Leave out --{option} or the file."
 
 
 def _no_topic(named: list[Candidate], wanted: str, role: str, found: list[str], log: str) -> str:

@@ -253,10 +253,8 @@ class FixTrack:
             bad = left_out(gps)
             if bad.any():
                 notes.add(f"{self.topic}: {int(bad.sum())} of {len(bad)} fixes left out: {why}.")
-                kept = ~bad
-                degrees = gps.latitude_deg[kept], gps.longitude_deg[kept]
-                gps = Gps(gps.stamp_ns[kept], *degrees, gps.altitude_m[kept], covariance[kept])
-                covariance = covariance[kept]
+                columns = ("stamp_ns", "latitude_deg", "longitude_deg", "altitude_m", "covariance")
+                gps = replace(gps, **{name: getattr(gps, name)[~bad] for name in columns})
         return gps
 
 
@@ -278,10 +276,9 @@ def _no_position(fix: FixMessage) -> str:
 
 def _without_altitude(covariance: Floats) -> Floats:
     """(K, 3, 3) with the horizontal part alone; where that is unknown, a plain receiver's."""
-    result = np.zeros_like(covariance)
-    plane = covariance[:, :2, :2]
-    known = np.asarray(np.isfinite(plane).all((1, 2)))
-    result[:, :2, :2] = np.where(known[:, None, None], plane, RECEIVER_SIGMA_M**2 * np.eye(2))
+    result, plane = np.zeros_like(covariance), covariance[:, :2, :2]
+    known = np.isfinite(plane).all((1, 2), keepdims=True)
+    result[:, :2, :2] = np.where(known, plane, RECEIVER_SIGMA_M**2 * np.eye(2))
     result[:, 2, 2] = _HIGHEST_M**2
     return result
 

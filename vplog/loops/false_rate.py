@@ -16,7 +16,7 @@ from pydantic import Field
 from scipy.optimize import isotonic_regression
 
 from vplog.data import Bools, Closures, Floats, Ints, Verdict
-from vplog.features.mirror import mirrored
+from vplog.features.sift import mirrored
 from vplog.loops.propose import Proposals
 from vplog.loops.verify import verify_between
 from vplog.places.match_probability import conformal_p

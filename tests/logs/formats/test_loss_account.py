@@ -32,7 +32,6 @@ from tests.logs.drives import (
 )
 from vplog import logs
 from vplog.errors import LogError
-from vplog.logs.formats.container import messages_in
 from vplog.logs.formats.loss_account import LossAccount, LossRuns, merged, runs_of
 from vplog.logs.recorded_log import RecordedLog
 from vplog.storage import scratch
@@ -108,7 +107,7 @@ def chunked(path: Path, **options: object) -> Path:
 
 def read(log: RecordedLog) -> Counter[str]:
     """Messages by topic that can really be read."""
-    return Counter(m.channel.topic for m in messages_in(log._container, log._contents.counts))
+    return Counter(m.channel.topic for m in log._container.messages(log._contents.counts))
 
 
 def in_chunk(path: Path, number: int) -> tuple[int, Counter[str], tuple[int, int]]:

@@ -13,16 +13,13 @@ from vplog.data import Trajectory
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.calibration_file import read_calibrations
-from vplog.logs.datasets import ros1
-from vplog.logs.datasets.streams import DataSet, Stream, camera_streams
+from vplog.logs.datasets.streams import DataSet, calibration_stream, camera_streams
 from vplog.logs.datasets.tables import lines_of
-from vplog.logs.formats.container import Channel
 from vplog.logs.image_folder import named_stamps, natural_order
 from vplog.logs.tf_odometry import are_usable
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, Ints
-    from vplog.logs.calibrations.camera import CalibratedCamera
+    from vplog.data import Floats
 
 _MODELS = (".", "sparse", "sparse/0", "colmap/sparse/0", "dslr_calibration_undistorted")
 """Paths of a model below the folder of a reconstruction: COLMAP's own, its automatic one, NeRF's, ETH3D's."""
@@ -71,9 +68,14 @@ def read(path: Path) -> DataSet:
         files = [folder / one.name for one in group]
         topic = folder.name if name == "." else name
         stamp_ns, _ = named_stamps(files)
-        streams += [*camera_streams(topic, stamp_ns, files, None), _calibrations(topic, stamp_ns, group, cameras)]
-    stamp_ns, _ = named_stamps([folder / one.name for one in groups[main]])
-    return DataSet("colmap", streams, _truth(stamp_ns, groups[main]), [_UNITS])
+        if missing := next((one for one in group if one.camera not in cameras), None):
+            raise LogError(f"The COLMAP model has no camera {missing.camera} of {missing.name[:60]}. Copy it again.")
+        known = [cameras[one.camera].calibration for one in group]  # COLMAP may have a camera for every image
+        streams += [*camera_streams(topic, stamp_ns, files, None), calibration_stream(topic, stamp_ns, known)]
+    stamp_ns, rows = np.unique(named_stamps([folder / one.name for one in groups[main]])[0], return_index=True)
+    values = np.array([groups[main][row].pose for row in rows], np.float64)
+    camera_from_world: Floats = se3.pose(se3.rotation(values[:, [1, 2, 3, 0]]), values[:, 4:])
+    return DataSet("colmap", streams, Trajectory(stamp_ns, se3.inverse(camera_from_world)), [_UNITS])
 
 
 def _folder_of(images: list[_Image], near: list[Path], table: Path) -> Path:
@@ -87,41 +89,18 @@ def _folder_of(images: list[_Image], near: list[Path], table: Path) -> Path:
     return max(places, key=lambda place: found[place])
 
 
-def _calibrations(topic: str, stamp_ns: Ints, images: list[_Image], cameras: dict[str, CalibratedCamera]) -> Stream:
-    """The calibration of each image: COLMAP may have a camera for every one."""
-    if missing := next((one for one in images if one.camera not in cameras), None):
-        raise LogError(f"The COLMAP model has no camera {missing.camera} of {missing.name[:60]}. Copy it again.")
-    channel = Channel(f"{topic}/camera_info", "sensor_msgs/CameraInfo", "ros1")
-
-    def message(row: int) -> bytes:
-        return ros1.camera_info(int(stamp_ns[row]), topic, cameras[images[row].camera].calibration)
-
-    return Stream(channel, stamp_ns, message)
-
-
-def _truth(stamp_ns: Ints, images: list[_Image]) -> Trajectory:
-    values = np.array([one.pose for one in images], np.float64)
-    stamp_ns, rows = np.unique(stamp_ns, return_index=True)
-    camera_from_world: Floats = se3.pose(se3.rotation(values[rows][:, [1, 2, 3, 0]]), values[rows][:, 4:])
-    return Trajectory(stamp_ns, se3.inverse(camera_from_world))
-
-
 def _text(path: Path) -> list[_Image]:
     """`ID QW QX QY QZ TX TY TZ CAMERA NAME`, and a line of points behind each, which may be empty. Raises LogError."""
     found = []
     for number, line in lines_of(path):
         fields = line.split(maxsplit=9)
-        if len(fields) < 10 or not fields[0].isdecimal() or not _is_name(fields[9]):
+        if len(fields) < 10 or not fields[0].isdecimal() or not any(map(str.isalpha, fields[9])):
             continue  # points: x, y and the number of a landmark, over and over
         try:
             found.append(_Image(_inside(fields[9], path), fields[8], tuple(map(float, fields[1:8]))))
         except ValueError:
             raise LogError(f"{path}:{number} is not an image of a COLMAP model. Copy it again.") from None
     return _checked(found, path)
-
-
-def _is_name(text: str) -> bool:
-    return any(letter.isalpha() for letter in text)
 
 
 def _binary(path: Path) -> list[_Image]:

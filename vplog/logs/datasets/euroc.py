@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from vplog.logs.calibration_file import read_calibrations
-from vplog.logs.datasets.folders import below, image_files
 from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, imu_stream
 from vplog.logs.datasets.tables import listed_images, poses_of
-from vplog.logs.image_folder import named_stamps
+from vplog.logs.image_folder import below, image_files, named_stamps
 
 if TYPE_CHECKING:
     from pathlib import Path

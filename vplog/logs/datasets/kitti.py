@@ -10,9 +10,9 @@ from vplog.data import Trajectory
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.calibration_file import read_calibrations
-from vplog.logs.datasets.folders import below, image_files
 from vplog.logs.datasets.streams import DataSet, camera_streams
 from vplog.logs.datasets.tables import numbers_of, rows_of, stamps_ns
+from vplog.logs.image_folder import below, image_files
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -3,31 +3,29 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vplog.errors import LogError
-from vplog.logs.datasets import ros1
+from vplog.geometry import se3
 from vplog.logs.datasets.tables import numbers_of, rows_of, stamps_ns
-from vplog.logs.formats.container import Block, Channel, Contents, block_of, by_topic
+from vplog.logs.formats.container import BRIEF, Channel, Contents, Message, by_topic
 from vplog.logs.messages.pixels import scaled_depth_m
-from vplog.logs.messages.records import BadMessageError
+from vplog.logs.messages.records import BadMessageError, FixMessage, ImageMessage, ImuMessage, PoseMessage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
 
-    from vplog.data import Gps, Ints, Trajectory
+    from vplog.data import Bytes, Float32s, Gps, Ints, Trajectory
     from vplog.logs.calibrations.camera import CalibratedCamera
     from vplog.logs.formats.container import Notes, Place
+    from vplog.logs.messages.records import CalibrationMessage, Record
 
 BODY = "base_link"
 """Frame of the body, by its name in ROS REP 105."""
-_BRIEF = 4096
-"""Bytes of a message from which only its header is given, where that is enough."""
 _LATEST_NS = 2**32 * 10**9
 """ns; stamps of ROS 1 end in 2106."""
 
@@ -39,7 +37,7 @@ class Stream:
     channel: Channel
     stamp_ns: Ints
     """(K,) increasing or not."""
-    message: Callable[[int], bytes]
+    message: Callable[[int], Record]
     """The message of a row."""
     length: Callable[[int], int] | None = None
     """Bytes of a message without making it; None of small ones."""
@@ -88,17 +86,17 @@ class DataSetContainer:
         }
         return Contents(dict(sorted(counts.items())), *span_ns, self._truth, BODY, self._names, files)
 
-    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
         """The messages in order of time."""
         numbers = [number for number, one in enumerate(self._streams) if one.channel in channels]
         at = [(int(ns), number, row) for number in numbers for row, ns in enumerate(self._streams[number].stamp_ns)]
         for stamp_ns, number, row in sorted(at):
             one = self._streams[number]
             length = 0 if one.length is None or one.channel not in brief else one.length(row)
-            data = ros1.header(stamp_ns) if length >= _BRIEF else one.message(row)
-            yield block_of(data, [(one.channel, stamp_ns, 0, max(length, len(data)), (number, row))])
+            data = ImageMessage(stamp_ns, "", "", bytes(1), True) if length >= BRIEF else one.message(row)
+            yield Message(one.channel, stamp_ns, data, (number, row))
 
-    def read(self, place: Place) -> bytes:
+    def read(self, place: Place) -> Record:
         return self._streams[place[0]].message(place[1])
 
 
@@ -109,38 +107,38 @@ def camera_streams(
     there, or damaged, make messages without an image."""
     channel = Channel(topic, "sensor_msgs/CompressedImage", "ros1")
 
-    def message(row: int) -> bytes:
+    def message(row: int) -> ImageMessage:
         data = b"" if files[row] in damaged else _bytes_of(files[row])
-        return ros1.compressed(int(stamp_ns[row]), topic, files[row].suffix[1:].lower(), data)
+        return ImageMessage(int(stamp_ns[row]), topic, files[row].suffix[1:].lower(), data, True)
 
     def length(row: int) -> int:
         return 0 if files[row] in damaged else _length_of(files[row])
 
-    return [Stream(channel, stamp_ns, message, length, files), *calibration_streams(topic, topic, stamp_ns, camera)]
-
-
-def calibration_streams(topic: str, frame: str, stamp_ns: Ints, camera: CalibratedCamera | None) -> list[Stream]:
-    """The calibration of an image topic and the static transform to its frame, where they are known."""
-    if camera is None or not len(stamp_ns):
-        return []
-    known, first = camera.calibration, stamp_ns[:1]
-    info = Channel(f"{topic}/camera_info", "sensor_msgs/CameraInfo", "ros1")
-    found = [Stream(info, first, lambda row: ros1.camera_info(int(first[row]), frame, known))]
-    if camera.body_from_camera is not None:
-        message = ros1.transforms(int(first[0]), BODY, frame, camera.body_from_camera)
-        found.append(Stream(Channel("tf_static", "tf2_msgs/TFMessage", "ros1"), first, lambda _: message))
+    found, first = [Stream(channel, stamp_ns, message, length, files)], stamp_ns[:1]
+    if camera is not None and len(first):
+        found.append(calibration_stream(topic, first, [camera.calibration]))
+        if (pose := camera.body_from_camera) is not None:
+            turn = se3.quaternion(pose[:3, :3]).tolist()
+            placed = PoseMessage(int(first[0]), BODY, topic, pose[:3, 3].tolist(), turn, None)
+            found.append(Stream(Channel("tf_static", "tf2_msgs/TFMessage", "ros1"), first, lambda _: [placed]))
     return found
+
+
+def calibration_stream(topic: str, stamp_ns: Ints, known: Sequence[CalibrationMessage]) -> Stream:
+    """The calibration of an image topic at each stamp."""
+    channel = Channel(f"{topic}/camera_info", "sensor_msgs/CameraInfo", "ros1")
+    return Stream(channel, stamp_ns, lambda row: replace(known[row], stamp_ns=int(stamp_ns[row]), frame=topic))
 
 
 def depth_stream(topic: str, stamp_ns: Ints, files: Sequence[Path], per_m: float, frame: str) -> Stream:
     """16-bit PNGs with `per_m` counts of a metre, registered to the images of `frame`."""
 
-    def message(row: int) -> bytes:
+    def message(row: int) -> ImageMessage:
         try:
             metres = scaled_depth_m(_bytes_of(files[row]), per_m)
         except BadMessageError:
             metres = np.zeros((0, 0), np.float32)
-        return ros1.image(int(stamp_ns[row]), frame, "32FC1", metres)
+        return raw_image(int(stamp_ns[row]), frame, "32FC1", metres)
 
     def length(row: int) -> int:
         return _length_of(files[row])
@@ -153,18 +151,23 @@ def imu_stream(topic: str, table: Path) -> Stream:
     rows = rows_of(table, 7)
     stamp_ns, values = stamps_ns(table, [row[0] for row in rows], 1), numbers_of(table, rows, 1, 6)
     channel = Channel(topic, "sensor_msgs/Imu", "ros1")
-    return Stream(channel, stamp_ns, lambda row: ros1.imu(int(stamp_ns[row]), BODY, values[row, :3], values[row, 3:]))
+    return Stream(channel, stamp_ns, lambda row: ImuMessage(int(stamp_ns[row]), BODY, values[row, :3].tolist()))
 
 
 def fix_stream(topic: str, gps: Gps) -> Stream:
     """Satellite fixes."""
-    channel = Channel(topic, "sensor_msgs/NavSatFix", "ros1")
-    return Stream(channel, gps.stamp_ns, partial(_fix, gps))
+
+    def message(row: int) -> FixMessage:
+        place = float(gps.latitude_deg[row]), float(gps.longitude_deg[row]), float(gps.altitude_m[row])
+        return FixMessage(int(gps.stamp_ns[row]), True, *place, gps.covariance[row], BODY)
+
+    return Stream(Channel(topic, "sensor_msgs/NavSatFix", "ros1"), gps.stamp_ns, message)
 
 
-def _fix(gps: Gps, row: int) -> bytes:
-    place = gps.latitude_deg[row], gps.longitude_deg[row], gps.altitude_m[row]
-    return ros1.fix(int(gps.stamp_ns[row]), BODY, place, gps.covariance[row])
+def raw_image(stamp_ns: int, frame: str, encoding: str, pixels: Bytes | Float32s) -> ImageMessage:
+    """An image of (H, W) pixels."""
+    height, width = pixels.shape
+    return ImageMessage(stamp_ns, frame, encoding, pixels.tobytes(), False, width, height)
 
 
 def _bytes_of(file: Path) -> bytes:

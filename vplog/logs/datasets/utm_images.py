@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,12 +10,8 @@ from vplog.data import Gps, Trajectory
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.geometry.utm_name import utm_name
-from vplog.logs.datasets.folders import image_files
 from vplog.logs.datasets.streams import DataSet, camera_streams, fix_stream
-from vplog.logs.image_folder import named_stamps, natural_order
-
-if TYPE_CHECKING:
-    from vplog.geometry.utm_name import UtmName
+from vplog.logs.image_folder import image_files, named_stamps, natural_order
 
 _UNORDERED = (
     "The names hold no time: the images are taken in the order of their panoramas and tiles, 0.1 s apart, which need "
@@ -35,7 +30,8 @@ def read(path: Path) -> DataSet:
     named = {file: place for file, place in found.items() if place is not None}
     if bad := sorted(found.keys() - named):
         raise LogError(f"{bad[0]} is not named @utm_east@utm_north@... as the others are. Move it elsewhere.")
-    files = sorted(named, key=lambda file: _order(file, named[file]))
+    columns = {file: (place.time, place.panorama, place.tile, file.name) for file, place in named.items()}
+    files = sorted(named, key=lambda file: [natural_order(column or "0") for column in columns[file]])
     places = [named[file] for file in files]
     stamp_ns, timed = named_stamps([Path(place.time or "-") for place in places])
     if timed and len(np.unique(stamp_ns)) < len(stamp_ns):
@@ -50,8 +46,3 @@ def read(path: Path) -> DataSet:
     truth = Trajectory(stamp_ns, se3.pose(np.eye(3), position))
     names = {time_ns: file.name for time_ns, file in zip(stamp_ns.tolist(), files, strict=True)}
     return DataSet("utm-images", streams, truth, [] if timed else [_UNORDERED], names)
-
-
-def _order(file: Path, place: UtmName) -> tuple:
-    columns = (place.time, place.panorama, place.tile)
-    return tuple(natural_order(column or "0") for column in columns), natural_order(file.name)

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 
 from vplog.errors import LogError
-from vplog.logs.datasets import ros1
-from vplog.logs.datasets.streams import DataSet, Stream
+from vplog.logs.datasets.streams import DataSet, Stream, raw_image
 from vplog.logs.formats.container import Channel
 from vplog.logs.messages.records import BadMessageError
 from vplog.logs.messages.video import (
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Bytes, Ints
+    from vplog.logs.messages.records import ImageMessage
 
 _TURNS = {90: cv2.ROTATE_90_COUNTERCLOCKWISE, 180: cv2.ROTATE_180, -180: cv2.ROTATE_180, -90: cv2.ROTATE_90_CLOCKWISE}
 """By the degrees counterclockwise that PyAV gives of the display matrix (ISO/IEC 14496-12, 8.3.2)."""
@@ -67,9 +67,8 @@ def read(path: Path) -> DataSet:
     frames = VideoFrames(path, remarks.append)
     channel = Channel("video", "sensor_msgs/Image", "ros1")
 
-    def message(row: int) -> bytes:
-        stamp_ns = int(frames.stamp_ns[row])
-        return ros1.image(stamp_ns, "video", "mono8", frames.image(row))
+    def message(row: int) -> ImageMessage:
+        return raw_image(int(frames.stamp_ns[row]), "video", "mono8", frames.image(row))
 
     return DataSet("video", [Stream(channel, frames.stamp_ns, message, lambda _: MAX_PIXELS)], remarks=remarks)
 

@@ -12,7 +12,6 @@ from vplog.logs.datasets.tables import lines_of, listed_images, poses_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.data import Trajectory
     from vplog.logs.calibrations.camera import CalibratedCamera
 
 
@@ -32,7 +31,9 @@ def read(path: Path) -> DataSet:
         streams = camera_streams("rgb", *listed_images(path / "rgb.txt", path, 10**9), first)
     if (imu := path / "imu_0.csv").is_file():
         streams.append(imu_stream("imu_0", imu))
-    return DataSet("vslam-lab", streams, _truth(path))
+    truths = (("groundtruth.csv", 1), ("groundtruth.txt", 10**9))
+    truth = next((poses_of(path / name, unit_ns) for name, unit_ns in truths if (path / name).is_file()), None)
+    return DataSet("vslam-lab", streams, truth)
 
 
 def _columns(path: Path, cameras: dict[str, CalibratedCamera]) -> list[Stream]:
@@ -55,10 +56,3 @@ def _columns(path: Path, cameras: dict[str, CalibratedCamera]) -> list[Stream]:
         elif camera is not None and camera.depth_per_m is not None:
             streams.append(depth_stream(topic, *listed, camera.depth_per_m, topic.replace("depth", "rgb")))
     return streams
-
-
-def _truth(path: Path) -> Trajectory | None:
-    for name, unit_ns in (("groundtruth.csv", 1), ("groundtruth.txt", 10**9)):
-        if (path / name).is_file():
-            return poses_of(path / name, unit_ns)
-    return None

@@ -15,7 +15,7 @@ from vplog.execution.cores import allowed
 from vplog.logs.formats.compression import BadChunkError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Iterator
+    from collections.abc import Callable, Generator, Iterable
     from concurrent.futures import Future
     from typing import BinaryIO
 
@@ -95,46 +95,35 @@ class Chunks:
         return memoryview(data)[start:stop] if len(data) <= _VIEWED else data[start:stop]
 
     def iterate(
-        self, numbers: Iterable[int], in_place: Callable[[int], bool] | None = None
+        self, numbers: Iterable[int], in_place: Callable[[int], bool] = lambda _: False
     ) -> Generator[tuple[int, bytes | None]]:
         """Each number with its chunk, None where it is read `in_place`. The next ones are unpacked meanwhile once that
         saves time; reading only the first message of a topic starts no thread."""
-        numbers, spent_s = iter(numbers), 0.0
-        for number in numbers:
-            began_s = time.perf_counter()
-            data = None if in_place and in_place(number) else self(number)
-            spent_s += time.perf_counter() - began_s
-            yield number, data
-            if spent_s >= _ALONE_S and self._threads:
-                break
-        else:
-            return
-        with ThreadPoolExecutor(self._threads, "vplog-read-ahead") as pool:
-            yield from self._prefetched(numbers, in_place or (lambda _: False), pool)
-
-    def _prefetched(
-        self, numbers: Iterator[int], in_place: Callable[[int], bool], pool: ThreadPoolExecutor
-    ) -> Iterator[tuple[int, bytes | None]]:
+        numbers, spent_s, pool = iter(numbers), 0.0, None
         waiting: deque[tuple[int, Future[bytes] | None]] = deque()
         following = next(numbers, None)
         try:
             while waiting or following is not None:
-                while following is not None and len(waiting) < 2 * self._threads:
+                while following is not None and len(waiting) < (2 * self._threads if pool else 1):
                     size = self._size(following)
                     if waiting and sum(self._size(number) for number, _ in waiting) + size > _AHEAD_BYTES:
                         break
                     handed = _LEAST_BYTES <= size <= _AHEAD_BYTES and not in_place(following)
                     handed = handed and _RECENT.get((self._file, following)) is None
-                    waiting.append((following, pool.submit(self._load, following) if handed else None))
+                    waiting.append((following, pool.submit(self._load, following) if pool and handed else None))
                     following = next(numbers, None)
-                number, future = waiting.popleft()
+                began_s, (number, future) = time.perf_counter(), waiting.popleft()
                 if future is not None:
-                    yield number, self._take(number, future.result)
+                    data = self._take(number, future.result)
                 else:
-                    yield number, None if in_place(number) else self(number)
+                    data = None if in_place(number) else self(number)
+                spent_s += time.perf_counter() - began_s
+                yield number, data
+                if pool is None and self._threads and spent_s >= _ALONE_S:
+                    pool = ThreadPoolExecutor(self._threads, "vplog-read-ahead")
         finally:
-            for future in (future for _, future in waiting if future is not None):
-                future.cancel()
+            if pool is not None:
+                pool.shutdown(cancel_futures=True)
 
     def _take(self, number: int, loaded: Callable[[], bytes]) -> bytes:
         try:

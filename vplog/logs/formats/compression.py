@@ -37,6 +37,8 @@ _BLOCK = 2**20
 """Bytes that are read at once."""
 _SPARE = 2**30
 """Bytes of disk that are left free for others."""
+_THREAD = threading.local()
+"""A decompressor for each thread: to set up its tables takes as long as to unpack 0.5 MB."""
 
 
 class BadChunkError(Exception):
@@ -71,7 +73,9 @@ def _zstd(data: bytes, most: int) -> bytes:
     try:
         # One frame, as most writers make it; -1 where it does not say its size, as those that stream leave it.
         if zstandard.frame_content_size(data) in (most - 1, -1):
-            result = _OF_THREAD.zstd.decompress(data, max_output_size=most)
+            if not hasattr(_THREAD, "zstd"):
+                _THREAD.zstd = zstandard.ZstdDecompressor()
+            result = _THREAD.zstd.decompress(data, max_output_size=most)
             if len(result) == most - 1:
                 return result
     except zstandard.ZstdError:
@@ -82,16 +86,6 @@ def _zstd(data: bytes, most: int) -> bytes:
             parts.append(part)
             left -= len(part)
     return b"".join(parts)
-
-
-class _ThreadLocal(threading.local):
-    """A decompressor for each thread: to set up its tables takes as long as to unpack 0.5 MB."""
-
-    def __init__(self) -> None:
-        self.zstd = zstandard.ZstdDecompressor()
-
-
-_OF_THREAD = _ThreadLocal()
 
 
 _DECODERS = {
@@ -132,24 +126,20 @@ def unpacked(path: Path) -> Iterator[Path]:
     bytes justify."""
     with scratch("log") as folder:
         target = folder / path.name.removesuffix(".zstd").removesuffix(".zst")
-        _unpack_file(path, target, shutil.disk_usage(folder).free - _SPARE)
+        most, room = max(FREE_BYTES, MAX_RATIO * path.stat().st_size), shutil.disk_usage(folder).free - _SPARE
+        with path.open("rb") as file, target.open("wb") as out:
+            stream = zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True)
+            try:
+                while block := stream.read(_BLOCK):
+                    out.write(block)
+                    if out.tell() > most:
+                        raise LogError(f"{path} unpacks to more than {MAX_RATIO} times its size, so it is no log.")
+                    if out.tell() > room:
+                        raise LogError(
+                            f"{path} unpacks to more than the {room / 1e9:.1f} GB that are free in {folder.parent}. "
+                            "Unpack it elsewhere with `zstd -d`, or set TMPDIR to a larger disk."
+                        )
+            except zstandard.ZstdError as error:
+                if not out.tell():  # else what came before is a log that is cut here
+                    raise LogError(f"{path} cannot be unpacked: {error}. Is the copy whole?") from None
         yield target
-
-
-def _unpack_file(path: Path, target: Path, room: int) -> None:
-    most, written = max(FREE_BYTES, MAX_RATIO * path.stat().st_size), 0
-    with path.open("rb") as file, target.open("wb") as out:
-        stream = zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True)
-        try:
-            while block := stream.read(_BLOCK):
-                written += out.write(block)
-                if written > most:
-                    raise LogError(f"{path} unpacks to more than {MAX_RATIO} times its size, so it is no log.")
-                if written > room:
-                    raise LogError(
-                        f"{path} unpacks to more than the {room / 1e9:.1f} GB that are free in {target.parent.parent}. "
-                        "Unpack it elsewhere with `zstd -d`, or set TMPDIR to a larger disk."
-                    )
-        except zstandard.ZstdError as error:
-            if not written:  # else what came before is a log that is cut here
-                raise LogError(f"{path} cannot be unpacked: {error}. Is the copy whole?") from None

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from itertools import accumulate, pairwise
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from vplog.logs.formats.loss_account import LossAccount
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping
 
     from vplog.data import Gps, Trajectory
 
@@ -18,6 +17,11 @@ Octets = bytes | memoryview
 """Bytes of a message: its own where they are few, else a view of the chunk that holds them."""
 Place = tuple[int, ...]
 """Place of a message in its container; only the container that gave it out can read it."""
+BRIEF = 512
+"""Bytes of a large message that are there where it is only wanted briefly: its header, and more than a message without
+content has."""
+_COPIED = 4096
+"""Bytes of a message below which it is given as a copy: as cheap as a view, and quicker to read numbers from."""
 
 
 class Channel(NamedTuple):
@@ -35,66 +39,14 @@ class Message(NamedTuple):
 
     channel: Channel
     log_ns: int
-    data: Octets
+    data: Any
+    """Octets; of a published data set the record that they would be decoded to."""
     place: Place
 
 
-class Block(NamedTuple):
-    """Messages that lie in the same bytes, in file order: a chunk's, or one alone. All lists are as long."""
-
-    data: Octets
-    channels: list[Channel]
-    log_ns: list[int]
-    starts: list[int]
-    stops: list[int]
-    places: list[Place]
-
-    def messages(self) -> Iterator[Message]:
-        return map(self.message, range(len(self.channels)))
-
-    def message(self, row: int) -> Message:
-        start, stop = self.starts[row], self.stops[row]
-        data = self.data if stop - start < _COPIED else memoryview(self.data)
-        return Message(self.channels[row], self.log_ns[row], data[start:stop], self.places[row])
-
-
-Row = tuple[Channel, int, int, int, Place]
-"""Channel, log time, start, stop and place of a message of a block."""
-
-
-def block_of(data: Octets, rows: list[Row]) -> Block:
-    return Block(data, *map(list, zip(*rows, strict=True))) if rows else Block(data, [], [], [], [], [])
-
-
-_COPIED = 4096
-"""Bytes of a message below which it is given as a copy: as cheap as a view, and quicker to read numbers from."""
-_TOGETHER = 256
-"""Small messages of one block, at most; they take about as long to go through as one call does to set up."""
-
-
-def in_blocks(messages: Iterable[Message]) -> Iterator[Block]:
-    """Blocks of messages that lie in no chunk: small ones together, up to the next large one, which is one alone; few
-    at first, for who takes only the first of a topic."""
-    waiting: list[Message] = []
-    together = 1
-    for message in messages:
-        large = len(message.data) >= _COPIED
-        if waiting and (large or len(waiting) >= together):
-            yield _joined(waiting)
-            waiting.clear()
-            together = min(2 * together, _TOGETHER)
-        if large:
-            yield _joined([message])
-        else:
-            waiting.append(message)
-    if waiting:
-        yield _joined(waiting)
-
-
-def _joined(messages: list[Message]) -> Block:
-    data = messages[0].data if len(messages) == 1 else b"".join(message.data for message in messages)
-    bounds = pairwise(accumulate((len(message.data) for message in messages), initial=0))
-    return block_of(data, [(m.channel, m.log_ns, *ends, m.place) for m, ends in zip(messages, bounds, strict=True)])
+def part_of(data: bytes, start: int, stop: int) -> Octets:
+    """The bytes of a message in a chunk, as far as they are there."""
+    return data[start:stop] if stop - start < _COPIED else memoryview(data)[start:stop]
 
 
 @dataclass(frozen=True)
@@ -146,21 +98,14 @@ class Container(Protocol):
 
     def contents(self) -> Contents: ...
 
-    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
-        """The messages of these channels in file order, by the bytes they lie in, one block in memory at a time. Of
-        large messages of `brief` channels, in the encodings of ROS, only the header's stamp is there: what follows it,
-        up to their stop and beyond the end of the block, are bytes of others. `read` gives them whole."""
+    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
+        """The messages of these channels in file order. Of large ones of `brief` channels, in the encodings of ROS, no
+        more than the first BRIEF bytes need be there; `read` gives them whole."""
         ...
 
-    def read(self, place: Place) -> Octets:
-        """The bytes of one message, from any place that `blocks` gave."""
+    def read(self, place: Place) -> Any:
+        """The data of one message, from any place that `messages` gave."""
         ...
-
-
-def messages_in(container: Container, channels: Collection[Channel]) -> Iterator[Message]:
-    """The messages of these channels in file order."""
-    for block in container.blocks(channels):
-        yield from block.messages()
 
 
 def by_topic(counts: Mapping[Channel, int]) -> dict[str, int]:

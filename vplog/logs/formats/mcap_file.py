@@ -15,24 +15,30 @@ from mcap.opcode import Opcode
 
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
 from vplog.logs.formats.compression import BadChunkError, crc32, unpack
-from vplog.logs.formats.container import Channel, Contents, Notes
+from vplog.logs.formats.container import BRIEF, Channel, Contents, Message, Notes, part_of
 from vplog.logs.formats.layout import ChunkLosses
 from vplog.logs.formats.loss_account import sampled
-from vplog.logs.formats.mcap_chunk import ChunkReader
-from vplog.logs.formats.mcap_layout import MAGIC, read_layout
+from vplog.logs.formats.mcap_layout import MAGIC, RECORD, read_layout
 from vplog.storage.remote_path import RemotePath
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Callable, Collection, Iterator
     from pathlib import Path
 
-    from vplog.logs.formats.container import Block, Octets, Place
+    from vplog.logs.formats.container import Octets, Place
     from vplog.logs.formats.layout import Chunk
 
 __all__ = ["MAGIC", "McapFile"]
 
 _IDL = ("ros2idl", "omgidl")
 """Schema languages whose writers may name types as C++ and DDS do."""
+_MESSAGE = struct.Struct("<BQHIQQ")
+"""Opcode and length; channel id, sequence, log time, publish time: a message record up to its data."""
+_IS_MESSAGE, _IS_SCHEMA, _DEFINES = int(Opcode.MESSAGE), int(Opcode.SCHEMA), (int(Opcode.SCHEMA), int(Opcode.CHANNEL))
+_OUTSIDE = frozenset({0, *map(int, Opcode)}.difference(_DEFINES, [_IS_MESSAGE]))
+"""Opcodes that no record in a chunk has; those not known yet are stepped over, as the specification requires."""
+_WINDOW = 4096
+"""Bytes that are read of a chunk at once where most of its bytes are those of images, which are stepped over."""
 
 
 class McapFile:
@@ -55,7 +61,10 @@ class McapFile:
         self._sound = bytearray(len(self._layout.chunks))
         """1 for chunks whose checksum was found right."""
         sizes = [chunk.stop - chunk.start if _is_plain(chunk) else chunk.size for chunk in self._layout.chunks]
-        self._data = Chunks(self._unpack, self._add_damaged_chunk, sizes.__getitem__, self._is_cached, self._local)
+        # parts of what is not packed can be read again by themselves, unless each costs a request
+        cached = [not self._local or not _is_plain(chunk) for chunk in self._layout.chunks]
+        load, damaged = self._unpack, self._add_damaged_chunk
+        self._data = Chunks(load, damaged, sizes.__getitem__, cached.__getitem__, self._local)
 
     def contents(self) -> Contents:
         """Counted by the indexes behind the chunks; a chunk without is unpacked, as all are where the file's statistics
@@ -84,26 +93,26 @@ class McapFile:
             else:
                 data = self._data(number)
                 reader = ChunkReader(number, len(data), self._channels, self._define, None, cut=chunk.cut)
-                times += sampled(reader.whole(data).log_ns)
+                times += sampled([message.log_ns for message in reader.whole(data)])
                 damaged = self._account_for_chunk(chunk, reader) or not data
                 counts.update(reader.counts | Counter(chunk.counts) if damaged else reader.counts)
                 if not damaged:
                     chunk.counts = dict(reader.counts)
         return counts, times
 
-    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
         wanted, chunks = set(channels), self._layout.chunks
         numbers = (number for number, chunk in enumerate(chunks) if self._losses.may_hold(chunk, wanted))
-        for number, data in self._data.iterate(numbers, self._is_read_in_place if brief else None):
+        for number, data in self._data.iterate(numbers, lambda number: bool(brief) and self._is_read_in_place(number)):
             chunk = chunks[number]
             if not self._losses.may_hold(chunk, wanted):  # by a definition that came meanwhile
                 continue
             end = chunk.stop - chunk.start if data is None else len(data)
             reader = ChunkReader(number, end, self._channels, self._define, wanted, brief, chunk.cut)
             if data is None:
-                yield reader.in_place(lambda start, length, at=chunk.start: self._at(at + start, length))
+                yield from reader.in_place(lambda start, length, at=chunk.start: self._at(at + start, length))
             else:
-                yield reader.whole(data)
+                yield from reader.whole(data)
             self._account_for_chunk(chunk, reader)
 
     def read(self, place: Place) -> Octets:
@@ -183,10 +192,6 @@ class McapFile:
         span = chunk.first_ns, max(chunk.first_ns, chunk.last_ns)
         self._losses.add_chunk(chunk, {}, [span], self._unread[number])
 
-    def _is_cached(self, number: int) -> bool:
-        """Parts of what is not packed can be read again by themselves, unless each costs a request."""
-        return not self._local or not _is_plain(self._layout.chunks[number])
-
     def _is_read_in_place(self, number: int) -> bool:
         """Whether a chunk's messages can be found where they lie, without reading all of it."""
         chunk = self._layout.chunks[number]
@@ -198,3 +203,107 @@ class McapFile:
 
 def _is_plain(chunk: Chunk) -> bool:
     return chunk.compression in (None, "", "none")
+
+
+class ChunkReader:
+    """Messages found so far in chunk `number`, from its first byte to `position`."""
+
+    def __init__(
+        self,
+        number: int,
+        end: int,
+        channels: dict[int, Channel],
+        define: Callable[[int, bytes], None],
+        wanted: Collection[Channel] | None,
+        brief: Collection[Channel] = (),
+        cut: bool = False,
+    ) -> None:
+        """`end` is its length, `cut` whether the file ends in it. Messages on `wanted` channels are given (None: on
+        all); those on `brief` ones need not be whole. `define` takes a schema or channel record and may add to
+        `channels`."""
+        self.position = 0
+        self.last_ns: int | None = None
+        """Log time of the last message, on whatever channel."""
+        self.number, self.end, self._channels, self._define = number, end, channels, define
+        self._wanted, self._brief, self._cut = wanted, brief, cut
+        self._used = {i: channel for i, channel in channels.items() if wanted is None or channel in wanted}
+        self._ids: list[int] = []
+        self._messages: list[Message] = []
+
+    @property
+    def counts(self) -> Counter[int]:
+        """Messages by channel id."""
+        return Counter(self._ids)
+
+    def whole(self, data: bytes) -> list[Message]:
+        """The messages of the chunk, of which `data` are all bytes."""
+        self._go(data)
+        return self._sound()
+
+    def in_place(self, read: Callable[[int, int], bytes]) -> list[Message]:
+        """The messages of a chunk that is not packed, from what `read(start, length)` gives of its bytes."""
+        while (left := self.end - self.position) >= RECORD.size:
+            before = self.position
+            data = read(before, min(_WINDOW, left))
+            self._go(data)
+            if self.position == before:
+                length = RECORD.size + RECORD.unpack_from(data)[1] if len(data) >= RECORD.size else left + 1
+                if not len(data) < length <= left:
+                    break
+                self._go(read(before, length))
+                if self.position == before:
+                    break
+        return self._sound()
+
+    def _sound(self) -> list[Message]:
+        """The messages found, without the one before damage: its length may be what is damaged."""
+        if self.position < self.end and not self._cut and self._ids and self._ids.pop() in self._used:
+            self._messages.pop()
+        return self._messages
+
+    def _go(self, data: bytes) -> None:
+        """On through `data`, which lie at `position` in the chunk, up to the first record that more is needed of."""
+        base, at, size, left = self.position, 0, len(data), self.end - self.position
+        used = self._used
+        while at + _MESSAGE.size <= size:
+            opcode, length, channel_id, _, log_ns, _ = _MESSAGE.unpack_from(data, at)
+            start, stop = at + _MESSAGE.size, at + RECORD.size + length
+            if stop < start if opcode == _IS_MESSAGE else opcode in _OUTSIDE:
+                break
+            if stop > size and (
+                opcode != _IS_MESSAGE or stop > left or self._is_needed(used.get(channel_id), size - start, length)
+            ):
+                break
+            if opcode == _IS_MESSAGE:
+                self._ids.append(channel_id)
+                self.last_ns = log_ns
+                if channel_id in used:
+                    place = self.number, base + start, base + stop
+                    self._messages.append(Message(used[channel_id], log_ns, part_of(data, start, stop), place))
+            elif opcode in _DEFINES:
+                self._learn(opcode, data[at + RECORD.size : stop])
+            at = stop
+        while at + RECORD.size <= size:  # too short for a message
+            opcode, length = RECORD.unpack_from(data, at)
+            stop = at + RECORD.size + length
+            if stop > size or opcode == _IS_MESSAGE or opcode in _OUTSIDE:
+                break
+            if opcode in _DEFINES:
+                self._learn(opcode, data[at + RECORD.size : stop])
+            at = stop
+        self.position = base + at
+
+    def _learn(self, opcode: int, data: bytes) -> None:
+        """Take a definition; it may be of a wanted channel, and a log may have ten thousands of them."""
+        self._define(opcode, data)
+        number = int.from_bytes(data[:2], "little")  # of a schema or channel record, its first field
+        channel = self._channels.get(number)
+        if opcode != _IS_SCHEMA and channel is not None:
+            if self._wanted is None or channel in self._wanted:
+                self._used[number] = channel
+            else:
+                self._used.pop(number, None)
+
+    def _is_needed(self, channel: Channel | None, there: int, length: int) -> bool:
+        """Whether more of a message is needed than the bytes that are there."""
+        return channel is not None and (channel not in self._brief or there < BRIEF or length < _WINDOW)

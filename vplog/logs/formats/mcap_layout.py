@@ -150,8 +150,8 @@ class _LayoutReader:
             if (chunk := found.get(offset)) is not None:
                 if chunk.counts and chunk.counts.keys() != indexes.keys():
                     chunk.doubtful |= chunk.counts != {i: n for i, n in self._counts(indexes).items() if n}
-            elif (stop := self._chunk_stop(offset)) is not None:  # it was jumped over
-                self._add_chunk(offset + RECORD.size, stop, cut=False)
+            elif (there := self._bounds(offset))[0] == Opcode.CHUNK and there[1] <= self._length:  # jumped over
+                self._add_chunk(offset + RECORD.size, there[1], cut=False)
                 self.layout.chunks[-1].counts = self._counts(indexes)
             elif any(start <= offset < stop for start, stop in self.layout.gaps):
                 listed.counts = self._counts(indexes)
@@ -161,11 +161,6 @@ class _LayoutReader:
         self.layout.in_order()
         if placed:  # the index tells of every chunk in the gaps
             self.layout.gaps = []
-
-    def _chunk_stop(self, position: int) -> int | None:
-        """Where the chunk at `position` stops; None where none lies whole there."""
-        opcode, stop = self._bounds(position)
-        return stop if opcode == Opcode.CHUNK and stop <= self._length else None
 
     def _counts(self, indexes: dict[int, int]) -> dict[int, int]:
         """Messages per channel id by message indexes at these offsets; empty where one is not there."""
@@ -256,7 +251,11 @@ class _LayoutReader:
             counts = {channel_id: count for channel_id, count in entries if count}
             self.layout.recorded = counts if sum(counts.values()) == total <= self._length else {}
         elif opcode == Opcode.CHUNK_INDEX and 64 <= length <= _MAX_DEFINITION:
-            self._add_index(self.at(start, length))
+            data = self.at(start, length)
+            first_ns, last_ns, offset, _, size = struct.unpack_from("<QQQQI", data)
+            entries = data[36 : 36 + min(size, len(data) - 36) // 10 * 10]  # channel id and offset of its message index
+            listed = Chunk(offset, offset, first_ns=first_ns, last_ns=last_ns)
+            self._indexed[offset] = listed, dict(struct.iter_unpack("<HQ", entries))
 
     def _add_message_index(self, start: int, length: int) -> None:
         if self._indexing is None or length < 6:
@@ -293,12 +292,6 @@ class _LayoutReader:
             last.stop, last.first_ns, last.last_ns = stop, min(last.first_ns, log_ns), max(last.last_ns, log_ns)
         else:
             chunks.append(Chunk(start - RECORD.size, stop, None, first_ns=log_ns, last_ns=log_ns))
-
-    def _add_index(self, data: bytes) -> None:
-        first_ns, last_ns, offset, _, size = struct.unpack_from("<QQQQI", data)
-        entries = data[36 : 36 + min(size, len(data) - 36) // 10 * 10]  # channel id and offset of its message index
-        chunk = Chunk(offset, offset, first_ns=first_ns, last_ns=last_ns)
-        self._indexed[offset] = chunk, dict(struct.iter_unpack("<HQ", entries))
 
     def _resume(self, before: int, position: int) -> int | None:
         """The next record to go on with, where there is none at `position`. In a file without chunks the message

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
 from vplog.logs.formats.compression import BadChunkError, unpack
-from vplog.logs.formats.container import Channel, Contents, Notes, block_of
+from vplog.logs.formats.container import Channel, Contents, Message, Notes, part_of
 from vplog.logs.formats.layout import ChunkLosses
 from vplog.logs.formats.loss_account import sampled
 from vplog.logs.formats.ros1_layout import CONNECTION, MAGIC, MESSAGE, fields, number, read_layout, time_ns
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from pathlib import Path
 
-    from vplog.logs.formats.container import Block, Octets, Place
+    from vplog.logs.formats.container import Octets, Place
 
 _FIELDS = {MESSAGE: {b"conn", b"time"}, CONNECTION: {b"conn", b"topic"}}
 """Header fields of each kind of record in the chunks."""
@@ -46,7 +46,7 @@ class Ros1Bag:
         by_id, times = self._counted()
         if (by_id.keys() | self._doubtful.keys()) - self._channels.keys():
             for row in range(len(self._layout.chunks)):  # which define their connections too
-                self._messages(row, self._data(row))
+                self._found(row, self._data(row))
             for connection, channel in self._doubtful.items():
                 self._channels.setdefault(connection, channel)
             by_id, times = self._counted()
@@ -61,7 +61,7 @@ class Ros1Bag:
                 found = chunk.counts
                 times += chunk.first_ns, chunk.last_ns
             else:
-                messages = self._messages(row, self._data(row))
+                messages = self._found(row, self._data(row))
                 found = Counter(connection for connection, *_ in messages)
                 own = [log_ns for _, log_ns, _, _ in messages]
                 chunk.first_ns = min([*own, chunk.first_ns] if chunk.first_ns else own, default=0)
@@ -76,17 +76,15 @@ class Ros1Bag:
             counts.update(found)
         return counts, times
 
-    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
         wanted, chunks = set(channels), self._layout.chunks
         rows = (row for row, chunk in enumerate(chunks) if self._losses.may_hold(chunk, wanted))
         for row, data in self._data.iterate(rows):
             if data is None or not self._losses.may_hold(chunks[row], wanted):  # by a connection that came meanwhile
                 continue
-            found = [(self._channels.get(connection), *rest) for connection, *rest in self._messages(row, data)]
-            yield block_of(
-                data,
-                [(c, log_ns, start, stop, (row, start, stop)) for c, log_ns, start, stop in found if c in wanted and c],
-            )
+            for connection, log_ns, start, stop in self._found(row, data):
+                if (channel := self._channels.get(connection)) in wanted and channel:
+                    yield Message(channel, log_ns, part_of(data, start, stop), (row, start, stop))
 
     def read(self, place: Place) -> Octets:
         return self._data.part(*place)
@@ -98,7 +96,7 @@ class Ros1Bag:
         known = self._channels if b"type" in about else self._doubtful
         known.setdefault(number(header, b"conn"), Channel(topic, kind, "ros1"))
 
-    def _messages(self, row: int, data: bytes) -> list[tuple[int, int, int, int]]:
+    def _found(self, row: int, data: bytes) -> list[tuple[int, int, int, int]]:
         """Connection, log time, start and stop of every message in a chunk; what it was short of is accounted for."""
         chunk = self._layout.chunks[row]
         found: list[tuple[int, int, int, int]] = []
@@ -113,7 +111,7 @@ class Ros1Bag:
             if number(header, b"op") == CONNECTION:
                 self._connect(header, data[start:stop])
             else:
-                found.append((number(header, b"conn"), time_ns(header, b"time"), start, stop))
+                found.append((number(header, b"conn"), time_ns(header[b"time"]), start, stop))
             position = stop
         damaged = position < len(data) and not chunk.cut
         if damaged and found:

@@ -233,8 +233,7 @@ class _LayoutReader:
             if count and stop <= self._length:
                 chunk.counts[connection] = count
                 for at in (start, start + 12 * (count - 1)):
-                    seconds, nanoseconds = struct.unpack("<II", self.at(at, 8))
-                    log_ns = seconds * 1_000_000_000 + nanoseconds
+                    log_ns = time_ns(self.at(at, 8))
                     chunk.first_ns = min(chunk.first_ns or log_ns, log_ns)
                     chunk.last_ns = max(chunk.last_ns, log_ns)
         elif op == _CHUNK_INFO:
@@ -246,8 +245,9 @@ class _LayoutReader:
             self._chunk_count = number(header, b"chunk_count")
 
     def _add_info(self, header: dict[bytes, bytes], data: bytes) -> None:
-        position, span = number(header, b"chunk_pos"), (time_ns(header, b"start_time"), time_ns(header, b"end_time"))
-        info = Chunk(position, position, first_ns=span[0], last_ns=span[1], record=position)
+        position = number(header, b"chunk_pos")
+        first_ns, last_ns = time_ns(header[b"start_time"]), time_ns(header[b"end_time"])
+        info = Chunk(position, position, first_ns=first_ns, last_ns=last_ns, record=position)
         for connection, count in struct.iter_unpack("<II", data[: len(data) // 8 * 8]):
             if 0 < count <= self._length // _ENTRY[_INDEX]:
                 info.counts[connection] = count
@@ -275,12 +275,9 @@ def number(header: dict[bytes, bytes], name: bytes) -> int:
     return int.from_bytes(header[name][:8], "little") if name in header else -1
 
 
-def time_ns(header: dict[bytes, bytes], name: bytes) -> int:
-    """Nanoseconds of a ROS time field: u32 seconds, u32 nanoseconds."""
-    value = header.get(name, b"")
-    if len(value) != 8:
-        return 0
-    seconds, nanoseconds = struct.unpack("<II", value)
+def time_ns(value: bytes) -> int:
+    """Nanoseconds of a ROS time: u32 seconds, u32 nanoseconds; 0 where its bytes are not so many."""
+    seconds, nanoseconds = struct.unpack("<II", value) if len(value) == 8 else (0, 0)
     return seconds * 1_000_000_000 + nanoseconds
 
 

@@ -12,14 +12,14 @@ import yaml
 import zstandard
 
 from vplog.logs.formats.compression import BadChunkError, unpack_zstd_message
-from vplog.logs.formats.container import Contents, Message, Notes, by_topic, in_blocks, messages_in
+from vplog.logs.formats.container import Contents, Notes, by_topic
 from vplog.logs.formats.loss_account import LossRuns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
-    from vplog.logs.formats.container import Block, Channel, Container, Octets, Place
+    from vplog.logs.formats.container import Channel, Container, Message, Octets, Place
 
 _MAX_METADATA = 4 * 2**20
 """Bytes of metadata.yaml that are parsed; real ones have some 10 kB."""
@@ -44,8 +44,6 @@ class Metadata:
     """The storage files that are there, in order."""
     missing: list[str]
     """Names of those that are not."""
-    mode: str
-    """Compression: ``, `file` or `message`."""
     recorded: dict[str, int]
     """Messages by topic; empty where it does not say."""
     start_ns: int
@@ -71,10 +69,10 @@ class Chain:
             self._reconcile(self._metadata, by_topic(counts))
         return Contents(dict(sorted(counts.items())), start_ns, max((end for _, end in spans), default=0))
 
-    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
+    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
         for number, part in enumerate(self._parts):
-            for block in part.blocks(channels, brief):
-                yield block._replace(places=[(number, *place) for place in block.places])
+            for message in part.messages(channels, brief):
+                yield message._replace(place=(number, *message.place))
 
     def read(self, place: Place) -> Octets:
         return self._parts[place[0]].read(place[1:])
@@ -101,19 +99,16 @@ class ZstdMessages:
     def contents(self) -> Contents:
         return self._packed.contents()
 
-    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
-        return in_blocks(self._unpacked(channels))
-
     def read(self, place: Place) -> bytes:
         try:
             return unpack_zstd_message(self._packed.read(place))
         except BadChunkError:
             return b""
 
-    def _unpacked(self, channels: Collection[Channel]) -> Iterator[Message]:
+    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
         lost: defaultdict[str, LossRuns] = defaultdict(LossRuns)
         reason = ""
-        for message in messages_in(self._packed, channels):
+        for message in self._packed.messages(channels):
             topic = message.channel.topic
             try:
                 yield message._replace(data=unpack_zstd_message(message.data))
@@ -126,10 +121,10 @@ class ZstdMessages:
 
 
 def messages_unpacked(container: Container, contents: Contents, notes: Notes) -> Container:
-    """The container, or one that unpacks its messages where each is a zstd frame, as which no CDR begins: a storage
-    file of rosbag2's compression mode MESSAGE without its metadata."""
+    """The container, or one that unpacks its messages where each is a zstd frame, as which no CDR begins: rosbag2's
+    compression mode MESSAGE, in a folder whose metadata say so or in a storage file alone."""
     channels = [channel for channel in contents.counts if channel.encoding == "cdr"]
-    firsts = islice(messages_in(container, channels), _TRIED) if channels else ()
+    firsts = islice(container.messages(channels), _TRIED) if channels else ()
     packed = any(bytes(message.data[:4]) == zstandard.FRAME_HEADER for message in firsts)
     return ZstdMessages(container, notes) if packed else container
 
@@ -145,10 +140,9 @@ def read_metadata(folder: Path) -> Metadata:
     if not files:
         lacks = ", ".join(missing[:3]) or "no storage file"
         raise MetadataError(f"{folder / 'metadata.yaml'} names {lacks}, and no such file is in the folder.")
-    mode = str(tree.get("compression_mode") or "").lower()
     start_ns, length_ns = _nanoseconds(tree.get("starting_time")), _nanoseconds(tree.get("duration"))
     end_ns = start_ns + length_ns if start_ns and length_ns else 0
-    return Metadata(files, missing, mode if mode in ("file", "message") else "", _recorded(tree), start_ns, end_ns)
+    return Metadata(files, missing, _recorded(tree), start_ns, end_ns)
 
 
 def _recorded(tree: dict) -> dict[str, int]:

@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog.errors import LogError, plural
-from vplog.logs.formats.container import Channel, Contents, Message, Notes, by_topic, in_blocks
+from vplog.logs.formats.container import Channel, Contents, Message, Notes, by_topic
 from vplog.logs.formats.layout import ResyncSearch
 from vplog.logs.formats.loss_account import confirmed_span, main_span
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from vplog.logs.formats.container import Block, Place
+    from vplog.logs.formats.container import Place
 
 MAGIC = b"SQLite format 3\x00"
 _DAMAGE = (sqlite3.Error, OverflowError, UnicodeDecodeError)
@@ -111,16 +111,10 @@ class SqliteBag:
         for _, name, *_ in self._rows("PRAGMA index_list(messages)"):
             index = '"' + name.replace('"', '""') + '"'
             query = f"SELECT count({what}) FROM (SELECT rowid FROM messages INDEXED BY {index})"  # noqa: S608 - quoted
-            try:
-                most = max(most, self._db.execute(query).fetchone()[0])
-            except _DAMAGE:
-                continue  # the index is what is damaged
+            most = max(most, *self._first(query) or [0])  # none where the index is what is damaged
         return most
 
-    def blocks(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Block]:
-        return in_blocks(self._messages(channels))
-
-    def _messages(self, channels: Collection[Channel]) -> Iterator[Message]:
+    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
         ids = [topic for topic, channel in self._topics.items() if channel in channels]
         found: Counter[int] = Counter()
         for row, topic, time_ns, data in self._rows_of(ids):
@@ -181,19 +175,20 @@ class SqliteBag:
 
     def _last_row(self) -> int:
         """The highest number of a row, by the table or its indexes; where none is sound, the most there can be."""
-        try:
-            found = self._db.execute("SELECT max(rowid) FROM messages").fetchone()[0]
-        except _DAMAGE:
-            found = None
+        (found,) = self._first("SELECT max(rowid) FROM messages") or (None,)
         return found if isinstance(found, int) else self._most_by_index() or self._path.stat().st_size // _LEAST_FOUND
 
     def _row(self, number: int) -> tuple | None:
         """A row by its number; None where it is not there or not whole."""
+        found = self._first(f"{_ROWS} WHERE rowid = ?", number)
+        return found if found and _is_whole(found) else None
+
+    def _first(self, query: str, *values: int) -> tuple | None:
+        """The first row of a query; None where there is none, or damage keeps it from being read."""
         try:
-            found = self._db.execute(f"{_ROWS} WHERE rowid = ?", [number]).fetchone()
+            return self._db.execute(query, values).fetchone()
         except _DAMAGE:
             return None
-        return found if found and _is_whole(found) else None
 
     def _connect(self, mode: str) -> sqlite3.Connection:
         db = sqlite3.connect(f"{self._path.resolve().as_uri()}?{mode}", uri=True)

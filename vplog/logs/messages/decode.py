@@ -34,8 +34,10 @@ _HEAD = 12
 """Bytes before the names of frames: CDR's encapsulation of 4 bytes or ROS 1's sequence number, then the stamp."""
 
 
-def decode(channel: Channel, data: Octets) -> Record:
+def decode(channel: Channel, data: Octets | Record) -> Record:
     """The record of a message, the bytes of images views of `data` where they can be. Raises BadMessageError."""
+    if not isinstance(data, bytes | memoryview):
+        return data
     try:
         if ENCODINGS[channel.encoding] == "ros":
             return decode_ros(short_type(channel.type), channel.encoding, data)
@@ -49,9 +51,9 @@ def decode(channel: Channel, data: Octets) -> Record:
         raise BadMessageError(reason[:200]) from None
 
 
-def stamp_of(channel: Channel, data: Octets) -> int:
+def stamp_of(channel: Channel, data: Octets | Record) -> int:
     """The header stamp in ns, of ROS without looking at the rest. Raises BadMessageError."""
-    if channel.encoding in ("cdr", "ros1"):
+    if channel.encoding in ("cdr", "ros1") and isinstance(data, bytes | memoryview):
         if len(data) < 12:
             raise BadMessageError(f"{len(data)} bytes are too few for a header")
         little = channel.encoding == "ros1" or data[1] == 1

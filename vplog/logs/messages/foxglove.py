@@ -96,23 +96,11 @@ def _stamp(message: Any) -> int:
     return nanoseconds(message.timestamp.seconds, message.timestamp.nanos)
 
 
-def _raw(m: Any) -> Record:
-    return ImageMessage(_stamp(m), m.frame_id, m.encoding, m.data, False, m.width, m.height, m.step)
-
-
-def _compressed(m: Any) -> Record:
-    return ImageMessage(_stamp(m), m.frame_id, m.format, m.data, True)
-
-
 def _calibration(m: Any) -> Record:
     return CalibrationMessage(
         _stamp(m), m.frame_id, m.width, m.height, m.distortion_model, np.array(m.D, np.float64),
         _matrix(m.K, (3, 3)), _matrix(m.P, (3, 4)), _matrix(m.R, (3, 3)),
     )  # fmt: skip
-
-
-def _pose(m: Any) -> Record:
-    return _placed(m, m.frame_id, "", m.pose.position, m.pose.orientation)
 
 
 def _poses(m: Any) -> Record:
@@ -130,22 +118,22 @@ def _odometry(m: Any) -> Record:
     return found._replace(twist=(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z, *variances.tolist()))
 
 
-def _transform(m: Any) -> PoseMessage:
-    return _placed(m, m.parent_frame_id, m.child_frame_id, m.translation, m.rotation)
+def _transforms(found: Any) -> Record:
+    return [_placed(m, m.parent_frame_id, m.child_frame_id, m.translation, m.rotation) for m in found]
 
 
 def _placed(m: Any, frame: str, child: str, p: Any, q: Any, covariance: list[float] | None = None) -> PoseMessage:
     return PoseMessage(_stamp(m), frame, child, (p.x, p.y, p.z), (q.x, q.y, q.z, q.w), covariance)
 
 
-def _fix(m: Any) -> Record:
+def _fix(m: Any) -> FixMessage:
     known = m.position_covariance_type != _UNKNOWN_COVARIANCE
     covariance = _matrix(m.position_covariance, (3, 3)) if known else np.full((3, 3), np.nan)
     return FixMessage(_stamp(m), True, m.latitude, m.longitude, m.altitude, covariance, m.frame_id)
 
 
 def _fixes(m: Any) -> Record:
-    found = [one for one in map(_fix, m.fixes) if isinstance(one, FixMessage)]
+    found = [_fix(one) for one in m.fixes]
     return FixesMessage(found[0].stamp_ns if found else 0, found)
 
 
@@ -155,15 +143,19 @@ def _matrix(values: Any, shape: tuple[int, int]) -> Floats:
 
 
 _READERS: dict[str, Callable[[Any], Record]] = {
-    "foxglove.RawImage": _raw,
-    "foxglove.CompressedImage": _compressed,
-    "foxglove.CompressedVideo": _compressed,
+    "foxglove.RawImage": lambda m: ImageMessage(
+        _stamp(m), m.frame_id, m.encoding, m.data, False, m.width, m.height, m.step
+    ),
+    **dict.fromkeys(
+        ("foxglove.CompressedImage", "foxglove.CompressedVideo"),
+        lambda m: ImageMessage(_stamp(m), m.frame_id, m.format, m.data, True),
+    ),
     "foxglove.CameraCalibration": _calibration,
-    "foxglove.PoseInFrame": _pose,
+    "foxglove.PoseInFrame": lambda m: _placed(m, m.frame_id, "", m.pose.position, m.pose.orientation),
     "foxglove.PosesInFrame": _poses,
     "foxglove.Odometry": _odometry,
     "foxglove.LocationFix": _fix,
     "foxglove.LocationFixes": _fixes,
-    "foxglove.FrameTransform": lambda m: [_transform(m)],
-    "foxglove.FrameTransforms": lambda m: [_transform(t) for t in m.transforms],
+    "foxglove.FrameTransform": lambda m: _transforms([m]),
+    "foxglove.FrameTransforms": lambda m: _transforms(m.transforms),
 }

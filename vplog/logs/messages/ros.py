@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 import struct
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -136,10 +136,6 @@ def _image(fields: _Fields) -> Record:
     return ImageMessage(stamp_ns, frame, encoding, fields.octets(), False, width, height, step, bool(big_endian))
 
 
-def _compressed(fields: _Fields) -> Record:
-    return ImageMessage(*fields.header(), fields.text(), fields.octets(), True)
-
-
 def _packet(fields: _Fields) -> Record:
     """github.com/ros-misc-utilities/ffmpeg_image_transport_msgs."""
     stamp_ns, frame = fields.header()
@@ -171,20 +167,13 @@ def _calibration(fields: _Fields) -> Record:
     return CalibrationMessage(stamp_ns, frame, *size, model, distortion, k, p, r)
 
 
-def _odometry(fields: _Fields) -> Record:
-    (stamp_ns, frame), child = fields.header(), fields.text()
-    numbers = fields.numbers("85d")  # pose and its covariance, twist and its own
-    return PoseMessage(stamp_ns, frame, child, numbers[:3], numbers[3:7], numbers[7:43], _twist_of(numbers[43:]))
-
-
-def _pose(fields: _Fields) -> Record:
-    (stamp_ns, frame), numbers = fields.header(), fields.numbers("7d")
-    return PoseMessage(stamp_ns, frame, "", numbers[:3], numbers[3:], None)
-
-
-def _pose_with_covariance(fields: _Fields) -> Record:
-    (stamp_ns, frame), numbers = fields.header(), fields.numbers("43d")
-    return PoseMessage(stamp_ns, frame, "", numbers[:3], numbers[3:7], numbers[7:])
+def _pose(fields: _Fields, numbers: str, child: bool = False) -> PoseMessage:
+    """A pose, its covariance and the twist with its own, as far as the type has them; of some with the frame that
+    moves."""
+    (stamp_ns, frame), moved = fields.header(), fields.text() if child else ""
+    found = fields.numbers(numbers)
+    twist = _twist_of(found[43:]) if len(found) > 43 else None
+    return PoseMessage(stamp_ns, frame, moved, found[:3], found[3:7], found[7:43] or None, twist)
 
 
 def _twist_of(numbers: tuple) -> tuple:
@@ -195,14 +184,6 @@ def _twist_of(numbers: tuple) -> tuple:
 def _moving(stamp_ns: int, frame: str, twist: tuple) -> PoseMessage:
     """Velocities without a pose."""
     return PoseMessage(stamp_ns, "", frame, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), None, twist)
-
-
-def _twist(fields: _Fields) -> Record:
-    return _moving(*fields.header(), (*fields.numbers("6d"), *_UNKNOWN_VARIANCES))
-
-
-def _twist_with_covariance(fields: _Fields) -> Record:
-    return _moving(*fields.header(), _twist_of(fields.numbers("42d")))
 
 
 def _ackermann(fields: _Fields) -> Record:
@@ -236,12 +217,8 @@ def _pose_2d(fields: _Fields) -> Record:
 def _path(fields: _Fields) -> Record:
     stamp_ns, frame = fields.header()
     count = fields.numbers("I")[0]
-    poses: list[PoseMessage] = []
-    for _ in range(count):
-        at_ns, own = fields.header()
-        numbers = fields.numbers("7d")
-        poses.append(PoseMessage(at_ns, own or frame, "", numbers[:3], numbers[3:], None))
-    return PathMessage(stamp_ns, frame, poses)
+    poses = [_pose(fields, "7d") for _ in range(count)]
+    return PathMessage(stamp_ns, frame, [pose if pose.frame else pose._replace(frame=frame) for pose in poses])
 
 
 def _imu(fields: _Fields) -> Record:
@@ -266,13 +243,8 @@ def _px4(fields: _Fields) -> Record:
     )  # fmt: skip
 
 
-def _transform(fields: _Fields) -> PoseMessage:
-    (stamp_ns, frame), child, numbers = fields.header(), fields.text(), fields.numbers("7d")
-    return PoseMessage(stamp_ns, frame, child, numbers[:3], numbers[3:], None)
-
-
 def _transforms(fields: _Fields) -> Record:
-    return [_transform(fields) for _ in range(fields.numbers("I")[0])]
+    return [_pose(fields, "7d", child=True) for _ in range(fields.numbers("I")[0])]
 
 
 def _fix(fields: _Fields) -> Record:
@@ -300,23 +272,19 @@ def _gps_fix(fields: _Fields) -> Record:
     return FixMessage(stamp_ns, status >= 0, latitude, longitude, altitude, known, frame)
 
 
-def _sentence(fields: _Fields) -> Record:
-    return fix_of(*fields.header(), fields.text()) or []
-
-
 _READERS: dict[str, Callable[[_Fields], Record]] = {
     "sensor_msgs/Image": _image,
-    "sensor_msgs/CompressedImage": _compressed,
+    "sensor_msgs/CompressedImage": lambda f: ImageMessage(*f.header(), f.text(), f.octets(), True),
     "ffmpeg_image_transport_msgs/FFMPEGPacket": _packet,
     "foxglove_msgs/CompressedVideo": _video,
     "sensor_msgs/CameraInfo": _calibration,
-    "nav_msgs/Odometry": _odometry,
-    "geometry_msgs/PoseStamped": _pose,
-    "geometry_msgs/PoseWithCovarianceStamped": _pose_with_covariance,
-    "geometry_msgs/TransformStamped": _transform,
+    "nav_msgs/Odometry": partial(_pose, numbers="85d", child=True),
+    "geometry_msgs/PoseStamped": partial(_pose, numbers="7d"),
+    "geometry_msgs/PoseWithCovarianceStamped": partial(_pose, numbers="43d"),
+    "geometry_msgs/TransformStamped": partial(_pose, numbers="7d", child=True),
     "geometry_msgs/Pose2D": _pose_2d,
-    "geometry_msgs/TwistStamped": _twist,
-    "geometry_msgs/TwistWithCovarianceStamped": _twist_with_covariance,
+    "geometry_msgs/TwistStamped": lambda f: _moving(*f.header(), (*f.numbers("6d"), *_UNKNOWN_VARIANCES)),
+    "geometry_msgs/TwistWithCovarianceStamped": lambda f: _moving(*f.header(), _twist_of(f.numbers("42d"))),
     "nav_msgs/Path": _path,
     "ackermann_msgs/AckermannDriveStamped": _ackermann,
     "px4_msgs/VehicleOdometry": _px4,
@@ -325,7 +293,7 @@ _READERS: dict[str, Callable[[_Fields], Record]] = {
     "sensor_msgs/NavSatFix": _fix,
     "gps_common/GPSFix": _gps_fix,
     "gps_msgs/GPSFix": _gps_fix,
-    "nmea_msgs/Sentence": _sentence,
+    "nmea_msgs/Sentence": lambda f: fix_of(*f.header(), f.text()) or [],
     "tf2_msgs/TFMessage": _transforms,
     "tf/tfMessage": _transforms,
 }
