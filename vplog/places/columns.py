@@ -46,24 +46,41 @@ def check_values(*arrays: pa.Array) -> None:
             raise LibraryError("Some descriptors have no value; compute them again with `vplog run`.")
 
 
-def to_lists(items: pa.Array, lengths: Sequence[int], arrow_type: pa.ListType) -> pa.Array:
-    """A column of lists of these lengths from all their items."""
-    start = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+def to_lists(places: Sequence[NDArray], arrow_type: pa.ListType) -> pa.Array:
+    """A column of lists from the values (K,) of each place, a numpy record where the items are structs."""
+    item = arrow_type.value_type
+    values = np.concatenate([np.zeros(0, _dtype(item)), *places])
+    parts = [pa.array(values[name]) for name in values.dtype.names or ()]
+    items = pa.StructArray.from_arrays(parts, fields=list(item)) if parts else pa.array(values)
+    start = np.concatenate([[0], np.cumsum([len(place) for place in places])]).astype(np.int32)
     return pa.ListArray.from_arrays(pa.array(start), items, type=arrow_type)
 
 
-def list_slices(column: pa.ListArray, words: NDArray[np.uint16], vocabulary: int) -> list[slice]:
-    """The slice of all words (K,) for each list of the column. Raises LibraryError where the words of a place do not
-    rise or are beyond the `vocabulary`."""
-    if len(words) and words.max() >= vocabulary:
+def from_lists(column: pa.ListArray, arrow_type: pa.ListType, words: int) -> list[NDArray]:
+    """The values of each list of a `to_lists`, whose first number is that of a visual word. Raises LibraryError where
+    the column is of another type, lacks a value, or a place's words do not rise or are not below `words`."""
+    check_type(column, arrow_type)
+    items = column.flatten()
+    parts = items.flatten() if pa.types.is_struct(items.type) else [items]
+    check_values(column, *parts)
+    values = np.empty(len(items), _dtype(items.type))
+    for name, part in zip(values.dtype.names or (...,), parts, strict=True):
+        values[name] = part.to_numpy()
+    word = parts[0].to_numpy().astype(np.int32)
+    if len(word) and word.max() >= words:
         raise LibraryError(
             "The descriptors name words that this library does not have; compute them again with `vplog run`."
         )
-    lengths = column.value_lengths().to_numpy()
-    stop = np.cumsum(lengths)
-    start = stop - lengths
-    rising = np.diff(words.astype(np.int32), prepend=-1) > 0
-    rising[start[start < len(words)]] = True  # a place's first word follows none
+    stop = np.cumsum(column.value_lengths().to_numpy())
+    rising = np.diff(word, prepend=-1) > 0
+    rising[stop[stop < len(word)]] = True  # a place's first word follows none
     if not np.all(rising):
         raise LibraryError("The descriptors name a word twice or out of order; compute them again with `vplog run`.")
-    return list(map(slice, start.tolist(), stop.tolist()))
+    return np.split(values, stop)[:-1]
+
+
+def _dtype(item: pa.DataType) -> np.dtype:
+    """Numpy's type of a number, or a record of the numbers of a struct."""
+    if isinstance(item, pa.StructType):
+        return np.dtype([(field.name, field.type.to_pandas_dtype()) for field in item])
+    return np.dtype(item.to_pandas_dtype())
