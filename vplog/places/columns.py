@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from vplog.errors import LibraryError
+from vplog.places.library_files import ReferencesState
 
 
 def to_column(arrow_type: pa.DataType, arrays: Iterator[NDArray]) -> pa.Array:
@@ -30,6 +34,49 @@ def from_column(column: pa.Array, arrow_type: pa.DataType) -> list[NDArray]:
     if not np.all(np.isfinite(values)):
         raise LibraryError("Some descriptors have values that are not finite; compute them again with `vplog run`.")
     return [values]
+
+
+class RecordState(ReferencesState, ABC):
+    """A state whose places are records of arrays, the first of which are numbers of references."""
+
+    record: type[Any]
+    """Dataclass of a place."""
+    none: int
+    """The number of no reference."""
+
+    @property
+    @abstractmethod
+    def layout(self) -> dict[str, tuple[pa.DataType, tuple[int, ...]]]:
+        """Type and shape of the values of each field of a place."""
+
+    @property
+    def arrow_type(self) -> pa.StructType:
+        return pa.struct({name: pa.list_(kind, math.prod(shape)) for name, (kind, shape) in self.layout.items()})
+
+    def arrays(self, places: Sequence[Any]) -> Any:
+        """(N, ...) values of each field, in a list."""
+        return self._shaped([getattr(place, name) for place in places] for name in self.layout)
+
+    def _shaped(self, fields: Iterable[Any]) -> list[Any]:
+        return [
+            np.asarray(values, kind.to_pandas_dtype()).reshape(-1, *shape)
+            for values, (kind, shape) in zip(fields, self.layout.values(), strict=True)
+        ]
+
+    def to_arrow(self, descriptors: Sequence[Any]) -> pa.Array:
+        return to_column(self.arrow_type, iter(self.arrays(descriptors)))
+
+    def from_arrow(self, column: pa.Array) -> list[Any]:
+        return list(map(self.record, *self.checked(from_column(column, self.arrow_type))))
+
+    def checked(self, fields: Sequence[NDArray]) -> list[Any]:
+        """(N, ...) values of each field of a column. Raises LibraryError where this library has no such reference."""
+        references, *others = self._shaped(fields)
+        if np.any((references != self.none) & ((references < 0) | (references >= len(self.references)))):
+            raise LibraryError(
+                "The descriptors name references that this library lacks; compute them again with `vplog run`."
+            )
+        return [references, *others]
 
 
 def check_type(column: pa.Array, arrow_type: pa.DataType) -> None:
