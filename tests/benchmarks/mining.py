@@ -92,7 +92,7 @@ def recall(state: BobbState, features: list[Features]) -> float:
     """Share of features whose nearest library feature the graph finds, or another one just as near."""
     matcher, settings = state.matcher, state.settings
     right = count = 0
-    for kind, described in ((matcher.keypoints, matches.keypoints_of), (matcher.patches, matches.patches_of)):
+    for kind, described in zip(matcher.indexed(), (matches.keypoints_of, matches.patches_of), strict=True):
         if kind is None:
             continue
         exact = faiss.IndexFlatL2(kind.graph.d)

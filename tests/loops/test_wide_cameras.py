@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vplog.data import Camera
+from vplog.data import Camera, Features
 from vplog.geometry import se3
 from vplog.loops import pose_refinement, undistort, verify_metric
 from vplog.loops.landmarks import LandmarkSettings, from_depth
@@ -41,9 +41,10 @@ def verified(camera: Camera, half_view_deg: float, seed: int) -> tuple[Pose, flo
     landmarks = from_depth(here, 1.0 / rho, camera, NOISE)
     rows = np.flatnonzero(landmarks.known & np.isfinite(there).all(1))
     unknown = np.full(len(rows), np.nan, np.float32)
-    share = undistort.project(camera, seen)[rows] / 1000
+    px, nothing = undistort.project(camera, seen)[rows].astype(np.float32), np.zeros((len(rows), 128), np.uint8)
+    query = Features(px, unknown, nothing, unknown, camera.width, camera.height)
     matches = verify_metric.observe(landmarks, rows, there[rows], unknown, camera, NOISE)
-    pose = verify_metric.solve(matches, share, camera, landmarks.from_depth, NOISE.pixel_sigma, ALONE)
+    pose = verify_metric.solve(landmarks, rows, query, there[rows], camera, NOISE, ALONE)
     assert pose.match_from_query is not None
     assert pose.covariance is not None
     distance, _ = pose_refinement.agreement(pose.match_from_query, matches)

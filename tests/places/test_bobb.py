@@ -95,8 +95,9 @@ def test_grain_is_not_used() -> None:
 def test_matches_are_of_the_kinds_asked_for(kinds: dict[str, float], references: list[Reference]) -> None:
     wanted = WeighedMatchSettings(**kinds)  # pyright: ignore[reportArgumentType]
     matcher = index_references(references, wanted)
-    assert (matcher.keypoints is None) == (wanted.features == 0)
-    assert (matcher.patches is None) == (wanted.patch_weight == 0)
+    keypoints, patches = matcher.indexed()
+    assert (keypoints is None) == (wanted.features == 0)
+    assert (patches is None) == (wanted.patch_weight == 0)
     seen = noisy(references[2].features, 9)
     found = matcher.match(seen)
     assert np.argmax(np.add.reduceat(np.append(found.weight, 0), found.start[:-1])) == 2

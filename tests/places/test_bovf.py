@@ -10,7 +10,7 @@ import pytest
 
 from vplog.errors import LibraryError
 from vplog.execution.execution import Execution
-from vplog.places.bovf import BovfSettings, BovfState, WordCounts
+from vplog.places.bovf import BovfSettings, BovfState
 
 if TYPE_CHECKING:
     from vplog.data import Reference
@@ -54,8 +54,8 @@ def test_a_cut_place_fits_its_bytes_and_keeps_the_weightiest(
     assert state.bits <= 8 * max_bytes
     for place, reference in zip(places, references, strict=True):
         full = learned.describe(reference.features)
-        weight = dict(zip(full.words.tolist(), np.sqrt(full.counts) * learned.idf[full.words], strict=True))
-        kept = set(place.words.tolist())
+        weight = dict(zip(full["word"].tolist(), np.sqrt(full["count"]) * learned.idf[full["word"]], strict=True))
+        kept = set(place["word"].tolist())
         assert len(kept) == min((max_bytes - 4) // 3, len(weight))
         dropped = weight.keys() - kept
         assert min(weight[w] for w in kept) >= max((weight[w] for w in dropped), default=0)
@@ -63,9 +63,10 @@ def test_a_cut_place_fits_its_bytes_and_keeps_the_weightiest(
 
 def test_damaged_tables_are_refused(learned: BovfState) -> None:
     def column(words: list[int], counts: list[int]) -> pa.Array:
-        return learned.to_arrow([WordCounts(np.array(words, np.uint16), np.array(counts, np.uint8))])
+        place = list(zip(words, counts, strict=True))
+        return learned.to_arrow([np.array(place, [("word", np.uint16), ("count", np.uint8)])])
 
-    assert len(learned.from_arrow(column([1, 2], [1, 1]))[0].words) == 2
+    assert len(learned.from_arrow(column([1, 2], [1, 1]))[0]) == 2
     for words, counts in ([2, 1], [1, 1]), ([1, 1], [1, 1]), ([1, 2], [1, 0]):
         with pytest.raises(LibraryError, match=r"twice|zero times"):
             learned.from_arrow(column(words, counts))
@@ -73,4 +74,4 @@ def test_damaged_tables_are_refused(learned: BovfState) -> None:
         learned.from_arrow(column([1, 60_000], [1, 1]))
     other = column([5, 9], [1, 1])
     joined = pa.concat_arrays([other, column([], []), other])
-    assert [place.words.tolist() for place in learned.from_arrow(joined)] == [[5, 9], [], [5, 9]]
+    assert [place["word"].tolist() for place in learned.from_arrow(joined)] == [[5, 9], [], [5, 9]]

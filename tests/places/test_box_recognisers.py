@@ -86,6 +86,6 @@ def test_only_recognisers_with_boxes_share_references(references: list[Reference
     places = [hybrid.describe(r.features) for r in references]
     query, match = pairs(len(places))
     found = hybrid.shared(places, query, match)
-    boxes = hybrid.bobb.shared([place.boxes for place in places], query, match)
+    boxes = hybrid.bobb.shared(places, query, match)
     assert all(map(np.array_equal, found.references, boxes.references))
     assert not isinstance(BovfSettings(features=250).learn(references, Execution()), BoxState)

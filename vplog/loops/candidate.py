@@ -165,10 +165,8 @@ def _check_metric(
         still = not landmarks.from_depth and landmarks.tracked >= settings.min_matches > landmarks.known.sum()
         verdict = Verdict.DEGENERATE_MOTION if still else Verdict.TOO_FEW_LANDMARKS
         return Row(matches, count, Pose(verdict, 0, 0.0))
-    depth_m, share = own.depth_m[mine[usable]], own.points[mine[usable]] / [own.width, own.height]
-    noise = settings.landmarks
-    matched = verify_metric.observe(landmarks, found[usable], rays[usable], depth_m, camera, noise)
-    pose = verify_metric.solve(matched, share, camera, landmarks.from_depth, noise.pixel_sigma, metric, start)
+    query, noise = own.rows(mine[usable]), settings.landmarks
+    pose = verify_metric.solve(landmarks, found[usable], query, rays[usable], camera, noise, metric, start)
     if pose.verdict is not Verdict.ACCEPTED:
         return Row(matches, count, pose)
     scale = ("stereo" if stereo else "depth") if landmarks.from_depth else "odometry"

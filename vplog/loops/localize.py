@@ -4,7 +4,7 @@ that agree."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -92,14 +92,9 @@ class _Query:
     def solve(self, landmarks: Landmarks, rows: Ints, mine: Ints, start: Floats | None = None) -> Pose:
         """The pose by landmarks `rows` (K,) that features `mine` (K,) match. A place's width limits closures, whose
         errors grow with the distance; a picture has what is nearest, and its covariance."""
-        own, settings = self.features.rows(mine), self.settings
-        noise = settings.landmarks
-        metric = settings.metric.model_copy(update={"max_distance_m": np.inf})
-        share = own.points / [own.width, own.height]
-        matches = verify_metric.observe(landmarks, rows, self.rays[mine], own.depth_m, self.camera, noise)
-        return verify_metric.solve(
-            matches, share, self.camera, landmarks.from_depth, noise.pixel_sigma, metric, start
-        )  # fmt: skip
+        metric = self.settings.metric.model_copy(update={"max_distance_m": np.inf})
+        own, noise = self.features.rows(mine), self.settings.landmarks
+        return verify_metric.solve(landmarks, rows, own, self.rays[mine], self.camera, noise, metric, start)
 
 
 def landmarks_from(features: Features, sigma: Floats, camera: Camera, pixel_sigma: float, measured: bool) -> Landmarks:
@@ -126,11 +121,8 @@ def localize(
     query = _Query(features, undistort.rays(camera, features.points), camera, settings)
     fits = _verified(query, places)
     best = max(fits, key=lambda fit: (_PROGRESS.index(fit.pose.verdict), fit.pose.inliers, len(fit.mine)))
-    found = Localization(best.pose.verdict, best.place, len(best.mine), best.pose.inliers)
-    if best.world_from_camera is None:
-        return found
-    if any(_is_rival(fit, best, places, settings) for fit in fits):
-        return replace(found, verdict=Verdict.INCONSISTENT)
+    if any(_is_rival(fit, best, settings) for fit in fits):
+        return Localization(Verdict.INCONSISTENT, best.place, len(best.mine), best.pose.inliers)
     return _refined(query, fits, best, places)
 
 
@@ -140,7 +132,7 @@ def _verified(query: _Query, places: Sequence[KeyframeLandmarks]) -> list[_Fit]:
     matched = [_matched(query, place) for place in places]
     fits, world_from_camera = list[_Fit](), None
     for number in sorted(range(len(places)), key=lambda number: -len(matched[number][0])):
-        fits.append(_fitted(query, number, places[number], matched[number], world_from_camera))
+        fits.append(_fitted(query, number, places[number], *matched[number], world_from_camera))
         if world_from_camera is None:
             world_from_camera = fits[-1].world_from_camera
     return sorted(fits, key=lambda fit: fit.place)
@@ -153,11 +145,8 @@ def _matched(query: _Query, place: KeyframeLandmarks) -> tuple[Ints, Ints]:
     return mine[usable], rows[usable]
 
 
-def _fitted(
-    query: _Query, number: int, place: KeyframeLandmarks, matched: tuple[Ints, Ints], start: Floats | None
-) -> _Fit:
+def _fitted(query: _Query, number: int, place: KeyframeLandmarks, mine: Ints, rows: Ints, start: Floats | None) -> _Fit:
     """The picture's pose by its matches with one place; `start` is world_from_camera (4, 4) to try first."""
-    mine, rows = matched
     if len(mine) < query.settings.metric.min_inliers:
         few = Verdict.TOO_FEW_MATCHES if place.landmarks.known.any() else Verdict.TOO_FEW_LANDMARKS
         return _Fit(number, mine, rows, Pose(few, 0, 0.0))
@@ -167,7 +156,7 @@ def _fitted(
     return _Fit(number, mine, rows, pose, None if found is None else place.world_from_camera @ found)
 
 
-def _is_rival(fit: _Fit, best: _Fit, places: Sequence[KeyframeLandmarks], settings: VerifySettings) -> bool:
+def _is_rival(fit: _Fit, best: _Fit, settings: VerifySettings) -> bool:
     """Whether a pose elsewhere has as many inliers as the best, but for the noise of their count.
 
     Elsewhere is further off than views of one place can be: in a map that still errs, places around a picture give
@@ -176,16 +165,17 @@ def _is_rival(fit: _Fit, best: _Fit, places: Sequence[KeyframeLandmarks], settin
     if fit.world_from_camera is None or best.world_from_camera is None:
         return False
     apart = np.linalg.norm(fit.world_from_camera[:3, 3] - best.world_from_camera[:3, 3])
-    if apart < settings.metric.max_distance_m:
-        return False
-    return fit.pose.inliers > best.pose.inliers - _RIVAL_SIGMA * np.sqrt(best.pose.inliers)
+    alike = fit.pose.inliers > best.pose.inliers - _RIVAL_SIGMA * np.sqrt(best.pose.inliers)
+    return bool(apart >= settings.metric.max_distance_m and alike)
 
 
 def _refined(query: _Query, fits: Sequence[_Fit], best: _Fit, places: Sequence[KeyframeLandmarks]) -> Localization:
-    """The best fit, improved by the landmarks of all places that agree with it."""
-    start, anchor = best.pose.match_from_query, places[best.place].world_from_camera
-    if start is None:
-        raise ValueError("only a pose is refined")
+    """The best fit, improved by the landmarks of all places that agree with it, where it has a pose."""
+    start, own = best.pose.match_from_query, best.pose.covariance
+    pose, used, matches = best.pose, 1, len(best.mine)
+    if start is None or own is None:
+        return Localization(pose.verdict, best.place, matches, pose.inliers)
+    anchor = places[best.place].world_from_camera
     agreeing = [_agreeing(query, fit, places[fit.place], anchor, start) for fit in fits if len(fit.mine)]
     points, covariance, mine = map(np.concatenate, zip(*agreeing, strict=True))
     # a feature counts once, by the landmark whose depth is surest: its pixel has one error, however many match it
@@ -195,15 +185,12 @@ def _refined(query: _Query, fits: Sequence[_Fit], best: _Fit, places: Sequence[K
         points[chosen, 2], points[chosen, :2], covariance[chosen], np.ones(len(chosen), bool), len(chosen),
         places[best.place].landmarks.from_depth,
     )  # fmt: skip
-    pose = query.solve(merged, np.arange(len(chosen)), mine[chosen], start)
-    used = sum(len(rows) > 0 for _, _, rows in agreeing)
-    if pose.match_from_query is None or pose.covariance is None or pose.inliers < best.pose.inliers:
-        pose, used = best.pose, 1  # other places drew it away
-    found, own = pose.match_from_query, pose.covariance
-    if found is None or own is None:
-        raise ValueError("only a pose is refined")
-    own = own + motion_covariance(found, query.settings.calibration.least_share)
-    return Localization(Verdict.ACCEPTED, best.place, len(best.mine), pose.inliers, used, anchor @ found, own)
+    refined = query.solve(merged, np.arange(len(chosen)), mine[chosen], start)
+    if refined.match_from_query is not None and refined.covariance is not None and refined.inliers >= pose.inliers:
+        pose, start, own = refined, refined.match_from_query, refined.covariance
+        used = sum(len(rows) > 0 for _, _, rows in agreeing)  # else other places drew it away
+    own = own + motion_covariance(start, query.settings.calibration.least_share)
+    return Localization(Verdict.ACCEPTED, best.place, matches, pose.inliers, used, anchor @ start, own)
 
 
 def _agreeing(query: _Query, fit: _Fit, place: KeyframeLandmarks, anchor: Floats, pose: Floats) -> _Agreeing:

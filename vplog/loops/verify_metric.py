@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from vplog.data import Bools, Camera, Float32s, Floats, Ints, Verdict
+from vplog.data import Bools, Camera, Features, Float32s, Floats, Ints, Verdict
 from vplog.geometry import se3
 from vplog.loops import pose_refinement, undistort
 from vplog.loops.landmarks import inverse_depth
@@ -98,21 +98,22 @@ def observe(
 
 
 def solve(
-    matches: Matches,
-    image_share: Floats,
+    landmarks: Landmarks,
+    rows: Ints,
+    query: Features,
+    rays: Floats,
     camera: Camera,
-    from_depth: bool,
-    pixel_sigma: float,
+    noise: LandmarkSettings,
     settings: MetricSettings,
     start: Floats | None = None,
 ) -> Pose:
-    """The pose of the query's camera in the match's camera.
+    """The pose of the query's camera in the match's camera, by its known landmarks `rows` (K,) that the `query`'s
+    features (K,) match, whose rays are (K, 2).
 
-    `image_share` (K, 2) are the query's pixels as shares of its size, `pixel_sigma` is their noise; `from_depth`, the
-    landmarks have their scale of a sensor. The pose `start`, where given and enough matches agree with it, is improved
-    instead of sampling one.
+    The pose `start`, where given and enough matches agree with it, is improved instead of sampling one.
     """
-    focal_px, area_px = undistort.focal_px(camera), float(camera.width * camera.height)
+    focal_px, area_px, pixel_sigma = undistort.focal_px(camera), float(camera.width * camera.height), noise.pixel_sigma
+    matches = observe(landmarks, rows, rays, query.depth_m, camera, noise)
     points, cloud = matches.points, matches.cloud
     # as long in rays as for most matches: what is nearer to the centre of a wide view is sorted out next
     near = settings.ransac_px / pixel_sigma * float(np.median(np.linalg.det(matches.noise))) ** 0.25
@@ -134,7 +135,7 @@ def solve(
         or alarms > settings.log10_false_alarms
     ):
         return Pose(Verdict.TOO_FEW_INLIERS, count, 0.0)
-    spread = float(np.prod(np.ptp(image_share[inlier], axis=0)))
+    spread = float(np.prod(np.ptp(query.points[inlier] / [query.width, query.height], axis=0)))
     if spread < settings.min_spread:
         return Pose(Verdict.POOR_SPREAD, count, spread)
     depth_m = float(np.median(1.0 / points[inlier, 2]))
@@ -149,7 +150,7 @@ def solve(
     shared = settings.systematic_px / focal_px
     pose_covariance[:3, :3] += shared**2 * np.eye(3)
     pose_covariance[3:, 3:] += (shared * depth_m) ** 2 * np.eye(3)
-    if not from_depth:  # a wrong scale of the landmarks stretches the translation alone, along itself
+    if not landmarks.from_depth:  # a wrong scale of the landmarks stretches the translation alone, along itself
         along = match_from_query[:3, :3].T @ moved * settings.scale_share
         pose_covariance[3:, 3:] += np.outer(along, along)
     return Pose(Verdict.ACCEPTED, count, spread, match_from_query, pose_covariance)

@@ -14,12 +14,12 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field, model_validator
 
-from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences, Uint16s
+from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences
 from vplog.errors import LibraryError
 from vplog.places import expected_votes
 from vplog.places.code_search import BLOCK, CodeIndex, CodeLists, Place, build_lists
-from vplog.places.columns import from_column, to_column
-from vplog.places.library_files import ReferencesState, RelearnedSettings
+from vplog.places.columns import RecordState, from_column
+from vplog.places.library_files import RelearnedSettings
 from vplog.places.matches import Matcher, Matches, Once, WeighedMatchSettings, index_references
 from vplog.places.overlap import list_shared
 
@@ -145,13 +145,15 @@ def _rarity(explained: Floats, power: float) -> Floats:
     return 1.0 / np.maximum(part, 0.05) ** power
 
 
-class BobbState(ReferencesState):
+class BobbState(RecordState):
     """A library, indexed when it first describes. Safe to share between threads."""
+
+    record, none = Place, NOBODY
 
     def __init__(self, settings: BobbSettings, matcher: Matcher, rarity: Once[Floats]) -> None:
         """`rarity` is the weight (L,) of each reference."""
-        s = self.settings = settings
-        self.matcher, self.references, self.rarity = matcher, matcher.references, rarity
+        super().__init__(settings, matcher.references)
+        s, self.matcher, self.rarity = settings, matcher, rarity
         self._windows = expected_votes.even_windows(s.windows_along, s.window_share)
         self._along_x = expected_votes.box_sums(s.columns, s.patches_x, s.box_columns)
         self._along_y = expected_votes.box_sums(s.rows, s.patches_y, s.box_rows)
@@ -162,15 +164,13 @@ class BobbState(ReferencesState):
         return 8 * self.settings.references * (2 + 1 + self.settings.boxes)
 
     @property
-    def arrow_type(self) -> pa.StructType:
-        s = self.settings
-        return pa.struct(
-            {
-                "references": pa.list_(pa.uint16(), s.references),
-                "weights": pa.list_(pa.uint8(), s.references),
-                "boxes": pa.list_(pa.uint8(), s.references * s.boxes),
-            }
-        )
+    def layout(self) -> dict[str, tuple[pa.DataType, tuple[int, ...]]]:
+        J, windows = self.settings.references, self.settings.boxes
+        return {
+            "references": (pa.uint16(), (J,)),
+            "weights": (pa.uint8(), (J,)),
+            "boxes": (pa.uint8(), (J, windows)),
+        }
 
     def describe(self, features: Features) -> Place:
         """Algorithm 1: the references that explain the features, and a box for each window on each of them."""
@@ -286,30 +286,10 @@ class BobbState(ReferencesState):
 
         return list_shared(np.where(references == NOBODY, -1, references.astype(np.int64)), query, match, compare)
 
-    def arrays(self, places: Sequence[Place]) -> tuple[Uint16s, Bytes, Bytes]:
-        """(N, J) references and weights, (N, J, I) boxes."""
-        shape = -1, self.settings.references
-        return (
-            np.array([place.references for place in places], np.uint16).reshape(shape),
-            np.array([place.weights for place in places], np.uint8).reshape(shape),
-            np.array([place.boxes for place in places], np.uint8).reshape(*shape, self.settings.boxes),
-        )
-
-    def to_arrow(self, descriptors: Sequence[Place]) -> pa.Array:
-        return to_column(self.arrow_type, iter(self.arrays(descriptors)))
-
-    def from_arrow(self, column: pa.Array) -> list[Place]:
-        return list(map(Place, *self.checked(from_column(column, self.arrow_type))))
-
-    def checked(self, values: Sequence[Any]) -> tuple[Uint16s, Bytes, Bytes]:
-        """(N, J) references and weights, (N, J, I) boxes of a column's values. Raises LibraryError where this library
-        has no such reference or box."""
-        references, weights, boxes = values
-        if np.any((references >= len(self.matcher)) & (references != NOBODY)):
-            raise LibraryError(
-                "The descriptors name references that this library lacks; compute them again with `vplog run`."
-            )
+    def checked(self, fields: Sequence[Any]) -> list[Any]:
+        """Raises LibraryError where there is no such box, too."""
+        references, weights, boxes = super().checked(fields)
         positions = np.prod(self.settings.positions)
         if np.any((boxes >= positions) & (boxes != NOWHERE)):
             raise LibraryError(f"The descriptors name boxes beyond the {positions} that this recogniser knows.")
-        return references, weights, boxes.reshape(*references.shape, self.settings.boxes)
+        return [references, weights, boxes]

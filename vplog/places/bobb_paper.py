@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numba
 import numpy as np
 import pyarrow as pa
 from pydantic import Field, PositiveFloat, model_validator
 
-from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences
+from vplog.data import Boxes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences
 from vplog.errors import LibraryError
 from vplog.places import library as lib
 from vplog.places import rvp
-from vplog.places.columns import from_column, to_column
-from vplog.places.library_files import ReferencesState, RelearnedSettings
+from vplog.places.columns import RecordState
+from vplog.places.library_files import RelearnedSettings
 from vplog.places.overlap import BoxIndex, BoxPlace, list_shared
 
 if TYPE_CHECKING:
@@ -102,12 +102,14 @@ def _prepare(library: lib.Library, row: int, settings: PaperBobbSettings) -> rvp
     )
 
 
-class PaperBobbState(ReferencesState):
+class PaperBobbState(RecordState):
     """A library, indexed and partitioned. Shared freely between threads."""
 
+    record, none = BoxPlace, -1
+
     def __init__(self, settings: PaperBobbSettings, library: lib.Library, patterns: list[rvp.Pattern]) -> None:
-        s = self.settings = settings
-        self.library, self.references, self.patterns = library, library.references, patterns
+        super().__init__(settings, library.references)
+        s, self.library, self.patterns = settings, library, patterns
         # Alg. 1 line 4 draws windows at random; one draw serves all images, so that no image's noise can change it
         corners = np.random.default_rng([s.seed, 0]).uniform(0.0, 1.0 - s.window_share, (s.references, s.boxes, 2))
         self._windows = np.concatenate([corners, corners + s.window_share], axis=-1)
@@ -121,13 +123,9 @@ class PaperBobbState(ReferencesState):
         return math.ceil(math.log2(math.comb(len(self.library), s.references))) + s.references * s.boxes * per_box
 
     @property
-    def arrow_type(self) -> pa.StructType:
-        s = self.settings
-        lists = {
-            "references": pa.list_(pa.int32(), s.references),
-            "boxes": pa.list_(pa.uint8(), s.references * s.boxes * 4),
-        }
-        return pa.struct(lists)
+    def layout(self) -> dict[str, tuple[pa.DataType, tuple[int, ...]]]:
+        J, windows = self.settings.references, self.settings.boxes
+        return {"references": (pa.int32(), (J,)), "boxes": (pa.uint8(), (J, windows, 4))}
 
     def describe(self, features: Features) -> BoxPlace:
         """Algorithm 1: the references that explain the features, and a box for each window on each of them."""
@@ -179,18 +177,11 @@ class PaperBobbState(ReferencesState):
         return votes / max(float(votes.max()), 1e-12)
 
     def index(self, descriptors: Sequence[BoxPlace]) -> BoxIndex:
-        return BoxIndex(*self._arrays(descriptors), len(self.library), self.settings.grid)
-
-    def _arrays(self, places: Sequence[BoxPlace]) -> tuple[Int32s, Bytes]:
-        s = self.settings
-        return (
-            np.array([place.references for place in places], np.int32).reshape(-1, s.references),
-            np.array([place.boxes for place in places], np.uint8).reshape(-1, s.references, s.boxes, 4),
-        )
+        return BoxIndex(*self.arrays(descriptors), len(self.library), self.settings.grid)
 
     def shared(self, places: Sequence[BoxPlace], query: Int32s, match: Int32s) -> SharedReferences:
         """The parts of Eq. (1) of pairs (C,) of rows of `places`, by reference; equal boxes overlap by 1."""
-        references, boxes = (part.astype(np.int64) for part in self._arrays(places))
+        references, boxes = (part.astype(np.int64) for part in self.arrays(places))
 
         def compare(rows: Ints, ranks: Ints, others: Ints, other_ranks: Ints) -> tuple[Floats, Floats]:
             mine, theirs = boxes[rows, ranks][:, :, None], boxes[others, other_ranks][:, None]
@@ -201,19 +192,13 @@ class PaperBobbState(ReferencesState):
 
         return list_shared(references, query, match, compare)
 
-    def to_arrow(self, descriptors: Sequence[BoxPlace]) -> pa.Array:
-        return to_column(self.arrow_type, iter(self._arrays(descriptors)))
-
-    def from_arrow(self, column: pa.Array) -> list[BoxPlace]:
-        s = self.settings
-        references, boxes = from_column(column, self.arrow_type)
-        if len(references) and (references.max() >= len(self.library) or references.min() < -1):
-            raise LibraryError(
-                "The descriptors name references that this library lacks; compute them again with `vplog run`."
-            )
-        if len(boxes) and boxes.max() > s.grid:
-            raise LibraryError(f"The descriptors have boxes beyond the grid of {s.grid} x {s.grid} cells.")
-        return list(map(BoxPlace, references, boxes.reshape(-1, s.references, s.boxes, 4)))
+    def checked(self, fields: Sequence[Any]) -> list[Any]:
+        """Raises LibraryError where a box is beyond the grid, too."""
+        references, boxes = super().checked(fields)
+        grid = self.settings.grid
+        if len(boxes) and boxes.max() > grid:
+            raise LibraryError(f"The descriptors have boxes beyond the grid of {grid} x {grid} cells.")
+        return [references, boxes]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -16,9 +16,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pydantic import Field
 
-from vplog.data import Bytes, Features, Float32s, Ranking, Reference
+from vplog.data import Features, Float32s, Ranking, Reference
 from vplog.errors import LibraryError
-from vplog.places.columns import check_type, check_values, list_slices, to_lists
+from vplog.places.columns import from_lists, to_lists
 from vplog.places.dense import best_rows
 from vplog.places.library_files import ReferencesState, RelearnedSettings, keep_references
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary, postings
@@ -30,13 +30,9 @@ _WORD_BYTES, _PLACE_BYTES = 3, 4
 """In a table: a word's number in two bytes and its count in one; where a place's list begins in four."""
 _MAX_COUNT = 255
 """Largest count of a byte; a word that occurs more often in one image is no better known for it."""
-_PLACE = pa.list_(
-    pa.field(
-        "item",
-        pa.struct([pa.field("word", pa.uint16(), nullable=False), pa.field("count", pa.uint8(), nullable=False)]),
-        nullable=False,
-    )
-)
+_WORD = np.dtype([("word", np.uint16), ("count", np.uint8)])
+_FIELDS = [pa.field(name, pa.from_numpy_dtype(_WORD[name]), nullable=False) for name in ("word", "count")]
+_PLACE = pa.list_(pa.field("item", pa.struct(_FIELDS), nullable=False))
 
 
 class BovfSettings(RelearnedSettings):
@@ -74,16 +70,6 @@ class BovfSettings(RelearnedSettings):
 
 
 @dataclass(frozen=True, eq=False)
-class WordCounts:
-    """The descriptor: words of one image."""
-
-    words: NDArray[np.uint16]
-    """(K,) increasing."""
-    counts: Bytes
-    """(K,) how often each occurs, at most 255."""
-
-
-@dataclass(frozen=True, eq=False)
 class BovfState(ReferencesState):
     """A vocabulary with the weight of each word. Shared freely between threads."""
 
@@ -105,69 +91,60 @@ class BovfState(ReferencesState):
         """Size of the largest place: as many words as there may be. Images with fewer features take less."""
         return 8 * (_PLACE_BYTES + _WORD_BYTES * self._most_words)
 
-    def describe(self, features: Features) -> WordCounts:
-        """Words and their counts; words that all references have weigh nothing and are left out."""
+    def describe(self, features: Features) -> NDArray:
+        """(K,) words, increasing, with their counts; words that all references have weigh nothing and are left out."""
         found = self.vocabulary.quantise(features.descriptors[: self.settings.features])
         words, counts = np.unique(found, return_counts=True)
-        counts = np.minimum(counts, _MAX_COUNT).astype(np.uint8)
-        weight = _tf_idf(words, counts, self)
+        place = np.empty(len(words), _WORD)
+        place["word"], place["count"] = words, np.minimum(counts, _MAX_COUNT)
+        weight = _tf_idf(place, self)
         best = np.lexsort((words, -weight))[: self._most_words]
-        best = np.sort(best[weight[best] > 0])
-        return WordCounts(words[best].astype(np.uint16), counts[best])
+        return place[np.sort(best[weight[best] > 0])]
 
-    def index(self, descriptors: Sequence[WordCounts]) -> WordIndex:
+    def index(self, descriptors: Sequence[NDArray]) -> WordIndex:
         return WordIndex(descriptors, self)
 
-    def to_arrow(self, descriptors: Sequence[WordCounts]) -> pa.Array:
-        words = np.concatenate([np.zeros(0, np.uint16), *(place.words for place in descriptors)])
-        counts = np.concatenate([np.zeros(0, np.uint8), *(place.counts for place in descriptors)])
-        items = pa.StructArray.from_arrays([pa.array(words), pa.array(counts)], fields=list(_PLACE.value_type))
-        return to_lists(items, [len(place.words) for place in descriptors], _PLACE)
+    def to_arrow(self, descriptors: Sequence[NDArray]) -> pa.Array:
+        return to_lists(descriptors, _PLACE)
 
-    def from_arrow(self, column: pa.Array) -> list[WordCounts]:
-        check_type(column, _PLACE)
-        items = column.flatten()
-        parts = items.field("word"), items.field("count")
-        check_values(column, items, *parts)
-        words, counts = (part.to_numpy() for part in parts)
-        places = list_slices(column, words, len(self.vocabulary))
-        if not np.all(counts):
+    def from_arrow(self, column: pa.Array) -> list[NDArray]:
+        places = from_lists(column, _PLACE, len(self.vocabulary))
+        if not column.flatten().field("count").to_numpy().all():
             raise LibraryError("The descriptors name a word zero times; compute them again with `vplog run`.")
-        return [WordCounts(words[place], counts[place]) for place in places]
+        return places
 
 
 class WordIndex:
     """Inverted file: for each word, the places that have it with their weight. Rows are in the order given."""
 
-    def __init__(self, places: Sequence[WordCounts], state: BovfState) -> None:
+    def __init__(self, places: Sequence[NDArray], state: BovfState) -> None:
         self._count, self._state = len(places), state
-        self._list_start, self._list_place, order = postings([place.words for place in places], len(state.idf))
-        self._list_weight = np.concatenate([np.zeros(0, np.float32), *(_weights(place, state) for place in places)])[
-            order
-        ]
+        self._list_start, self._list_place, order = postings([place["word"] for place in places], len(state.idf))
+        weights = [np.zeros(0, np.float32), *(_weights(place, state) for place in places)]
+        self._list_weight = np.concatenate(weights)[order]
 
     def __len__(self) -> int:
         return self._count
 
-    def scores(self, descriptor: WordCounts, stop: int | None = None) -> Float32s:
+    def scores(self, descriptor: NDArray, stop: int | None = None) -> Float32s:
         """(stop,) cosine of the tf-idf vectors of the query and each place, 0 where they share no word."""
         stop = self._count if stop is None else min(stop, self._count)
         lists = self._list_start, self._list_place, self._list_weight
-        return _products(descriptor.words, _weights(descriptor, self._state), *lists, stop)
+        return _products(descriptor["word"].copy(), _weights(descriptor, self._state), *lists, stop)
 
-    def query(self, descriptor: WordCounts, k: int, stop: int | None = None) -> Ranking:
+    def query(self, descriptor: NDArray, k: int, stop: int | None = None) -> Ranking:
         return best_rows(self.scores(descriptor, stop), k)
 
 
-def _tf_idf(words: NDArray, counts: Bytes, state: BovfState) -> Float32s:
+def _tf_idf(place: NDArray, state: BovfState) -> Float32s:
     """(K,) section 4.1. The paper's tf divides by the number of features, which the cosine cancels."""
-    counted = counts.astype(np.float32)
-    return (np.sqrt(counted) if state.settings.damp_bursts else counted) * state.idf[words]
+    counted = place["count"].astype(np.float32)
+    return (np.sqrt(counted) if state.settings.damp_bursts else counted) * state.idf[place["word"]]
 
 
-def _weights(place: WordCounts, state: BovfState) -> Float32s:
+def _weights(place: NDArray, state: BovfState) -> Float32s:
     """(K,) tf-idf of unit length."""
-    weights = _tf_idf(place.words, place.counts, state)
+    weights = _tf_idf(place, state)
     return weights / max(np.sqrt(np.square(weights).sum()), np.float32(1e-9))
 
 

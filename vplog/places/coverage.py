@@ -111,12 +111,9 @@ def explanations(descriptors: Sequence[Bytes], candidates: Ints, execution: Exec
         if len(found) == 0:
             return np.zeros(0, np.int64), np.zeros(0, np.float32)
         near = index.search(found.astype(np.float32), _NEIGHBOURS)[1]
-        same = (l1_distance(found, pool, near) < _MAX_L1) & (near >= 0)
-        of = np.where(same, owners[near], -1)
-        of[of == number[row]] = -1
-        of.sort(axis=1)
-        first = np.concatenate([np.ones((len(of), 1), bool), of[:, 1:] != of[:, :-1]], axis=1)  # once a feature
-        candidate, count = np.unique(of[first & (of >= 0)], return_counts=True)
+        same = (l1_distance(found, pool, near) < _MAX_L1) & (near >= 0) & (owners[near] != number[row])
+        once = np.unique(np.nonzero(same)[0] * len(candidates) + owners[near[same]])  # a feature counts once
+        candidate, count = np.unique(once % len(candidates), return_counts=True)
         return candidate, (count / len(found)).astype(np.float32)
 
     candidate, share = zip(*execution.map(explained_by, range(len(descriptors))), strict=True)
@@ -130,8 +127,18 @@ def greedy_cover(found: csr_array, size: int) -> Ints:
     Maximises the sum over the frames of the worth of their best reference, see `_worth`. Ties go to the first.
     """
     worth = _worth(found)
-    by_frame, by_candidate = ((one.indptr, one.indices, one.data) for one in (worth, worth.tocsc()))
-    return _greedy(by_frame, by_candidate, size)
+    columns, best, chosen = worth.tocsc(), np.zeros(worth.shape[0]), list[int]()
+    gain = np.bincount(worth.indices, worth.data, worth.shape[1])
+    while len(chosen) < size and gain[c := int(np.argmax(gain))] > 1e-9:  # what is left is rounding
+        part = slice(columns.indptr[c], columns.indptr[c + 1])
+        better = columns.data[part] > best[columns.indices[part]]
+        frames, now = columns.indices[part][better], columns.data[part][better]
+        others = worth[frames].tocoo()  # what they add to these frames is less now
+        less = np.maximum(others.data - best[frames][others.row], 0.0) - np.maximum(others.data - now[others.row], 0.0)
+        np.subtract.at(gain, others.col, less)
+        best[frames], gain[c] = now, -1.0
+        chosen.append(c)
+    return np.array(chosen, np.int64)
 
 
 def _worth(found: csr_array) -> csr_array:
@@ -145,31 +152,6 @@ def _worth(found: csr_array) -> csr_array:
     np.maximum.at(best, frame, found.data)
     worth = np.minimum(found.data / (_ENOUGH * best[frame]), 1.0)
     return csr_array((worth, found.indices, found.indptr), shape=found.shape)
-
-
-@numba.njit(cache=True, nogil=True)
-def _greedy(by_frame, by_candidate, size):
-    """Both orders of one sparse matrix, as start, index and value."""
-    start, candidate, worth = by_frame
-    by_start, frame, by_worth = by_candidate
-    F, C = start.shape[0] - 1, by_start.shape[0] - 1
-    best, gain = np.zeros(F), np.zeros(C)
-    for c in range(C):
-        gain[c] = by_worth[by_start[c] : by_start[c + 1]].sum()
-    chosen = np.empty(size, np.int64)
-    for n in range(size):
-        c = np.argmax(gain)
-        if gain[c] <= 1e-9:  # what is left is rounding
-            return chosen[:n]
-        chosen[n] = c
-        for e in range(by_start[c], by_start[c + 1]):
-            f = frame[e]
-            if by_worth[e] > best[f]:
-                for other in range(start[f], start[f + 1]):  # what others add to this frame is less now
-                    gain[candidate[other]] -= max(worth[other] - best[f], 0.0) - max(worth[other] - by_worth[e], 0.0)
-                best[f] = by_worth[e]
-        gain[c] = -1.0
-    return chosen
 
 
 def _needed_count(found: csr_array, chosen: Ints, least_gain: float) -> int:

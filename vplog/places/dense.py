@@ -59,37 +59,6 @@ def thumbnail_of(features: Features) -> Bytes:
     return features.thumbnail
 
 
-class VectorState(ReferencesState):
-    """A state whose places are vectors of one length."""
-
-    arrow_type: Any
-    """A fixed-size list of numbers."""
-
-    @property
-    def bits(self) -> int:
-        return self.arrow_type.list_size * self.arrow_type.value_type.bit_width
-
-    def matrix(self, descriptors: Sequence[NDArray], dtype: Any) -> NDArray:
-        """(N, D) places, one a row."""
-        return np.array(descriptors, dtype).reshape(-1, self.arrow_type.list_size)
-
-    def index(self, descriptors: Sequence[NDArray]) -> VectorIndex:
-        """By the cosine of unit vectors."""
-        return VectorIndex(self.matrix(descriptors, np.float32), products)
-
-    def to_arrow(self, descriptors: Sequence[NDArray]) -> pa.Array:
-        dtype = self.arrow_type.value_type.to_pandas_dtype()
-        return to_column(self.arrow_type, iter([self.matrix(descriptors, dtype)]))
-
-    def from_arrow(self, column: pa.Array) -> list[Any]:
-        return list(*from_column(column, self.arrow_type))
-
-
-def unit(vector: Float32s) -> Float32s:
-    """The vector at unit length; zeros where it has none."""
-    return vector / np.maximum(np.linalg.norm(vector), np.float32(1e-9))
-
-
 # no BLAS: its threads would compete with ours. Between halves, multiples of 2^-24, float64 sums are exact in any order
 @numba.njit(cache=True, nogil=True, fastmath={"reassoc"})
 def products(vectors, query):
@@ -114,3 +83,37 @@ def nearness(vectors, query):
             total += difference * difference
         result[row] = 1 / (1 + np.sqrt(total))
     return result
+
+
+class VectorState(ReferencesState):
+    """A state whose places are vectors of one length."""
+
+    arrow_type: Any
+    """A fixed-size list of numbers."""
+    similarity: Callable[[NDArray, NDArray], Float32s] = staticmethod(products)
+    """See `VectorIndex`; of unit vectors, the cosine."""
+    compared: Any = np.float32
+    """Type of the numbers that are compared."""
+
+    @property
+    def bits(self) -> int:
+        return self.arrow_type.list_size * self.arrow_type.value_type.bit_width
+
+    def matrix(self, descriptors: Sequence[NDArray], dtype: Any) -> NDArray:
+        """(N, D) places, one a row."""
+        return np.array(descriptors, dtype).reshape(-1, self.arrow_type.list_size)
+
+    def index(self, descriptors: Sequence[NDArray]) -> VectorIndex:
+        return VectorIndex(self.matrix(descriptors, self.compared), self.similarity)
+
+    def to_arrow(self, descriptors: Sequence[NDArray]) -> pa.Array:
+        dtype = self.arrow_type.value_type.to_pandas_dtype()
+        return to_column(self.arrow_type, iter([self.matrix(descriptors, dtype)]))
+
+    def from_arrow(self, column: pa.Array) -> list[Any]:
+        return list(*from_column(column, self.arrow_type))
+
+
+def unit(vector: Float32s) -> Float32s:
+    """The vector at unit length; zeros where it has none."""
+    return vector / np.maximum(np.linalg.norm(vector), np.float32(1e-9))

@@ -21,7 +21,7 @@ from pydantic import Field, model_validator
 
 from vplog.data import Bools, Features, Float32s, Floats, Ranking, Reference
 from vplog.errors import LibraryError
-from vplog.places.columns import check_type, check_values, list_slices, to_lists
+from vplog.places.columns import from_lists, to_lists
 from vplog.places.dense import ranked
 from vplog.places.fabmap_model import (
     Evidence,
@@ -137,14 +137,10 @@ class FabmapState(ReferencesState):
         return FabmapPart(self, descriptors)
 
     def to_arrow(self, descriptors: Sequence[Words]) -> pa.Array:
-        words = np.concatenate([np.zeros(0, np.uint16), *descriptors]).astype(np.uint16)
-        return to_lists(pa.array(words), [len(place) for place in descriptors], _PLACE)
+        return to_lists(descriptors, _PLACE)
 
     def from_arrow(self, column: pa.Array) -> list[Words]:
-        check_type(column, _PLACE)
-        check_values(column)
-        words = column.flatten().to_numpy()
-        return [words[place] for place in list_slices(column, words, len(self.vocabulary))]
+        return from_lists(column, _PLACE, len(self.vocabulary))
 
 
 class FabmapPart:

@@ -117,13 +117,13 @@ def _span(image_start, values, posting_start, postings, times_log):
     return parent, both
 
 
-def log_likelihood_table(tree: ChowLiuTree, seen_if_there: float, seen_if_absent: float) -> Floats:
+def log_likelihood_table(tree: ChowLiuTree, p_z_given_e: float, p_z_given_not_e: float) -> Floats:
     """(V, 3, 2, 2) ln p(z_q | z_p, L): by the state of q at L (absent, present, average), then z_p, then z_q.
 
     The word may or may not exist at the place (2008, section on the observation likelihood):
     p(z_q | z_p, L) = sum over e_q of p(z_q | e_q, z_p) p(e_q | L).
     """
-    detector = np.array([[1 - seen_if_absent, seen_if_absent], [1 - seen_if_there, seen_if_there]])  # [e, z]
+    detector = np.array([[1 - p_z_given_not_e, p_z_given_not_e], [1 - p_z_given_e, p_z_given_e]])  # p(z | e) by e, z
     marginal = np.stack([1 - tree.present, tree.present], axis=1)  # (V, z)
     given_parent = np.stack([1 - tree.present_given_parent, tree.present_given_parent], axis=2)  # (V, z_p, z)
     # p(z_q | e_q, z_p) is proportional to p(z_q | e_q) p(z_q | z_p) / p(z_q): detection does not depend on z_p.

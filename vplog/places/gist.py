@@ -5,7 +5,7 @@ The energy of a bank of Gabor filters over the prefiltered image, averaged over 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from vplog.data import THUMBNAIL_SIDE, Bytes, Features, Float32s, Reference
-from vplog.places.dense import VectorIndex, VectorState, nearness, thumbnail_of
+from vplog.places.dense import VectorState, nearness, thumbnail_of
 from vplog.places.library_files import RelearnedSettings, keep_references
 
 if TYPE_CHECKING:
@@ -50,9 +50,11 @@ class GistSettings(RelearnedSettings):
 class GistState(VectorState):
     """The filters. Shared freely between threads."""
 
+    similarity = staticmethod(nearness)
+
     def __init__(self, settings: GistSettings, references: list[Reference]) -> None:
-        s = self.settings = settings
-        self.references = references
+        super().__init__(settings, references)
+        s = settings
         self.arrow_type = pa.list_(pa.float16(), s.scales * s.orientations * s.blocks**2)
         self._low_pass = _low_pass(THUMBNAIL_SIDE + 2 * _PREFILTER_PAD)
         self._filters = gabor_filters(THUMBNAIL_SIDE + 2 * _PAD, s.scales, s.orientations)
@@ -80,9 +82,6 @@ class GistState(VectorState):
 
     def _blur(self, image: Float32s) -> Float32s:
         return np.fft.ifft2(np.fft.fft2(image) * self._low_pass).real.astype(np.float32)
-
-    def index(self, descriptors: Sequence[NDArray[np.float16]]) -> VectorIndex:
-        return VectorIndex(self.matrix(descriptors, np.float32), nearness)
 
 
 def _low_pass(side: int) -> Float32s:

@@ -8,7 +8,7 @@ representation, ACM MM 2013) of keypoints and patches, with the position in the 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numba
@@ -17,7 +17,7 @@ import pyarrow as pa
 from pydantic import Field
 from scipy.spatial.distance import cdist
 
-from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ints, Ranking, Reference, SharedReferences
+from vplog.data import Bytes, Features, Float32s, Floats, Ints, Ranking, Reference
 from vplog.places.bobb import BobbSettings, BobbState
 from vplog.places.code_search import CodeIndex, Place
 from vplog.places.columns import from_column, to_column
@@ -79,7 +79,7 @@ class HybridSettings(RelearnedSettings):
         state = HybridState(self, references, bobb, vlad, self.share)
         rows = spread_rows(len(references), _MOST_REFERENCES).tolist()
         places = list(execution.map(lambda row: state.describe(references[row].features), rows))
-        return replace(state, share=_balance(state.index(places), places, self.share))
+        return HybridState(self, references, bobb, vlad, _balance(state.index(places), places, self.share))
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,68 +191,52 @@ def _sum_residuals(values: Floats, centres: Floats, steps: int) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class HybridPlace:
-    """The descriptor."""
+class HybridPlace(Place):
+    """The descriptor: BoBB's boxes, and signs."""
 
-    boxes: Place
-    """BoBB's."""
     signs: Bytes
     """(W * B / 8,) of `BinaryVlad.signs`."""
 
 
-@dataclass(frozen=True, eq=False)
 class HybridState(ReferencesState):
     """A library, indexed, and its words. Shared freely between threads."""
 
-    settings: HybridSettings
-    references: list[Reference]
-    bobb: BobbState
-    vlad: BinaryVlad
-    share: float
-    """0..1: part of the words in a score."""
+    def __init__(
+        self, settings: HybridSettings, references: list[Reference], bobb: BobbState, vlad: BinaryVlad, share: float
+    ) -> None:
+        """`share`, 0..1, is the part of the words in a score."""
+        super().__init__(settings, references)
+        self.bobb, self.vlad, self.share = bobb, vlad, share
+        self.windows, self.boxes, self.voting_map, self.shared = bobb.windows, bobb.boxes, bobb.voting_map, bobb.shared
+        self._signs = settings.words * settings.bits // 8
 
     @property
     def bits(self) -> int:
         """Size of the boxes and the signs, as stored."""
-        return self.bobb.bits + self.settings.words * self.settings.bits
+        return self.bobb.bits + 8 * self._signs
 
     @property
     def arrow_type(self) -> pa.DataType:
-        signs = pa.list_(pa.uint8(), self.settings.words * self.settings.bits // 8)
-        return pa.struct([pa.field("boxes", self.bobb.arrow_type), pa.field("signs", signs)])
+        return pa.struct({"boxes": self.bobb.arrow_type, "signs": pa.list_(pa.uint8(), self._signs)})
 
     def describe(self, features: Features) -> HybridPlace:
         """Boxes and signs of the same features."""
-        return HybridPlace(self.bobb.describe(features), self.vlad.signs(*_features_of(features, self.settings)))
+        signs = self.vlad.signs(*_features_of(features, self.settings))
+        return HybridPlace(**vars(self.bobb.describe(features)), signs=signs)
 
-    def _signs(self, places: Sequence[HybridPlace]) -> Bytes:
+    def signs(self, places: Sequence[HybridPlace]) -> Bytes:
         """(N, W * B / 8)."""
-        length = self.settings.words * self.settings.bits // 8
-        return np.array([place.signs for place in places], np.uint8).reshape(-1, length)
+        return np.array([place.signs for place in places], np.uint8).reshape(-1, self._signs)
 
     def index(self, descriptors: Sequence[HybridPlace]) -> HybridIndex:
-        boxes = self.bobb.index([place.boxes for place in descriptors])
-        return HybridIndex(boxes, self._signs(descriptors), self.share)
-
-    def windows(self, rank: int) -> Floats:
-        return self.bobb.windows(rank)
-
-    def boxes(self, place: HybridPlace) -> Boxes:
-        return self.bobb.boxes(place.boxes)
-
-    def voting_map(self, features: Features, reference: int) -> Floats:
-        return self.bobb.voting_map(features, reference)
-
-    def shared(self, places: Sequence[HybridPlace], query: Int32s, match: Int32s) -> SharedReferences:
-        return self.bobb.shared([place.boxes for place in places], query, match)
+        return HybridIndex(self.bobb.index(descriptors), self.signs(descriptors), self.share)
 
     def to_arrow(self, descriptors: Sequence[HybridPlace]) -> pa.Array:
-        boxes = self.bobb.arrays([place.boxes for place in descriptors])
-        return to_column(self.arrow_type, iter((*boxes, self._signs(descriptors))))
+        return to_column(self.arrow_type, iter((*self.bobb.arrays(descriptors), self.signs(descriptors))))
 
     def from_arrow(self, column: pa.Array) -> list[HybridPlace]:
         *boxes, signs = from_column(column, self.arrow_type)
-        return list(map(HybridPlace, map(Place, *self.bobb.checked(boxes)), signs))
+        return list(map(HybridPlace, *self.bobb.checked(boxes), signs))
 
 
 class HybridIndex:
@@ -267,7 +251,7 @@ class HybridIndex:
 
     def alike(self, descriptor: HybridPlace, stop: int | None = None) -> tuple[Float32s, Float32s]:
         """(stop,) BoBB's score, and agreement of the signs 0..1: 0 where half of them or fewer are equal."""
-        boxes = self._boxes.scores(descriptor.boxes, stop)
+        boxes = self._boxes.scores(descriptor, stop)
         return boxes, _agreement(self._signs[: len(boxes)], descriptor.signs)
 
     def scores(self, descriptor: HybridPlace, stop: int | None = None) -> Float32s:

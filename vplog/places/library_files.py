@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -70,15 +71,11 @@ class RelearnedSettings(Settings):
 class ReferencesState:
     """A state that follows from settings and references: its hash, and how it is saved."""
 
-    settings: Any
-    references: list[Reference]
-
-    @property
-    def hash(self) -> str:
-        return self._hash
+    def __init__(self, settings: Any, references: list[Reference]) -> None:
+        self.settings, self.references = settings, references
 
     @cached_property
-    def _hash(self) -> str:
+    def hash(self) -> str:
         return references_hash(self.references, self.settings)
 
     def save(self, folder: Path) -> None:
@@ -109,13 +106,7 @@ def references_hash(references: Sequence[Reference], settings: Settings) -> str:
 _FEATURES = pa.schema([("reference", pa.int32()), ("x", pa.float32()), ("y", pa.float32()), ("size", pa.float32())])
 """Columns of features.parquet but `descriptor`, whose bytes are those of the features' own."""
 _REFERENCES = pa.schema(
-    [
-        ("drive", pa.string()),
-        ("stamp_ns", pa.int64()),
-        ("width", pa.int32()),
-        ("height", pa.int32()),
-        ("image", pa.binary()),
-    ]
+    {"drive": pa.string(), "stamp_ns": pa.int64(), "width": pa.int32(), "height": pa.int32(), "image": pa.binary()}
 )
 
 
@@ -193,30 +184,23 @@ def read_library_record(folder: Path) -> dict[str, Any]:
 
 def read_sources(folder: Path) -> set[tuple[str, int]]:
     """Log and stamp in ns of every reference of a saved library. Raises LibraryError."""
-    try:
+    with _reading(folder):
         table = _table(folder / "references.parquet", _REFERENCES)
         return set(zip(table["drive"].to_pylist(), table["stamp_ns"].to_pylist(), strict=True))
-    except (OSError, ValueError, pa.ArrowException) as error:
-        why = str(error).splitlines()[0].rstrip(".")
-        raise LibraryError(f"{folder} cannot be read: {why}. Build it again with `vplog library`.") from None
 
 
 def load_references(folder: Path, execution: Execution = Execution()) -> list[Reference]:
     """The references of a saved library, in their order. Raises LibraryError where the files do not fit together,
     ResultError where something in the folder is not its own file."""
     check_regular(folder, "library.json")
-    try:
+    with _reading(folder):
         features = _table(folder / "features.parquet", _FEATURES, "descriptor")
         references = _table(folder / "references.parquet", _REFERENCES)
         if any(column.null_count for table in (features, references) for column in table.columns):
             raise LibraryError(f"{folder}: the tables have empty cells; build it again with `vplog library`.")
         entries = references.to_pylist()
-    except (OSError, ValueError, pa.ArrowException) as error:  # ValueError: a drive's name that is no UTF-8
-        raise LibraryError(
-            f"{folder} cannot be read: {str(error).splitlines()[0].rstrip('.')}. Build it again with `vplog library`."
-        ) from None
     owners = features["reference"].to_numpy()
-    start = np.searchsorted(owners, np.arange(len(references) + 1))
+    start = np.searchsorted(owners, np.arange(len(references) + 1)).tolist()
     if len(owners) and (owners[0] < 0 or owners[-1] >= len(references) or np.any(np.diff(owners) < 0)):
         raise LibraryError(
             f"{folder}: features.parquet names references that references.parquet lacks; build it again."
@@ -227,14 +211,15 @@ def load_references(folder: Path, execution: Execution = Execution()) -> list[Re
     descriptors = np.frombuffer(b"".join(features["descriptor"].to_pylist()), np.uint8).reshape(-1, values)
 
     def reference(row: int) -> Reference:
-        entry = entries[row]
-        part = slice(int(start[row]), int(start[row + 1]))
+        entry, part = entries[row], slice(start[row], start[row + 1])
         width, height = entry["width"], entry["height"]
-        if not (0 < width < 2**15 and 0 < height < 2**15) or not np.all(
-            (points[part] > -1) & (points[part] < [width, height])
-        ):
+        inside = (points[part] > -1) & (points[part] < [width, height])
+        if not (0 < width < 2**15 and 0 < height < 2**15 and np.all(inside)):
             raise LibraryError(f"{folder}: reference {row} has features outside its {width} x {height} image.")
-        image = _decode(entry["image"])
+        try:
+            image = decode_image(entry["image"])
+        except BadImageError:
+            image = None
         if image is None or image.shape != (height, width):
             raise LibraryError(
                 f"{folder}: the image of reference {row} is damaged; build it again with `vplog library`."
@@ -245,6 +230,16 @@ def load_references(folder: Path, execution: Execution = Execution()) -> list[Re
         return Reference(image.astype(np.uint8, copy=False), found, entry["drive"], entry["stamp_ns"])
 
     return list(execution.map(reference, range(len(entries))))
+
+
+@contextmanager
+def _reading(folder: Path) -> Iterator[None]:
+    """Raises LibraryError where its tables cannot be read."""
+    try:
+        yield
+    except (OSError, ValueError, pa.ArrowException) as error:  # ValueError: a drive's name that is no UTF-8
+        why = str(error).splitlines()[0].rstrip(".")
+        raise LibraryError(f"{folder} cannot be read: {why}. Build it again with `vplog library`.") from None
 
 
 def _table(path: Path, schema: pa.Schema, descriptor: str = "") -> pa.Table:
@@ -264,10 +259,3 @@ def _table(path: Path, schema: pa.Schema, descriptor: str = "") -> pa.Table:
                 f"{path.parent}: the tables are not those of a library ({error}); build it again with `vplog library`."
             ) from None
         return read_table(path, file, schema.names).select(schema.names)
-
-
-def _decode(data: bytes) -> np.ndarray | None:
-    try:
-        return decode_image(data)
-    except BadImageError:
-        return None

@@ -102,20 +102,11 @@ class Matcher:
 
     def __init__(self, references: list[Reference], settings: WeighedMatchSettings) -> None:
         self.references, self.settings = references, settings
-        self._indexed = Once(lambda: (self._index(keypoints_of, 1.0), self._index(patches_of, settings.patch_weight)))
+        self.indexed = Once(lambda: (self._index(keypoints_of, 1.0), self._index(patches_of, settings.patch_weight)))
+        """Keypoints and patches; None where they are not used, or the references have none."""
 
     def __len__(self) -> int:
         return len(self.references)
-
-    @property
-    def keypoints(self) -> Indexed | None:
-        """The keypoints; None where they are not used, or the references have none."""
-        return self._indexed()[0]
-
-    @property
-    def patches(self) -> Indexed | None:
-        """The patches; None where they are not used, or the references have none."""
-        return self._indexed()[1]
 
     def _index(self, described: Callable[[Features, WeighedMatchSettings], Described], weight: float) -> Indexed | None:
         s = self.settings
@@ -130,7 +121,7 @@ class Matcher:
         """Matches of an image."""
         s, L = self.settings, len(self.references)
         found = []
-        for kind, described in zip(self._indexed(), (keypoints_of, patches_of), strict=True):
+        for kind, described in zip(self.indexed(), (keypoints_of, patches_of), strict=True):
             if kind is not None:
                 values, points = described(features, s)
                 if len(values):
@@ -174,7 +165,7 @@ def index_references(references: Iterable[Reference], settings: WeighedMatchSett
     """The references' features, not yet indexed. Raises LibraryError where they have none."""
     used = [replace(r, features=large_enough(r.features, settings)) for r in keep_references(references)]
     matcher = Matcher(used, settings)
-    if not any(len(r.features) for r in used) and matcher.patches is None:
+    if not any(len(r.features) for r in used) and matcher.indexed()[1] is None:
         raise LibraryError(f"None of the {len(used)} reference images has a single feature; choose other images.")
     return matcher
 

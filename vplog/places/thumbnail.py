@@ -5,8 +5,7 @@ Milford & Wyeth, SeqSLAM: Visual route-based navigation for sunny summer days an
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Literal
 
 import numba
@@ -14,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from vplog.data import THUMBNAIL_SIDE, Bytes, Features, Reference
-from vplog.places.dense import VectorIndex, VectorState, thumbnail_of
+from vplog.places.dense import VectorState, thumbnail_of
 from vplog.places.library_files import RelearnedSettings, keep_references
 
 if TYPE_CHECKING:
@@ -28,6 +27,18 @@ _LEAST_DEVIATION = 1.0
 """Grey levels; a patch that varies less is the camera's noise, which must not be blown up to the size of a texture."""
 
 
+@numba.njit(cache=True, nogil=True)
+def _likeness(images, query):
+    """(N,) float32: 1 less the mean absolute difference (N, P) to (P,), as a share of a byte's range."""
+    result = np.zeros(images.shape[0], np.float32)
+    for row in range(images.shape[0]):
+        total = np.int32(0)
+        for p in range(images.shape[1]):
+            total += abs(np.int32(images[row, p]) - np.int32(query[p]))
+        result[row] = 1 - total / (255 * images.shape[1])
+    return result
+
+
 class ThumbnailSettings(RelearnedSettings):
     """SeqSLAM's image comparison. It learns nothing: the references only go into the library."""
 
@@ -39,13 +50,12 @@ class ThumbnailSettings(RelearnedSettings):
         return ThumbnailState(self, keep_references(references))
 
 
-@dataclass(frozen=True, eq=False)
 class ThumbnailState(VectorState):
     """Nothing but what to save. Shared freely between threads."""
 
-    settings: ThumbnailSettings
-    references: list[Reference]
     arrow_type = pa.list_(pa.uint8(), _WIDTH * _HEIGHT)
+    similarity = staticmethod(_likeness)
+    compared = np.uint8
 
     def describe(self, features: Features) -> Bytes:
         """(2048,) uint8 row by row: deviations from the patch's mean in units of its own. Needs the thumbnail."""
@@ -55,18 +65,3 @@ class ThumbnailState(VectorState):
         mean, deviation = patches.mean(axis=(1, 3), keepdims=True), patches.std(axis=(1, 3), keepdims=True)
         normal = (patches - mean) / np.maximum(deviation, _LEAST_DEVIATION)
         return np.clip(np.rint(128 + _STEPS * normal), 0, 255).astype(np.uint8).reshape(-1)
-
-    def index(self, descriptors: Sequence[Bytes]) -> VectorIndex:
-        return VectorIndex(self.matrix(descriptors, np.uint8), _likeness)
-
-
-@numba.njit(cache=True, nogil=True)
-def _likeness(images, query):
-    """(N,) float32: 1 less the mean absolute difference (N, P) to (P,), as a share of a byte's range."""
-    result = np.zeros(images.shape[0], np.float32)
-    for row in range(images.shape[0]):
-        total = np.int32(0)
-        for p in range(images.shape[1]):
-            total += abs(np.int32(images[row, p]) - np.int32(query[p]))
-        result[row] = 1 - total / (255 * images.shape[1])
-    return result

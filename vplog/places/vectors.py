@@ -61,9 +61,13 @@ class VectorsSettings(RelearnedSettings):
 
     def learn(self, references: Iterable[Reference], execution: Execution) -> VectorsState:
         """Nothing to learn. Raises LibraryError where there is no reference, or no file of vectors."""
-        files = VectorFiles(_files(self.file))
+        paths = _files(self.file)
+        tables = [_Rows(path) if path.suffix == ".npy" else _Stamped(path) for path in paths]
+        lengths = {table.dimensions for table in tables}
+        if len(lengths) > 1:
+            raise LibraryError(f"{paths[0]} and {paths[1].name} have vectors of {sorted(lengths)} values: no pair.")
         value = pa.float16() if self.metric == "cosine" else pa.float32()
-        return VectorsState(self, keep_references(references), files, pa.list_(value, files.dimensions))
+        return VectorsState(self, keep_references(references), tables, pa.list_(value, lengths.pop()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,23 +76,39 @@ class VectorsState(VectorState):
 
     settings: VectorsSettings
     references: list[Reference]
-    files: VectorFiles
+    tables: Sequence[_Rows | _Stamped]
+    """One file, or that of queries, then that of the map."""
     arrow_type: pa.FixedSizeListType
 
     @cached_property
-    def _hash(self) -> str:
-        content = self.settings.model or self.files.sha256
-        about = f"{references_hash(self.references, self.settings)} {content} {self.files.dimensions}"
+    def hash(self) -> str:
+        content = self.settings.model or self._content
+        about = f"{references_hash(self.references, self.settings)} {content} {self.tables[0].dimensions}"
         return hashlib.sha256(about.encode()).hexdigest()
 
     @property
     def token(self) -> str:
         """Stands for all that descriptors depend on, the files of a named model among it."""
-        return f"{self.hash} {self.files.sha256}"
+        return f"{self.hash} {self._content}"
+
+    @cached_property
+    def _content(self) -> str:
+        """sha256 of the files."""
+        digest = hashlib.sha256()
+        for table in self.tables:
+            with table.path.open("rb") as stream:
+                digest.update(hashlib.file_digest(stream, "sha256").digest())
+        return digest.hexdigest()
 
     def stored(self, log: Log, stamp_ns: Ints, query: bool | None) -> list[NDArray[Any]]:
-        """(D,) of each frame. Raises LibraryError where they are not those of this log."""
-        vectors = self.files.of(log, stamp_ns, query, self.settings.order)
+        """(D,) of each frame. Raises LibraryError where they are not, or may not be, those of this log."""
+        tables = self.tables
+        if query is not False and not tables[0].names_drives and (query is None or len(tables) == 1):
+            raise LibraryError(
+                f"{tables[0].path} does not say which of several drives its vectors are of. Give a pair {_QUERIES}, "
+                f"{_DATABASE}, or a Parquet file with {_COLUMNS}."
+            )
+        vectors = tables[0 if query else -1].of(log, stamp_ns, self.settings.order)
         if not np.isfinite(vectors).all():
             raise LibraryError(f"{self.settings.file} has values that are not finite for frames of {log.name}.")
         if self.settings.metric == "cosine":
@@ -104,43 +124,13 @@ class VectorsState(VectorState):
         return VectorIndex(self.matrix(descriptors, np.float32), similarity)
 
 
-class VectorFiles:
-    """One file of vectors, or a pair: that of queries, then that of the map."""
-
-    def __init__(self, paths: list[Path]) -> None:
-        """Raises LibraryError where they hold no vectors, or of several lengths."""
-        self._paths = paths
-        self._tables = [_Rows(path) if path.suffix == ".npy" else _Stamped(path) for path in paths]
-        lengths = {table.dimensions for table in self._tables}
-        if len(lengths) > 1:
-            raise LibraryError(f"{paths[0]} and {paths[1].name} have vectors of {sorted(lengths)} values: no pair.")
-        self.dimensions: int = lengths.pop()
-
-    @cached_property
-    def sha256(self) -> str:
-        """Over the content of the files."""
-        digest = hashlib.sha256()
-        for path in self._paths:
-            with path.open("rb") as stream:
-                digest.update(hashlib.file_digest(stream, "sha256").digest())
-        return digest.hexdigest()
-
-    def of(self, log: Log, stamp_ns: Ints, query: bool | None, order: str) -> Float32s:
-        """(N, D) vectors of frames of a log. Raises LibraryError where they may be another drive's."""
-        names_drives = isinstance(self._tables[0], _Stamped) and self._tables[0].names_drives
-        if query is not False and not names_drives and (query is None or len(self._tables) == 1):
-            raise LibraryError(
-                f"{self._paths[0]} does not say which of several drives its vectors are of. Give a pair {_QUERIES}, "
-                f"{_DATABASE}, or a Parquet file with {_COLUMNS}."
-            )
-        return self._tables[0 if query else -1].of(log, stamp_ns, order)
-
-
 class _Rows:
     """The vectors of a .npy file, by the number of the frame."""
 
+    names_drives = False
+
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.path = path
         try:
             self._vectors = np.load(path, mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
@@ -158,7 +148,7 @@ class _Rows:
         stamps = log.stamps()
         if len(stamps) != len(self._vectors):
             raise LibraryError(
-                f"{self._path} has {len(self._vectors)} vectors, and {log.name} has {len(stamps)} frames. Give a row "
+                f"{self.path} has {len(self._vectors)} vectors, and {log.name} has {len(stamps)} frames. Give a row "
                 "for each, or a Parquet file with the stamps of those there are."
             )
         frames = np.searchsorted(stamps, stamp_ns)
@@ -174,7 +164,7 @@ class _Stamped:
     """The vectors of a Parquet file, by stamp."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.path = path
         try:
             with open_table(path) as file:
                 names = [name for name in ("stamp_ns", "vector", "drive") if name in file.schema_arrow.names]
@@ -197,13 +187,13 @@ class _Stamped:
         rows = rows[np.argsort(self._stamp_ns[rows], kind="stable")]
         known = self._stamp_ns[rows]
         if (np.diff(known) == 0).any():
-            raise LibraryError(f"{self._path} has two vectors of one stamp for {log.name}. Its columns are {_COLUMNS}.")
+            raise LibraryError(f"{self.path} has two vectors of one stamp for {log.name}. Its columns are {_COLUMNS}.")
         at = np.minimum(np.searchsorted(known, stamp_ns), max(len(known) - 1, 0))
         found = known[at] == stamp_ns if len(known) else np.zeros(len(stamp_ns), bool)
         if not found.all():
             missing = np.flatnonzero(~found)
             raise LibraryError(
-                f"{self._path} lacks {len(missing)} of {len(stamp_ns)} frames of {log.name}, the first at stamp_ns "
+                f"{self.path} lacks {len(missing)} of {len(stamp_ns)} frames of {log.name}, the first at stamp_ns "
                 f"{int(stamp_ns[missing[0]])}. Give a vector for each."
             )
         return self._vectors[rows[at]]
