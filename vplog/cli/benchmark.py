@@ -11,12 +11,12 @@ from vplog.cli.parser import (
     at_least,
     at_least_one,
     cache_options,
+    call,
     local,
     option,
     pipeline_of,
     place,
     positive,
-    topics_of,
 )
 from vplog.cli.printing import Progress, print_comparison, print_result, print_study
 from vplog.execution.execution import Execution
@@ -25,14 +25,7 @@ from vplog.execution.execution import Execution
 def compare(arguments: argparse.Namespace) -> None:
     """Compare recognisers on two drives, or on one that revisits places."""
     with Progress(arguments) as progress:
-        done = api.compare(
-            arguments.query, arguments.map, methods=arguments.methods, truth=arguments.truth,
-            tolerance=arguments.tolerance, distance_m=arguments.distance_m, heading_deg=arguments.heading_deg,
-            pipeline=arguments.pipeline, settings=arguments.set, topics=topics_of(arguments), library=arguments.library,
-            library_size=arguments.library_size, library_seed=arguments.library_seed, min_gap=arguments.min_gap,
-            sequence=arguments.sequence, out=arguments.output, cache=arguments.cache, cache_gb=arguments.cache_gb,
-            threads=arguments.threads, progress=progress,
-        )  # fmt: skip
+        done = call(api.compare, arguments, progress=progress)
     print_result(arguments, done.record, print_comparison)
 
 
@@ -44,12 +37,10 @@ def study(arguments: argparse.Namespace) -> None:
     from vplog.benchmark.study.study import study as run_study
     from vplog.evaluate.place_truth import TruthChoice
 
-    truth = TruthChoice(arguments.truth, arguments.tolerance, arguments.distance_m, arguments.heading_deg)
-    options = StudyOptions(
-        METHODS if arguments.methods is None else split_methods(arguments.methods), arguments.sizes, arguments.seeds,
-        arguments.library_size, arguments.min_gap, arguments.only, topics_of(arguments),
-        CacheChoice(arguments.cache, arguments.cache_gb),
-    )  # fmt: skip
+    truth = call(TruthChoice, arguments, source=arguments.truth)
+    methods = METHODS if arguments.methods is None else split_methods(arguments.methods)
+    cache = CacheChoice(arguments.cache, arguments.cache_gb)
+    options = call(StudyOptions, arguments, methods=methods, cache=cache)
     with Progress(arguments) as progress:
         execution = Execution(arguments.threads, progress)
         found = run_study(arguments.logs, truth, pipeline_of(arguments), arguments.output, options, execution)

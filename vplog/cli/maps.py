@@ -13,12 +13,12 @@ from vplog.cli.parser import (
     at_least,
     at_least_one,
     cache_options,
+    call,
     flag,
     option,
     output_file,
     place,
     settings_options,
-    topics_of,
 )
 from vplog.cli.printing import Progress, print_result
 from vplog.errors import plural
@@ -70,7 +70,7 @@ def redescribe_map(arguments: argparse.Namespace) -> None:
         from vplog.batch.redescribe import redescribe_map as redescribe
 
         execution = Execution(arguments.threads, progress)
-        options = BatchOptions(arguments.jobs, arguments.engine, arguments.address, arguments.retries, processes)
+        options = call(BatchOptions, arguments, processes=processes)
         found = redescribe(arguments.map, arguments.library, arguments.target, execution, options)
     wrong = f"{found['failed']} of {plural(len(found['drives']), 'drive')} missing in {found['map']}."
     _end(arguments, found, printing.print_redescribed, wrong)
@@ -79,12 +79,7 @@ def redescribe_map(arguments: argparse.Namespace) -> None:
 def batch(arguments: argparse.Namespace) -> None:
     """Compute many recorded drives into one growing map, each drive in its own process, here or on a Ray cluster."""
     with Progress(arguments) as progress:
-        found = api.batch(
-            arguments.logs, arguments.map, arguments.pipeline, settings=arguments.set, topics=topics_of(arguments),
-            library=arguments.library, jobs=arguments.jobs, threads=arguments.threads, engine=arguments.engine,
-            address=arguments.address, retries=arguments.retries, join=arguments.join, keep_cache=arguments.keep_cache,
-            progress=progress, on_drive=progress.print_drive,
-        )  # fmt: skip
+        found = call(api.batch, arguments, progress=progress, on_drive=progress.print_drive)
     drives = plural(len(found["drives"]), "drive")
     wrong = f"{found['failed']} of {drives} failed; {arguments.map}/failures.json has the reasons."
     _end(arguments, found, printing.print_batch, wrong)
@@ -122,21 +117,14 @@ def info_map(arguments: argparse.Namespace) -> None:
 def query_map(arguments: argparse.Namespace) -> None:
     """Find the places of a map most like each view of a log, here or on the workers of a Ray cluster."""
     with Progress(arguments) as progress:
-        found = api.Map(arguments.map).query(
-            arguments.log, arguments.top, topics=topics_of(arguments), sequence=arguments.sequence,
-            out=arguments.output, engine=arguments.engine, address=arguments.address, cache=arguments.cache,
-            cache_gb=arguments.cache_gb, threads=arguments.threads, progress=progress,
-        )  # fmt: skip
+        found = call(api.Map(arguments.map).query, arguments, progress=progress)
     print_result(arguments, found.record, printing.print_answers)
 
 
 def localize(arguments: argparse.Namespace) -> None:
     """Find the pose of pictures, or of the frames of a log, in a run or a map, with covariance and verdict."""
     with Progress(arguments) as progress:
-        found = api.localize(
-            arguments.map, arguments.pictures, topics=topics_of(arguments), out=arguments.output, top=arguments.top,
-            threads=arguments.threads, progress=progress,
-        )  # fmt: skip
+        found = call(api.localize, arguments, progress=progress)
     print_result(arguments, found, printing.print_localized)
 
 

@@ -10,8 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vplog import api
 from vplog.cli.parser import (
     STDOUT,
+    call,
     flag,
     local_file,
     number,
@@ -53,10 +55,7 @@ _BINARY = ("geoparquet", "rrd")
 
 def evaluate(arguments: argparse.Namespace) -> None:
     """Evaluate a run, of one or several drives, against ground truth."""
-    from vplog.verbs.evaluate_run import evaluate as evaluate_run
-
-    found = evaluate_run(arguments.run, arguments.truth, topics_of(arguments), _truth_options(arguments))
-    print_result(arguments, found, print_evaluation)
+    print_result(arguments, call(api.evaluate, arguments), print_evaluation)
 
 
 def explain(arguments: argparse.Namespace) -> None:
