@@ -8,18 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog import api
-from vplog.cli import printing
-from vplog.cli.parser import (
-    at_least,
-    at_least_one,
-    cache_options,
-    call,
-    flag,
-    option,
-    output_file,
-    place,
-    settings_options,
-)
+from vplog.cli import parser, printing
+from vplog.cli.parser import call, flag, option, place
 from vplog.cli.printing import Progress, print_result
 from vplog.errors import plural
 from vplog.execution.execution import Execution
@@ -144,12 +134,13 @@ def add_maps(
     common: argparse.ArgumentParser, topics: argparse.ArgumentParser, threads: argparse.ArgumentParser,
 ) -> None:  # fmt: skip
     """The verbs `batch` and `localize`, and the verb `map` with its own verbs."""
-    _add_batch(add("batch", batch, topics, threads, settings_options(None, "that of the map, else default")))
+    _add_batch(add("batch", batch, topics, threads, parser.settings_options(None, "that of the map, else default")))
     sub = add("localize", localize, topics, threads)
     option(sub, "map", place, "MAP|RUN")
     option(sub, "pictures", place, "IMAGE|LOG", "images, a folder of them, or one log", nargs="+")
-    option(sub, "--top", at_least_one, "K", "places that each picture is verified against (default: 10)", default=10)
-    option(sub, "-o --output", output_file, "FILE.parquet|FILE.tum", "write the poses, or a log's trajectory")
+    text = "places that each picture is verified against (default: 10)"
+    option(sub, "--top", parser.at_least_one, "K", text, default=10)
+    option(sub, "-o --output", parser.output_file, "FILE.parquet|FILE.tum", "write the poses, or a log's trajectory")
     text = "Inspect, search, export, merge, join or change a map of many drives."
     maps = group("map", text).add_subparsers(required=True, metavar="VERB")
 
@@ -164,7 +155,7 @@ def add_maps(
     flag(sub, "--check", "check every file against its sha256; a line for each damaged one, and exit status 1")
     _add_query(verb("query", query_map, "find where a log's views are in a map", topics, threads))
     sub = verb("index", index_map, "build the index that queries search", threads)
-    cache_options(sub, "what is read of a map by URL is kept")
+    parser.cache_options(sub, "what is read of a map by URL is kept")
     _add_export(verb("export", export_map, "the places of a map or of runs, in one file", of_map=False))
     sub = verb("merge", merge_maps, "copy drives of maps into another map", of_map=False)
     option(sub, "maps", place, "MAP|FILE.parquet", "maps, or places that `map export` wrote", nargs="+")
@@ -181,13 +172,13 @@ def add_maps(
 
 def _add_query(sub: argparse.ArgumentParser) -> None:
     option(sub, "log", place, "LOG")
-    option(sub, "--top", at_least_one, "K", "places for each view (default: 10)", default=10)
-    option(sub, "--sequence", at_least_one, "L", "views in a window, odd; 1: none (default: as the map's)")
-    option(sub, "-o --output", output_file, "FILE.parquet", "write the answers")
+    option(sub, "--top", parser.at_least_one, "K", "places for each view (default: 10)", default=10)
+    option(sub, "--sequence", parser.at_least_one, "L", "views in a window, odd; 1: none (default: as the map's)")
+    option(sub, "-o --output", parser.output_file, "FILE.parquet", "write the answers")
     text = "who searches: this process, or Ray workers that see the map under the same path (default: local)"
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     option(sub, "--address", str, "HOST:PORT", "Ray cluster (default: one of this machine's cores)")
-    cache_options(sub, "what is read of a map by URL is kept")
+    parser.cache_options(sub, "what is read of a map by URL is kept")
 
 
 def _add_export(sub: argparse.ArgumentParser) -> None:
@@ -196,7 +187,7 @@ def _add_export(sub: argparse.ArgumentParser) -> None:
     text = "only places in this box, in degrees; LON0 > LON1 crosses the antimeridian (write --box=-33.9,...)"
     option(sub, "--box", _box, "LAT0,LON0,LAT1,LON1", text)
     sub.add_argument("--format", choices=("parquet", "geoparquet"), default="parquet", help="(default: parquet)")
-    option(sub, "-o --output", output_file, "FILE.parquet", "file to write", required=True)
+    option(sub, "-o --output", parser.output_file, "FILE.parquet", "file to write", required=True)
 
 
 def _box(text: str) -> tuple[float, float, float, float]:
@@ -214,13 +205,13 @@ def _box(text: str) -> tuple[float, float, float, float]:
 def _add_workers(sub: argparse.ArgumentParser) -> None:
     """Who computes drives."""
     text = "drives at once (default: 1; over Ray as many as the cluster has cores for)"
-    option(sub, "--jobs", at_least_one, "N", text)
+    option(sub, "--jobs", parser.at_least_one, "N", text)
     text = "processes of this machine, or tasks of a Ray cluster (default: local)"
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     text = "HOST:PORT of a Ray cluster, or auto (default: one on this machine for the time of the batch)"
     option(sub, "--address", str, "HOST:PORT", text)
     text = "retries of a drive whose worker was killed or had an I/O error (default: 2)"
-    option(sub, "--retries", at_least(0), "N", text, default=2)
+    option(sub, "--retries", parser.at_least(0), "N", text, default=2)
 
 
 def _add_batch(sub: argparse.ArgumentParser) -> None:

@@ -43,7 +43,10 @@ def on_earth(earth: Earth, world_from_body: Floats) -> Floats:
 
 def feature_collection(earth: Earth, world_from_body: Floats, stamp_ns: Ints, closures: Closures) -> dict[str, Any]:
     """GeoJSON of keyframes (N, 4, 4): the path as one line, and of each accepted closure the line between its ends."""
-    where = [_rounded(row) for row in on_earth(earth, world_from_body).tolist()]
+    where = [
+        [round(x, _DEGREE_DIGITS), round(y, _DEGREE_DIGITS), round(z, _METRE_DIGITS)]
+        for x, y, z in on_earth(earth, world_from_body).tolist()
+    ]
     features = []
     if len(where) > 1:
         about = {"name": "optimised", "start_ns": str(stamp_ns[0]), "end_ns": str(stamp_ns[-1])}
@@ -120,7 +123,3 @@ def geo_header(low: Floats, high: Floats) -> dict[str, str]:
 def _line(where: list[list[float]], properties: dict[str, Any]) -> dict[str, Any]:
     geometry_ = {"type": "LineString", "coordinates": where}
     return {"type": "Feature", "geometry": geometry_, "properties": properties}
-
-
-def _rounded(row: list[float]) -> list[float]:
-    return [round(row[0], _DEGREE_DIGITS), round(row[1], _DEGREE_DIGITS), round(row[2], _METRE_DIGITS)]

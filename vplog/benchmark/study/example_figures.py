@@ -79,6 +79,7 @@ def examples(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, 
             file = f"examples-{len(files) + 1:02d}-{kind}"
             outcome = f"{kind}: the true frame is no. {int(ranks.better[row]) + 1} of {int(ranks.candidates[row])}"
             sides = (query, row, places[query][row]), (other, match, places[other][match])
+            named = [state.boxes(place).references for _, _, place in sides]
             _draw_example(bench, state, *sides, outcome, file, out)
             files.append(file)
             rows.append(
@@ -90,7 +91,7 @@ def examples(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, 
                     "query_frame": int(bench.traversal(query).frames[row]),
                     "map_frame": int(bench.traversal(other).frames[match]),
                     "rank": int(ranks.better[row]),
-                    "shared_references": _shared(state, places[query][row], places[other][match]),
+                    "shared_references": len(np.intersect1d(*named)),
                     "figure": f"{file}.png",
                 }
             )
@@ -138,10 +139,6 @@ def _learned(bench: Bench, options: StudyOptions, drive: int) -> tuple[str, BoxS
     name = box_methods(bench, options)[0]
     state: Any = bench.learn(name, options.libraries(drive)[0])
     return name, state
-
-
-def _shared(state: BoxState, a: Any, b: Any) -> int:
-    return len(np.intersect1d(state.boxes(a).references, state.boxes(b).references))
 
 
 def _draw_references(
