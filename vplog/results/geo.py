@@ -63,16 +63,15 @@ def write_geojson(path: Path, tree: dict[str, Any]) -> None:
         stream.write((json.dumps(tree, separators=(",", ":"), allow_nan=False) + "\n").encode())
 
 
-def write_kml(path: Path, earth: Earth, world_from_body: Floats, closures: Closures, name: str) -> None:
+def write_kml(path: Path, tree: dict[str, Any], name: str) -> None:
     """The lines of `feature_collection`, on the ground: a map's heights are not those of the ellipsoid."""
-    where = [f"{x:.{_DEGREE_DIGITS}f},{y:.{_DEGREE_DIGITS}f}" for x, y, _ in on_earth(earth, world_from_body).tolist()]
     kml = ElementTree.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
     document = ElementTree.SubElement(kml, "Document")
-    rows = np.flatnonzero(closures.accepted).tolist()
-    ends = [(f"closure {row}", [where[closures.match[row]], where[closures.query[row]]]) for row in rows]
-    for title, points in [(name, where), *ends]:
+    for feature in tree["features"]:
+        about, where = feature["properties"], feature["geometry"]["coordinates"]
+        points = [f"{x:.{_DEGREE_DIGITS}f},{y:.{_DEGREE_DIGITS}f}" for x, y, _ in where]
         mark = ElementTree.SubElement(document, "Placemark")
-        ElementTree.SubElement(mark, "name").text = title
+        ElementTree.SubElement(mark, "name").text = f"closure {about['closure']}" if "closure" in about else name
         line = ElementTree.SubElement(mark, "LineString")
         ElementTree.SubElement(line, "tessellate").text = "1"
         ElementTree.SubElement(line, "coordinates").text = " ".join(points)

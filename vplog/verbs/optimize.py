@@ -95,19 +95,11 @@ def solve_parts(
         raise GraphError(
             "No edge joins two poses, so there is nothing to solve. Give a graph with edges between two poses."
         )
-    return (
-        Solution(
-            poses,
-            weight,
-            sum(one.error_before for one in solutions),
-            sum(one.error_after for one in solutions),
-            max(one.iterations for one in solutions),
-            all(one.converged for one in solutions),
-            " ".join(one.reason for one in solutions),
-        ),
-        replace(graph, information=information),
-        warnings,
-    )
+    before, after = (sum(getattr(one, f"error_{when}") for one in solutions) for when in ("before", "after"))
+    iterations, converged = max(one.iterations for one in solutions), all(one.converged for one in solutions)
+    reason = " ".join(one.reason for one in solutions)
+    solution = Solution(poses, weight, before, after, iterations, converged, reason)
+    return solution, replace(graph, information=information), warnings
 
 
 def _by_part(part: Ints, parts: int) -> list[Ints]:
