@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 import pyarrow as pa
 
 from vplog.errors import ResultError
-from vplog.results.tables import reading
+from vplog.results.tables import reading, unreadable
 from vplog.storage.parquet_limits import check_columns, check_size, open_table, table_writer
 from vplog.storage.scratch import replacing
 
@@ -58,8 +58,10 @@ class KeyframeTable(Generic[T]):
 
     def __getitem__(self, row: int) -> T:
         """Raises ResultError where the file is damaged."""
-        with reading(f"{self._path}: keyframe {row}", "", ""):
+        try:
             return self._group(row // self._rows)[row % self._rows]
+        except (OSError, LookupError, ValueError, pa.ArrowException) as error:
+            raise unreadable(f"{self._path}: keyframe {row}", error) from None
 
     def _read_group(self, number: int) -> list[T]:
         with self._lock:

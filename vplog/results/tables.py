@@ -555,8 +555,13 @@ def reading(
     except FileNotFoundError:
         raise ResultError(f"{what} does not exist. {missing}".rstrip()) from None
     except (OSError, LookupError, ValueError, RecursionError, pa.ArrowException, *more) as error:
-        why = next(iter(str(error).splitlines()), type(error).__name__)
-        raise ResultError(f"{what} cannot be read: {why.rstrip('.')}. {again}".rstrip()) from None
+        raise unreadable(what, error, again) from None
+
+
+def unreadable(what: Path | str, error: Exception, again: str = "") -> ResultError:
+    """The error of a damaged file in one line, with a remedy."""
+    why = next(iter(str(error).splitlines()), type(error).__name__)
+    return ResultError(f"{what} cannot be read: {why.rstrip('.')}. {again}".rstrip())
 
 
 def _pose_values(prefix: str, poses: Floats) -> dict[str, Floats]:
