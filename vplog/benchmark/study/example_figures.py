@@ -79,7 +79,7 @@ def examples(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, 
             file = f"examples-{len(files) + 1:02d}-{kind}"
             outcome = f"{kind}: the true frame is no. {int(ranks.better[row]) + 1} of {int(ranks.candidates[row])}"
             sides = (query, row, places[query][row]), (other, match, places[other][match])
-            named = [state.boxes(place).references for _, _, place in sides]
+            mine, theirs = (state.boxes(place).references for _, _, place in sides)
             _draw_example(bench, state, *sides, outcome, file, out)
             files.append(file)
             rows.append(
@@ -91,7 +91,7 @@ def examples(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, 
                     "query_frame": int(bench.traversal(query).frames[row]),
                     "map_frame": int(bench.traversal(other).frames[match]),
                     "rank": int(ranks.better[row]),
-                    "shared_references": len(np.intersect1d(*named)),
+                    "shared_references": len(np.intersect1d(mine, theirs)),
                     "figure": f"{file}.png",
                 }
             )
