@@ -329,25 +329,12 @@ def compare(
     chosen = None if truth is None else TruthChoice(os.fspath(truth), *bounds)
     with limited(threads), ExitStack() as stack:
         references = None if library is None else stack.enter_context(local_copy(located(library)))
-        place = None if out is None else located(out)
-        return compare_methods(
-            located(query),
-            None if map is None else located(map),
-            split_methods(methods) if isinstance(methods, str) else methods,
-            chosen,
-            _pipeline(pipeline, settings),
-            CompareOptions(
-                references,
-                library_size,
-                library_seed,
-                min_gap,
-                sequence,
-                place,
-                _topics(topics),
-                CacheChoice(cache, cache_gb),
-            ),
-            Execution(threads, progress),
-        )
+        place, parts, kept = None if out is None else located(out), _topics(topics), CacheChoice(cache, cache_gb)
+        options = CompareOptions(references, library_size, library_seed, min_gap, sequence, place, parts, kept)
+        names = split_methods(methods) if isinstance(methods, str) else methods
+        drives = located(query), None if map is None else located(map)
+        settled = _pipeline(pipeline, settings)
+        return compare_methods(*drives, names, chosen, settled, options, Execution(threads, progress))
 
 
 def batch(

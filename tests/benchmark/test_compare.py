@@ -21,7 +21,7 @@ from vplog.benchmark.feature_cache import FeatureFolder
 from vplog.benchmark.method_scores import MethodInputs, evaluate_method, stored_bytes
 from vplog.benchmark.recogniser_specs import read_method, split_methods
 from vplog.benchmark.sequence_fit import sequence_warning
-from vplog.benchmark.traversals import candidate_stops, extract_traversal
+from vplog.benchmark.traversals import candidate_stops, extract_traversal, references_of
 from vplog.errors import LogError, SettingsError
 from vplog.evaluate.open_set import score_open_set
 from vplog.evaluate.pairs import index_pairs, listed_pairs
@@ -82,13 +82,13 @@ def store(tmp_path: Path) -> FeatureFolder:
 @pytest.fixture(scope="module")
 def day(traversals: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Traversal:
     folder = FeatureFolder(tmp_path_factory.mktemp("day"))
-    chosen = np.array([1, 5, 9, 13])
-    return extract_traversal(logs.open(traversals[0]), SIFT, folder, chosen=chosen, execution=Execution(2))
+    return extract_traversal(logs.open(traversals[0]), SIFT, folder, execution=Execution(2))
 
 
 def inputs_of(walk: Traversal, truth: Pairs, stops: Ints, *more: Any, **others: Any) -> MethodInputs:
     """A drive against itself."""
-    return MethodInputs(walk.references, walk, walk, truth, stops, *more, **others)
+    references = references_of(walk, np.array([1, 5, 9, 13]))
+    return MethodInputs(references, walk, walk, truth, stops, *more, **others)
 
 
 def without_times(record: dict[str, Any]) -> dict[str, Any]:
@@ -105,12 +105,10 @@ def without_times(record: dict[str, Any]) -> dict[str, Any]:
 def test_a_walk_holds_the_chosen_frames(traversals: tuple[Path, Path], store: FeatureFolder) -> None:
     log = logs.open(traversals[0])
     seen = []
-    walk = extract_traversal(
-        log, SIFT, store, np.array([2, 3, 7]), np.array([3]), Execution(2, lambda *at: seen.append(at))
-    )
+    walk = extract_traversal(log, SIFT, store, np.array([2, 3, 7]), Execution(2, lambda *at: seen.append(at)))
     assert walk.frames.tolist() == [2, 3, 7]
     assert walk.stamp_ns.tolist() == log.stamps()[[2, 3, 7]].tolist()
-    assert [reference.stamp_ns for reference in walk.references] == [int(log.stamps()[3])]
+    assert [reference.stamp_ns for reference in references_of(walk, np.array([3]))] == [int(log.stamps()[3])]
     assert len(walk.feature_ms) == len(walk.store) == 3
     assert (walk.feature_ms > 0).all()
     assert seen == [("extract day", done, 3) for done in (1, 2, 3)]
@@ -126,9 +124,9 @@ def test_frames_keep_their_numbers_where_others_are_damaged(
     for number in range(4):
         data = (traversals[0] / f"{number}.png").read_bytes()
         (folder / f"{number}.png").write_bytes(data[:100] if number == 1 else data)
-    walk = extract_traversal(logs.open(folder), SIFT, store, chosen=np.array([1, 2]))
+    walk = extract_traversal(logs.open(folder), SIFT, store)
     assert walk.frames.tolist() == [0, 2, 3]
-    assert len(walk.references) == 1
+    assert len(references_of(walk, np.array([1, 2]))) == 1
     assert "1 of 4 frames could not be decoded" in walk.warnings[0]
     with pytest.raises(LogError, match="none of 1 frames could be decoded"):
         extract_traversal(logs.open(folder), SIFT, store, np.array([1]))

@@ -22,7 +22,7 @@ from vplog.benchmark.feature_cache import CacheChoice, FeatureFolder
 from vplog.benchmark.method_scores import MethodInputs, evaluate_method
 from vplog.benchmark.recogniser_specs import read_methods
 from vplog.benchmark.sequence_fit import sequence_warning
-from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal
+from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal, references_of
 from vplog.data import Float32s, Ints, Reference
 from vplog.errors import SettingsError, TruthError
 from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, no_truth, open_truth
@@ -157,35 +157,32 @@ class _Drives:
     scratch: Path
     execution: Execution
 
-    def traversal_of(self, path: Path, log: Log, frames: Ints, references: Ints | None = None) -> Traversal:
+    def traversal_of(self, path: Path, log: Log, frames: Ints) -> Traversal:
         folder = self.options.cache.open() or self.scratch
         made = FeatureFolder.of(folder, path, self.options.topics, self.pipeline.features)
-        return extract_traversal(log, self.pipeline.features, made, frames, references, self.execution)
+        return extract_traversal(log, self.pipeline.features, made, frames, self.execution)
 
     def extract_all(self) -> tuple[Traversal, Traversal, list[Reference], list[str]]:
         """Traversals of the map and the query (one object for a drive against itself), the references, and warnings."""
-        source, known = self.source, self.known
-        wanted = LibrarySettings(
-            choose="random", size=self.options.library_size, seed=self.options.library_seed
-        )  # fmt: skip
-        chosen = None
-        if source is None:
-            chosen = known.map_frames[choose(self.map_log.stamps()[known.map_frames], wanted)]
-        map_traversal = query_traversal = self.traversal_of(self.other, self.map_log, known.map_frames, chosen)
+        source, known, options = self.source, self.known, self.options
+        map_traversal = query_traversal = self.traversal_of(self.other, self.map_log, known.map_frames)
         if self.query_log is not self.map_log:
             query_traversal = self.traversal_of(self.query, self.query_log, known.query_frames)
         warnings = list(dict.fromkeys(map_traversal.warnings + query_traversal.warnings))
         if isinstance(source, list):
             return map_traversal, query_traversal, source, warnings
-        references = map_traversal.references
-        if source is not None and self.library is not None:
-            rows = choose(source.stamps(), wanted)
-            traversal = self.traversal_of(self.library, source, rows, rows)
-            references = traversal.references
+        wanted = LibrarySettings(choose="random", size=options.library_size, seed=options.library_seed)
+        if source is None or self.library is None:
+            chosen = known.map_frames[choose(self.map_log.stamps()[known.map_frames], wanted)]
+            references = references_of(map_traversal, chosen)
+        else:
+            chosen = choose(source.stamps(), wanted)
+            traversal = self.traversal_of(self.library, source, chosen)
+            references = references_of(traversal, chosen)
             warnings += traversal.warnings
-        if len(references) < (wanted.size or 0):
+        if (size := options.library_size) > len(references):
             warnings.append(
-                f"The library has {len(references)} images instead of {wanted.size}: its drive has no more frames."
+                f"The library has {len(references)} images instead of {size}: its drive has no more frames."
             )
         return map_traversal, query_traversal, references, warnings
 

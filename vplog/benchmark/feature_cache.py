@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -15,12 +14,12 @@ import numpy as np
 from vplog.cache.code_hash import code_of
 from vplog.cache.feature_shards import Extracted, packed
 from vplog.cache.input_hashes import stat_signature
-from vplog.cache.stage_cache import AbsentError, DamagedError, check_file, file_name, key_of, sealed
+from vplog.cache.stage_cache import file_name, key_of, sealed
 from vplog.cache.user_cache import cache_folder, max_bytes, trim
-from vplog.data import Bytes, Features, Float32s, Frame, Ints
+from vplog.data import Bytes, Features, Float32s, Ints
 from vplog.features.extraction import extract_frames
-from vplog.results.previews import PictureSettings, preview
-from vplog.run.feature_extraction import PART_KEYFRAMES, image_topics
+from vplog.results.previews import PictureSettings
+from vplog.run.feature_extraction import PART_KEYFRAMES, described, image_topics, is_whole
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
@@ -70,7 +69,11 @@ class FeatureFolder:
         """Features and pictures of the frames with these stamps (N,), those that are not there yet from the log."""
         parts = [stamp_ns[at : at + PART_KEYFRAMES] for at in range(0, len(stamp_ns), PART_KEYFRAMES)]
         keys = [key_of({**self.made_from, "drive": log.name, "stamps": part.tolist()}) for part in parts]
-        missing = [(part, key) for part, key in zip(parts, keys, strict=True) if not self._holds(key)]
+        missing = [
+            (part, key)
+            for part, key in zip(parts, keys, strict=True)
+            if not is_whole(self._path(key), key, part.tolist())
+        ]
         wanted = [stamp for part, _ in missing for stamp in part.tolist()]
         done = len(stamp_ns) - len(wanted)
         spent: list[float] = []
@@ -84,9 +87,10 @@ class FeatureFolder:
         frames = extract_frames(log.frames(stamp_ns[np.isin(stamp_ns, wanted)]), timed, execution)
         counted = execution.part(done, len(stamp_ns)).counted(f"extract {log.name}", frames, len(stamp_ns))
         for part, key in missing:
-            content = _content(islice(counted, len(part)), spent)
+            decoded, lost = described(islice(counted, len(part)), PictureSettings())
+            times, spent[:] = spent[:], []
             with replacing(self._path(key)) as stream:
-                stream.write(sealed(key, content))
+                stream.write(sealed(key, packed(decoded, lost, [], times)))
         found = Extracted()
         for key in keys:
             os.utime(self._path(key))  # used now
@@ -95,24 +99,3 @@ class FeatureFolder:
 
     def _path(self, key: str) -> Path:
         return self.folder / file_name("frames", key)
-
-    def _holds(self, key: str) -> bool:
-        """Whether a part is there and whole; a damaged one is made again."""
-        try:
-            check_file(self._path(key), key)
-            Extracted().add(self._path(key))
-        except (AbsentError, DamagedError):
-            return False
-        return True
-
-
-def _content(frames: Iterable[tuple[int, Frame | None, Features | None, str]], spent: list[float]) -> bytes:
-    """The file of a part of the frames; takes the times measured so far."""
-    found, lost = [], []
-    for stamp_ns, frame, features, why in frames:
-        if frame is None or features is None:
-            lost.append(why)
-        else:
-            found.append((stamp_ns, features, preview(frame.image, PictureSettings())))
-    times, spent[:] = spent[:], []
-    return packed(found, lost, [], times)

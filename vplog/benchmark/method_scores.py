@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from vplog.evaluate.pairs import Pairs
     from vplog.places import PlaceSettings
 
-RELIABILITY_BINS = 10
-"""Bins of the probability: with the 200 answers of a short traversal a bin holds 20."""
 ANSWERS = 10
 """Rows that a timed search returns: what `vplog run` requests by default, and the deepest recall reported."""
 
@@ -197,7 +195,7 @@ def reliability_of(
     if not len(answered):
         return None
     probabilities = list(execution.map(work, answered.tolist()))
-    return reliability(probabilities, ranks.top_true[answered] > 0.5, RELIABILITY_BINS)
+    return reliability(probabilities, ranks.top_true[answered] > 0.5)
 
 
 def score_sequences(

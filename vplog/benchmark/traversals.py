@@ -31,8 +31,6 @@ class Traversal:
     """(N,)."""
     names: list[str] | None
     """File of each frame; None of a recording."""
-    references: list[Reference]
-    """The frames requested as reference images."""
     feature_ms: Floats
     """CPU ms that the features of each frame took, decoding not included; in no order."""
     warnings: list[str]
@@ -54,13 +52,11 @@ def extract_traversal(
     extractor: Extractor,
     folder: FeatureFolder,
     frames: Ints | None = None,
-    chosen: Ints | None = None,
     execution: Execution = Execution(),
 ) -> Traversal:
     """Features of the frames with these numbers (all where None), in files of the folder.
 
-    The images of `chosen`, numbers among them, are kept as references. Frames that cannot be decoded are left out,
-    with a warning. Raises LogError where none is left.
+    Frames that cannot be decoded are left out, with a warning. Raises LogError where none is left.
     """
     stamps, names = log.stamps(), log.file_names()
     frames = np.arange(len(stamps)) if frames is None else frames
@@ -73,13 +69,16 @@ def extract_traversal(
         warnings.append(f"{log.name}: {len(lost)} of {len(frames)} frames could not be decoded. First: {lost[0]}")
     stamp_ns = np.array(store.stamp_ns, np.int64)
     numbers = np.searchsorted(stamps, stamp_ns)
-    rows = np.flatnonzero(np.isin(numbers, [] if chosen is None else chosen))
-    references = [
-        Reference(image, store[row], log.name, int(stamp_ns[row]))
-        for row, image in zip(rows.tolist(), images_at(log, stamp_ns[rows]), strict=True)
-    ]
     named = None if names is None else [names[number] for number in numbers.tolist()]
-    return Traversal(log, store, numbers, stamp_ns, named, references, np.array(store.cpu_ms), warnings)
+    return Traversal(log, store, numbers, stamp_ns, named, np.array(store.cpu_ms), warnings)
+
+
+def references_of(traversal: Traversal, numbers: Ints) -> list[Reference]:
+    """The frames with these numbers as reference images, without those that cannot be decoded. Raises LogError."""
+    log, rows = traversal.log, np.flatnonzero(np.isin(traversal.frames, numbers))
+    stamp_ns = traversal.stamp_ns[rows]
+    found = zip(images_at(log, stamp_ns), rows.tolist(), stamp_ns.tolist(), strict=True)
+    return [Reference(image, traversal.store[row], log.name, stamp) for image, row, stamp in found]
 
 
 def images_at(log: Log, stamp_ns: Ints) -> list[Bytes]:

@@ -7,33 +7,17 @@ from collections.abc import Callable
 from functools import partial
 
 from vplog import api
-from vplog.cli.parser import (
-    at_least,
-    at_least_one,
-    cache_options,
-    local,
-    option,
-    pipeline_of,
-    place,
-    positive,
-    topics_of,
-)
-from vplog.cli.printing import Progress, print_comparison, print_result, print_study
+from vplog.cli import parser, printing
+from vplog.cli.parser import call, option, place
+from vplog.cli.printing import Progress, print_result
 from vplog.execution.execution import Execution
 
 
 def compare(arguments: argparse.Namespace) -> None:
     """Compare recognisers on two drives, or on one that revisits places."""
     with Progress(arguments) as progress:
-        done = api.compare(
-            arguments.query, arguments.map, methods=arguments.methods, truth=arguments.truth,
-            tolerance=arguments.tolerance, distance_m=arguments.distance_m, heading_deg=arguments.heading_deg,
-            pipeline=arguments.pipeline, settings=arguments.set, topics=topics_of(arguments), library=arguments.library,
-            library_size=arguments.library_size, library_seed=arguments.library_seed, min_gap=arguments.min_gap,
-            sequence=arguments.sequence, out=arguments.output, cache=arguments.cache, cache_gb=arguments.cache_gb,
-            threads=arguments.threads, progress=progress,
-        )  # fmt: skip
-    print_result(arguments, done.record, print_comparison)
+        done = call(api.compare, arguments, progress=progress)
+    print_result(arguments, done.record, printing.print_comparison)
 
 
 def study(arguments: argparse.Namespace) -> None:
@@ -44,16 +28,14 @@ def study(arguments: argparse.Namespace) -> None:
     from vplog.benchmark.study.study import study as run_study
     from vplog.evaluate.place_truth import TruthChoice
 
-    truth = TruthChoice(arguments.truth, arguments.tolerance, arguments.distance_m, arguments.heading_deg)
-    options = StudyOptions(
-        METHODS if arguments.methods is None else split_methods(arguments.methods), arguments.sizes, arguments.seeds,
-        arguments.library_size, arguments.min_gap, arguments.only, topics_of(arguments),
-        CacheChoice(arguments.cache, arguments.cache_gb),
-    )  # fmt: skip
+    truth = call(TruthChoice, arguments, source=arguments.truth)
+    methods = METHODS if arguments.methods is None else split_methods(arguments.methods)
+    cache = CacheChoice(arguments.cache, arguments.cache_gb)
+    options = call(StudyOptions, arguments, methods=methods, cache=cache)
     with Progress(arguments) as progress:
         execution = Execution(arguments.threads, progress)
-        found = run_study(arguments.logs, truth, pipeline_of(arguments), arguments.output, options, execution)
-    print_result(arguments, found, partial(print_study, arguments.output))
+        found = run_study(arguments.logs, truth, parser.pipeline_of(arguments), arguments.output, options, execution)
+    print_result(arguments, found, partial(printing.print_study, arguments.output))
 
 
 def add_studies(add: Callable[..., argparse.ArgumentParser], *parents: argparse.ArgumentParser) -> None:
@@ -71,12 +53,13 @@ def _truth_options(required: bool) -> argparse.ArgumentParser:
         text += " (default: none, so answers and no scores)"
     kinds = "index|FILE.csv|FILE.npy|labels|utm|FILE.tum[,MAPFILE.tum]|poses|gps"
     option(sub, "--truth", str, kinds, text, required=required)
-    option(sub, "--tolerance", at_least(0), "N", "index: numbers either side (default: 0)")
-    option(sub, "--distance-m", positive, "M", "poses, utm, gps: same place within (default: 6; utm: 25)")
-    option(sub, "--heading-deg", positive, "DEG", "poses, utm: and turned by at most (default: 45; utm: any)")
-    option(sub, "--min-gap", at_least_one, "N", "a drive against itself: matches are N frames older or more")
-    option(sub, "--library-size", at_least_one, "L", "reference images of the library (default: 100)", default=100)
-    cache_options(sub, "features are kept between calls")
+    option(sub, "--tolerance", parser.at_least(0), "N", "index: numbers either side (default: 0)")
+    option(sub, "--distance-m", parser.positive, "M", "poses, utm, gps: same place within (default: 6; utm: 25)")
+    option(sub, "--heading-deg", parser.positive, "DEG", "poses, utm: and turned by at most (default: 45; utm: any)")
+    option(sub, "--min-gap", parser.at_least_one, "N", "a drive against itself: matches are N frames older or more")
+    text = "reference images of the library (default: 100)"
+    option(sub, "--library-size", parser.at_least_one, "L", text, default=100)
+    parser.cache_options(sub, "features are kept between calls")
     return sub
 
 
@@ -85,10 +68,11 @@ def _add_comparison(sub: argparse.ArgumentParser) -> None:
     option(sub, "map", place, "MAP", "drive that is searched (default: QUERY)", nargs="?")
     text = "recognisers or pipelines, each with :setting=value as needed"
     option(sub, "--methods", str, "A,B", text, required=True)
-    option(sub, "--sequence", at_least_one, "L", "also match sequences of L frames")
+    option(sub, "--sequence", parser.at_least_one, "L", "also match sequences of L frames")
     option(sub, "--library", place, "LOG|LIB", "reference images for all methods (default: MAP)")
-    option(sub, "--library-seed", at_least(0), "S", "seed of the random choice of these images (default: 0)", default=0)
-    option(sub, "-o --output", local, "OUT", "folder for compare.json, answers.csv, scores and figures")
+    text = "seed of the random choice of these images (default: 0)"
+    option(sub, "--library-seed", parser.at_least(0), "S", text, default=0)
+    option(sub, "-o --output", parser.local, "OUT", "folder for compare.json, answers.csv, scores and figures")
 
 
 def _add_study(sub: argparse.ArgumentParser) -> None:
@@ -96,11 +80,11 @@ def _add_study(sub: argparse.ArgumentParser) -> None:
     option(sub, "--methods", str, "A,B", "recognisers as in compare (default: all those of the paper)")
     sizes = (10, 20, 50, 100)
     option(sub, "--sizes", _counts, "L,L", "library sizes (default: 10,20,50,100)", default=sizes)
-    option(sub, "--seeds", at_least_one, "N", "libraries per figure (default: 3)", default=3)
+    option(sub, "--seeds", parser.at_least_one, "N", "libraries per figure (default: 3)", default=3)
     text = "pairs, sizes, library, conditions, bits, ablations, references, examples, sequence (default: all)"
     option(sub, "--only", lambda text: text.split(","), "E,E", text)
     option(sub, "-o --output", place, "OUT", "folder for study.json and the figures", required=True)
 
 
 def _counts(text: str) -> tuple[int, ...]:
-    return tuple(at_least_one(part) for part in text.split(","))
+    return tuple(parser.at_least_one(part) for part in text.split(","))

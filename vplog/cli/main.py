@@ -17,24 +17,10 @@ from typing import TYPE_CHECKING, NoReturn
 
 import vplog
 from vplog import api
-from vplog.cli import printing
+from vplog.cli import parser, printing
 from vplog.cli.benchmark import add_studies
 from vplog.cli.maps import add_maps
-from vplog.cli.parser import (
-    Parser,
-    at_least_one,
-    flag,
-    local,
-    option,
-    output_file,
-    pipeline_of,
-    place,
-    resolved,
-    settings_options,
-    share,
-    topic_options,
-    topics_of,
-)
+from vplog.cli.parser import Parser, flag, option, place
 from vplog.cli.printing import Progress, print_json, print_result, print_status
 from vplog.cli.results import add_results
 from vplog.errors import LogError, VplogError, plural, was_interrupted
@@ -166,7 +152,7 @@ def info(arguments: argparse.Namespace) -> None:
     """Show what is in a log, what a run would use, what is wrong, and the command to run."""
     from vplog.verbs.info import preflight
 
-    found = preflight(arguments.log, topics_of(arguments))
+    found = preflight(arguments.log, parser.topics_of(arguments))
     if arguments.html is not None:
         from vplog.verbs.info import write_page
 
@@ -190,11 +176,11 @@ def library(arguments: argparse.Namespace) -> None:
     from vplog.places.library_files import read_library_record
     from vplog.run.reference_library import build_library
 
-    pipeline, warnings = pipeline_of(arguments), []
+    pipeline, warnings = parser.pipeline_of(arguments), []
     with Progress(arguments) as progress:
         state = build_library(
-            arguments.logs, arguments.output, pipeline, topics_of(arguments), Execution(arguments.threads, progress),
-            warnings.append, force=arguments.force,
+            arguments.logs, arguments.output, pipeline, parser.topics_of(arguments),
+            Execution(arguments.threads, progress), warnings.append, force=arguments.force,
         )  # fmt: skip
     record = read_library_record(arguments.output)
     if arguments.json:
@@ -237,7 +223,7 @@ def _request(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path 
             arguments.set.append(f"decisions.file={json.dumps(str(arguments.decisions))}")
         if arguments.false_rate is not None:
             arguments.set.append(f"false_rate.rate={arguments.false_rate!r}")
-        return arguments.logs, pipeline_of(arguments), arguments.library, topics_of(arguments)
+        return arguments.logs, parser.pipeline_of(arguments), arguments.library, parser.topics_of(arguments)
     from vplog.verbs.resume import resume_request
 
     if "://" in str(arguments.shown):
@@ -258,7 +244,7 @@ def config(arguments: argparse.Namespace) -> None:
     """Print every setting of a pipeline as YAML, in the form of a pipeline file."""
     import yaml
 
-    tree = pipeline_of(arguments).model_dump(mode="json")
+    tree = parser.pipeline_of(arguments).model_dump(mode="json")
     print_result(arguments, tree, lambda tree: print(yaml.safe_dump(tree, sort_keys=False), end=""))
 
 
@@ -287,7 +273,7 @@ def demo(arguments: argparse.Namespace) -> None:
     from vplog.run.report import outcome_of
     from vplog.verbs.report import report as write_report
 
-    pipeline = pipeline_of(arguments)
+    pipeline = parser.pipeline_of(arguments)
     _folder(arguments.output)
     with Progress(arguments) as progress:
         drive = make_drive(arguments.output / "drive", DemoSettings(), Execution(arguments.threads, progress))
@@ -303,16 +289,16 @@ def demo(arguments: argparse.Namespace) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = Parser(prog="vplog", description=(vplog.__doc__ or "").splitlines()[0])
-    parser.add_argument("-V", "--version", action="version", version=f"vplog {vplog.__version__}")
+    root = Parser(prog="vplog", description=(vplog.__doc__ or "").splitlines()[0])
+    root.add_argument("-V", "--version", action="version", version=f"vplog {vplog.__version__}")
     common = argparse.ArgumentParser(add_help=False)
     flag(common, "--json", "print one JSON object")
     flag(common, "--debug", "show the traceback of an error")
-    topics = topic_options()
+    topics = parser.topic_options()
     threads = argparse.ArgumentParser(add_help=False)
-    option(threads, "--threads", at_least_one, "N", "threads (default: all cores)", default=available())
-    settings = settings_options("default", "default")
-    verbs = parser.add_subparsers(title="verbs", required=True, metavar="VERB")
+    option(threads, "--threads", parser.at_least_one, "N", "threads (default: all cores)", default=available())
+    settings = parser.settings_options("default", "default")
+    verbs = root.add_subparsers(title="verbs", required=True, metavar="VERB")
 
     def group(name: str, text: str, parents: Sequence[argparse.ArgumentParser] = ()) -> argparse.ArgumentParser:
         summary = text[0].lower() + text[1:].rstrip(".")
@@ -329,7 +315,7 @@ def _parser() -> argparse.ArgumentParser:
     sub = add("info", info, topics)
     option(sub, "log", place, "LOG")
     flag(sub, "--check", "print one line; exit status 1 if a run would fail")
-    option(sub, "--html", output_file, "FILE.html", "also write an HTML page with pictures of the drive")
+    option(sub, "--html", parser.output_file, "FILE.html", "also write an HTML page with pictures of the drive")
     sub = add("library", library, topics, threads, settings)
     option(sub, "logs", place, "LOG", nargs="+")
     output(sub, "folder of the library")
@@ -344,14 +330,14 @@ def _parser() -> argparse.ArgumentParser:
     output(sub, "folder of the drive and the run")
     _add_force(sub)
     sub = add("schemas", schemas)
-    option(sub, "-o --output", local, "OUT", "folder (default: schemas)", default=Path("schemas"))
+    option(sub, "-o --output", parser.local, "OUT", "folder (default: schemas)", default=Path("schemas"))
     add("config", config, settings)
     sub = group("help", "Show what a verb does, and all its options.")
     sub.add_argument("words", nargs="*", metavar="VERB", help="such as `run` or `map query` (default: list the verbs)")
     sub.set_defaults(
-        verb=lambda arguments: parser.parse_args([*" ".join(arguments.words).split(), "--help"]), debug=False
+        verb=lambda arguments: root.parse_args([*" ".join(arguments.words).split(), "--help"]), debug=False
     )
-    return parser
+    return root
 
 
 def _add_force(sub: argparse.ArgumentParser, what: str = "run") -> None:
@@ -364,8 +350,9 @@ def _add_run(sub: argparse.ArgumentParser) -> None:
     option(sub, "--library", place, "LIB", "reference library (default: made from the drive)")
     flag(sub, "--one-drive", "the logs are the parts of one recording")
     flag(sub, "--gps", "use the log's satellite fixes as constraints")
-    option(sub, "--false-rate", share, "R", "share of false closures to allow, as 0.01 (default: all verified ones)")
-    option(sub, "--decisions", resolved, "FILE.csv", "closures to accept, reject or add, as report.html writes")
+    text = "share of false closures to allow, as 0.01 (default: all verified ones)"
+    option(sub, "--false-rate", parser.share, "R", text)
+    option(sub, "--decisions", parser.resolved, "FILE.csv", "closures to accept, reject or add, as report.html writes")
     flag(sub, "--resume", "continue the interrupted run in OUT; needs no LOG")
     _add_force(sub)
     flag(sub, "--no-cache", "do not cache results of stages in OUT for later runs", "cache")

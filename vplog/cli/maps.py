@@ -8,18 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog import api
-from vplog.cli import printing
-from vplog.cli.parser import (
-    at_least,
-    at_least_one,
-    cache_options,
-    flag,
-    option,
-    output_file,
-    place,
-    settings_options,
-    topics_of,
-)
+from vplog.cli import parser, printing
+from vplog.cli.parser import call, flag, option, place
 from vplog.cli.printing import Progress, print_result
 from vplog.errors import plural
 from vplog.execution.execution import Execution
@@ -70,7 +60,7 @@ def redescribe_map(arguments: argparse.Namespace) -> None:
         from vplog.batch.redescribe import redescribe_map as redescribe
 
         execution = Execution(arguments.threads, progress)
-        options = BatchOptions(arguments.jobs, arguments.engine, arguments.address, arguments.retries, processes)
+        options = call(BatchOptions, arguments, processes=processes)
         found = redescribe(arguments.map, arguments.library, arguments.target, execution, options)
     wrong = f"{found['failed']} of {plural(len(found['drives']), 'drive')} missing in {found['map']}."
     _end(arguments, found, printing.print_redescribed, wrong)
@@ -79,12 +69,7 @@ def redescribe_map(arguments: argparse.Namespace) -> None:
 def batch(arguments: argparse.Namespace) -> None:
     """Compute many recorded drives into one growing map, each drive in its own process, here or on a Ray cluster."""
     with Progress(arguments) as progress:
-        found = api.batch(
-            arguments.logs, arguments.map, arguments.pipeline, settings=arguments.set, topics=topics_of(arguments),
-            library=arguments.library, jobs=arguments.jobs, threads=arguments.threads, engine=arguments.engine,
-            address=arguments.address, retries=arguments.retries, join=arguments.join, keep_cache=arguments.keep_cache,
-            progress=progress, on_drive=progress.print_drive,
-        )  # fmt: skip
+        found = call(api.batch, arguments, progress=progress, on_drive=progress.print_drive)
     drives = plural(len(found["drives"]), "drive")
     wrong = f"{found['failed']} of {drives} failed; {arguments.map}/failures.json has the reasons."
     _end(arguments, found, printing.print_batch, wrong)
@@ -122,21 +107,14 @@ def info_map(arguments: argparse.Namespace) -> None:
 def query_map(arguments: argparse.Namespace) -> None:
     """Find the places of a map most like each view of a log, here or on the workers of a Ray cluster."""
     with Progress(arguments) as progress:
-        found = api.Map(arguments.map).query(
-            arguments.log, arguments.top, topics=topics_of(arguments), sequence=arguments.sequence,
-            out=arguments.output, engine=arguments.engine, address=arguments.address, cache=arguments.cache,
-            cache_gb=arguments.cache_gb, threads=arguments.threads, progress=progress,
-        )  # fmt: skip
+        found = call(api.Map(arguments.map).query, arguments, progress=progress)
     print_result(arguments, found.record, printing.print_answers)
 
 
 def localize(arguments: argparse.Namespace) -> None:
     """Find the pose of pictures, or of the frames of a log, in a run or a map, with covariance and verdict."""
     with Progress(arguments) as progress:
-        found = api.localize(
-            arguments.map, arguments.pictures, topics=topics_of(arguments), out=arguments.output, top=arguments.top,
-            threads=arguments.threads, progress=progress,
-        )  # fmt: skip
+        found = call(api.localize, arguments, progress=progress)
     print_result(arguments, found, printing.print_localized)
 
 
@@ -156,12 +134,13 @@ def add_maps(
     common: argparse.ArgumentParser, topics: argparse.ArgumentParser, threads: argparse.ArgumentParser,
 ) -> None:  # fmt: skip
     """The verbs `batch` and `localize`, and the verb `map` with its own verbs."""
-    _add_batch(add("batch", batch, topics, threads, settings_options(None, "that of the map, else default")))
+    _add_batch(add("batch", batch, topics, threads, parser.settings_options(None, "that of the map, else default")))
     sub = add("localize", localize, topics, threads)
     option(sub, "map", place, "MAP|RUN")
     option(sub, "pictures", place, "IMAGE|LOG", "images, a folder of them, or one log", nargs="+")
-    option(sub, "--top", at_least_one, "K", "places that each picture is verified against (default: 10)", default=10)
-    option(sub, "-o --output", output_file, "FILE.parquet|FILE.tum", "write the poses, or a log's trajectory")
+    text = "places that each picture is verified against (default: 10)"
+    option(sub, "--top", parser.at_least_one, "K", text, default=10)
+    option(sub, "-o --output", parser.output_file, "FILE.parquet|FILE.tum", "write the poses, or a log's trajectory")
     text = "Inspect, search, export, merge, join or change a map of many drives."
     maps = group("map", text).add_subparsers(required=True, metavar="VERB")
 
@@ -176,7 +155,7 @@ def add_maps(
     flag(sub, "--check", "check every file against its sha256; a line for each damaged one, and exit status 1")
     _add_query(verb("query", query_map, "find where a log's views are in a map", topics, threads))
     sub = verb("index", index_map, "build the index that queries search", threads)
-    cache_options(sub, "what is read of a map by URL is kept")
+    parser.cache_options(sub, "what is read of a map by URL is kept")
     _add_export(verb("export", export_map, "the places of a map or of runs, in one file", of_map=False))
     sub = verb("merge", merge_maps, "copy drives of maps into another map", of_map=False)
     option(sub, "maps", place, "MAP|FILE.parquet", "maps, or places that `map export` wrote", nargs="+")
@@ -193,13 +172,13 @@ def add_maps(
 
 def _add_query(sub: argparse.ArgumentParser) -> None:
     option(sub, "log", place, "LOG")
-    option(sub, "--top", at_least_one, "K", "places for each view (default: 10)", default=10)
-    option(sub, "--sequence", at_least_one, "L", "views in a window, odd; 1: none (default: as the map's)")
-    option(sub, "-o --output", output_file, "FILE.parquet", "write the answers")
+    option(sub, "--top", parser.at_least_one, "K", "places for each view (default: 10)", default=10)
+    option(sub, "--sequence", parser.at_least_one, "L", "views in a window, odd; 1: none (default: as the map's)")
+    option(sub, "-o --output", parser.output_file, "FILE.parquet", "write the answers")
     text = "who searches: this process, or Ray workers that see the map under the same path (default: local)"
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     option(sub, "--address", str, "HOST:PORT", "Ray cluster (default: one of this machine's cores)")
-    cache_options(sub, "what is read of a map by URL is kept")
+    parser.cache_options(sub, "what is read of a map by URL is kept")
 
 
 def _add_export(sub: argparse.ArgumentParser) -> None:
@@ -208,7 +187,7 @@ def _add_export(sub: argparse.ArgumentParser) -> None:
     text = "only places in this box, in degrees; LON0 > LON1 crosses the antimeridian (write --box=-33.9,...)"
     option(sub, "--box", _box, "LAT0,LON0,LAT1,LON1", text)
     sub.add_argument("--format", choices=("parquet", "geoparquet"), default="parquet", help="(default: parquet)")
-    option(sub, "-o --output", output_file, "FILE.parquet", "file to write", required=True)
+    option(sub, "-o --output", parser.output_file, "FILE.parquet", "file to write", required=True)
 
 
 def _box(text: str) -> tuple[float, float, float, float]:
@@ -226,13 +205,13 @@ def _box(text: str) -> tuple[float, float, float, float]:
 def _add_workers(sub: argparse.ArgumentParser) -> None:
     """Who computes drives."""
     text = "drives at once (default: 1; over Ray as many as the cluster has cores for)"
-    option(sub, "--jobs", at_least_one, "N", text)
+    option(sub, "--jobs", parser.at_least_one, "N", text)
     text = "processes of this machine, or tasks of a Ray cluster (default: local)"
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     text = "HOST:PORT of a Ray cluster, or auto (default: one on this machine for the time of the batch)"
     option(sub, "--address", str, "HOST:PORT", text)
     text = "retries of a drive whose worker was killed or had an I/O error (default: 2)"
-    option(sub, "--retries", at_least(0), "N", text, default=2)
+    option(sub, "--retries", parser.at_least(0), "N", text, default=2)
 
 
 def _add_batch(sub: argparse.ArgumentParser) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import inspect
 import math
 import os
 import textwrap
@@ -230,6 +231,15 @@ def pipeline_of(arguments: argparse.Namespace) -> Pipeline:
     from vplog.pipeline import load_pipeline
 
     return load_pipeline(arguments.pipeline, arguments.set)
+
+
+def call(function: Callable[..., Any], arguments: argparse.Namespace, **more: Any) -> Any:
+    """Call a function with the arguments of the command that it takes by name, and with more."""
+    names = inspect.signature(function).parameters
+    given = vars(arguments) | {"settings": vars(arguments).get("set"), "out": vars(arguments).get("output")}
+    if "topics" in names:
+        given["topics"] = topics_of(arguments)
+    return function(**{name: value for name, value in given.items() if name in names} | more)
 
 
 def topics_of(arguments: argparse.Namespace) -> TopicChoice:

@@ -10,27 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vplog.cli.parser import (
-    STDOUT,
-    flag,
-    local_file,
-    number,
-    option,
-    output_file,
-    output_or_stdout,
-    place,
-    positive,
-    topics_of,
-)
-from vplog.cli.printing import (
-    Progress,
-    print_diff,
-    print_evaluation,
-    print_explanation,
-    print_json,
-    print_optimised,
-    print_result,
-)
+from vplog import api
+from vplog.cli import parser, printing
+from vplog.cli.parser import call, flag, option, place
+from vplog.cli.printing import Progress, print_json, print_result
 from vplog.errors import ResultError, SettingsError
 from vplog.execution.execution import Execution
 
@@ -44,7 +27,9 @@ _ALIGNMENTS = ("se3", "sim3", "origin")
 """Alignments of evaluate/trajectory.py, here too since that imports numpy."""
 _MOST_OFFSET_S = 1e9
 """s; thirty years, from any clock that starts at zero to one of today."""
-_seconds = number(lambda value: abs(value) <= _MOST_OFFSET_S, f"between -{_MOST_OFFSET_S:g} and {_MOST_OFFSET_S:g}")
+_seconds = parser.number(
+    lambda value: abs(value) <= _MOST_OFFSET_S, f"between -{_MOST_OFFSET_S:g} and {_MOST_OFFSET_S:g}"
+)
 _FOLDERS = ("colmap", "nerfstudio")
 _FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd", *_FOLDERS)
 """Formats of export.py, here too since that imports numpy."""
@@ -53,10 +38,7 @@ _BINARY = ("geoparquet", "rrd")
 
 def evaluate(arguments: argparse.Namespace) -> None:
     """Evaluate a run, of one or several drives, against ground truth."""
-    from vplog.verbs.evaluate_run import evaluate as evaluate_run
-
-    found = evaluate_run(arguments.run, arguments.truth, topics_of(arguments), _truth_options(arguments))
-    print_result(arguments, found, print_evaluation)
+    print_result(arguments, call(api.evaluate, arguments), printing.print_evaluation)
 
 
 def explain(arguments: argparse.Namespace) -> None:
@@ -66,7 +48,7 @@ def explain(arguments: argparse.Namespace) -> None:
     found = explain_closure(
         arguments.run, arguments.closure, arguments.output, arguments.log, words_only=arguments.no_picture
     )
-    print_result(arguments, found, print_explanation)
+    print_result(arguments, found, printing.print_explanation)
 
 
 def optimize(arguments: argparse.Namespace) -> None:
@@ -74,7 +56,7 @@ def optimize(arguments: argparse.Namespace) -> None:
     from vplog.verbs.optimize import optimize as optimize_graph
 
     done = optimize_graph(arguments.graph, arguments.output, arguments.method, arguments.certify)
-    print_result(arguments, done.record, print_optimised)
+    print_result(arguments, done.record, printing.print_optimised)
 
 
 def report(arguments: argparse.Namespace) -> None:
@@ -82,7 +64,7 @@ def report(arguments: argparse.Namespace) -> None:
     from vplog.verbs.report import report as write_report
 
     found = write_report(
-        arguments.run, arguments.output, arguments.truth, arguments.log, topics_of(arguments),
+        arguments.run, arguments.output, arguments.truth, arguments.log, parser.topics_of(arguments),
         _truth_options(arguments), Execution(arguments.threads),
     )  # fmt: skip
     print_result(arguments, found, lambda found: print(found["report"]))
@@ -97,8 +79,8 @@ def diff(arguments: argparse.Namespace) -> None:
     if len(runs) != 2:
         arguments.refuse(f"two runs are compared, BASELINE RUN or RUN --baseline BASELINE, and {len(runs)} were given")
     check_limits(arguments.fail_on)
-    found = diff_runs(runs[0], runs[1], arguments.truth, topics_of(arguments), _truth_options(arguments))
-    print_result(arguments, found, print_diff)
+    found = diff_runs(runs[0], runs[1], arguments.truth, parser.topics_of(arguments), _truth_options(arguments))
+    print_result(arguments, found, printing.print_diff)
     if sentences := exceeded(found, arguments.fail_on):
         raise ResultError(" ".join(sentences))
 
@@ -107,7 +89,7 @@ def export(arguments: argparse.Namespace) -> None:
     """Write a finished run in the format of another tool."""
     from vplog.verbs.export import export as export_run
 
-    if arguments.output is STDOUT and arguments.format in _FOLDERS:
+    if arguments.output is parser.STDOUT and arguments.format in _FOLDERS:
         raise SettingsError(f"{arguments.format} is a folder, which stdout does not take. Name one with -o.")
     if arguments.output.is_dir() and arguments.format not in _FOLDERS:
         raise SettingsError(f"{arguments.output} is a folder, and {arguments.format} a file. Name one with -o.")
@@ -128,8 +110,8 @@ def _truth_options(arguments: argparse.Namespace) -> TruthOptions:
 
 
 def _add_truth_options(sub: argparse.ArgumentParser) -> None:
-    option(sub, "--distance-m", positive, "M", "largest distance within one place (default: 6)")
-    option(sub, "--heading-deg", positive, "DEG", "largest angle between optical axes (default: 45)")
+    option(sub, "--distance-m", parser.positive, "M", "largest distance within one place (default: 6)")
+    option(sub, "--heading-deg", parser.positive, "DEG", "largest angle between optical axes (default: 45)")
     sub.add_argument("--align", choices=_ALIGNMENTS, help="alignment of the ATE (default: se3)")
     option(sub, "--truth-offset-s", _seconds, "S", "add to the truth's stamps (default: 0)")
 
@@ -137,7 +119,7 @@ def _add_truth_options(sub: argparse.ArgumentParser) -> None:
 @contextmanager
 def _file_or_stdout(arguments: argparse.Namespace, binary: bool = False) -> Iterator[Path]:
     """The file to write: the one that -o names; for `-` a scratch file that goes to stdout when it is whole."""
-    if arguments.output is not STDOUT:  # ./- is a file
+    if arguments.output is not parser.STDOUT:  # ./- is a file
         yield arguments.output
         return
     from vplog.errors import SettingsError
@@ -166,7 +148,7 @@ def add_results(
     option(sub, "--truth", str, "FILE.tum|gps|auto", _TRUTH)
     _add_truth_options(sub)
     option(sub, "--log", place, "LOG", "log of the run, for pictures that result.mcap lacks")
-    option(sub, "-o --output", output_file, "FILE.html", "page (default: RUN/report.html)")
+    option(sub, "-o --output", parser.output_file, "FILE.html", "page (default: RUN/report.html)")
     sub = add("diff", diff, topics)
     sub.set_defaults(refuse=sub.error)
     option(sub, "runs", place, "RUN", nargs="+")
@@ -179,10 +161,10 @@ def add_results(
     option(sub, "run", place, "RUN")
     sub.add_argument("--format", required=True, choices=_FORMATS, help="format to write")
     text = "file to write, a folder for colmap and nerfstudio; - writes a file to stdout"
-    option(sub, "-o --output", output_or_stdout, "FILE|FOLDER|-", text, required=True)
+    option(sub, "-o --output", parser.output_or_stdout, "FILE|FOLDER|-", text, required=True)
     option(sub, "--log", place, "LOG", "log of the run, for the pictures of colmap and nerfstudio, where it has moved")
     sub = add("optimize", optimize)
-    option(sub, "graph", local_file, "GRAPH.g2o")
+    option(sub, "graph", parser.local_file, "GRAPH.g2o")
     option(sub, "-o --output", _graph, "OUT", "the graph at its solved poses, as g2o", required=True)
     sub.add_argument("--method", choices=_SOLVERS, default="gnc", help="robust method, or lm (default: gnc)")
     text = "report whether the solution is the global optimum of the accepted edges, and look for a better one if not"
@@ -195,13 +177,13 @@ def _add_explain(sub: argparse.ArgumentParser) -> None:
     text = "row of closures.parquet, or its two keyframes, by row or by stamp in ns"
     option(which, "--closure", _closure, "K|QUERY:MATCH", text)
     flag(which, "--worst", "the closure that the solved trajectory is furthest from")
-    option(sub, "-o --output", output_file, "PICTURE.png", "picture, .png or .svg (default: RUN/closure-K.png)")
+    option(sub, "-o --output", parser.output_file, "PICTURE.png", "picture, .png or .svg (default: RUN/closure-K.png)")
     option(sub, "--log", place, "LOG", "the run's log, where it has moved since")
     flag(sub, "--no-picture", "no picture; the log is not needed")
 
 
 def _graph(text: str) -> Path:
-    return place(text) if "://" in text else output_file(text)
+    return place(text) if "://" in text else parser.output_file(text)
 
 
 def _closure(text: str) -> tuple[int, ...]:

@@ -12,7 +12,6 @@ from vplog.evaluate.retrieval import Ranks, Reliability, reliability
 
 FALSE_ALARMS = 0.01
 """Share of the queries without a match that may be answered."""
-_BINS = 10
 
 
 def score_open_set(ranks: Ranks) -> dict[str, Any]:
@@ -41,7 +40,7 @@ def reliability_of_matches(ranks: Ranks) -> Reliability:
     if ranks.p_match is None:
         raise ValueError("no probabilities")
     known = ~np.isnan(ranks.p_match)
-    return reliability(np.clip(ranks.p_match[known], 0.0, 1.0), ranks.top_true[known] > 0.5, _BINS)
+    return reliability(np.clip(ranks.p_match[known], 0.0, 1.0), ranks.top_true[known] > 0.5)
 
 
 def auroc(scores: Floats, positive: Bools) -> float | None:

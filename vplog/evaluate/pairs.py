@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from vplog.data import Bools, Floats, Int32s, Ints, Trajectory
 from vplog.geometry import se3
@@ -162,16 +163,10 @@ def bracketing(stamp_ns: Ints, at_ns: Ints) -> tuple[Ints, Ints, Bools]:
 
 
 def _near(query: Floats | Ints, match: Floats | Ints, distance_m: float) -> Iterable[Int32s]:
-    """For each query the increasing rows of `match` within the distance; sorted along the longest axis: not Q x M."""
-    axis = int(np.ptp(match, axis=0).argmax()) if len(match) else 0
-    order = np.argsort(match[:, axis], kind="stable")
-    along = match[order, axis]
-    first = np.searchsorted(along, query[:, axis] - distance_m, side="left")
-    stop = np.searchsorted(along, query[:, axis] + distance_m, side="right")
-    for position, begin, end in zip(query, first.tolist(), stop.tolist(), strict=True):
-        rows = order[begin:end]
-        rows = rows[((match[rows] - position) ** 2).sum(1) <= distance_m**2]
-        yield np.sort(rows).astype(np.int32)
+    """For each query the increasing rows of `match` within the distance, one query at a time: not Q x M."""
+    tree = KDTree(match)
+    for position in query:
+        yield np.array(tree.query_ball_point(position, distance_m, return_sorted=True), np.int32)
 
 
 def _runs(rows_of_each: Iterable[Int32s]) -> Pairs:

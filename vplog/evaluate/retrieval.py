@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from vplog.evaluate.pairs import Pairs
 
 
+BINS = 10
+"""Bins of the probability: with the 200 answers of a short traversal a bin holds 20."""
+
+
 @dataclass(frozen=True, eq=False)
 class Ranks:
     """Ranks of the true rows of Q queries, by their scores."""
@@ -215,7 +219,7 @@ class Reliability:
         }
 
 
-def reliability(probability: ArrayLike, right: Bools, bins: int) -> Reliability:
+def reliability(probability: ArrayLike, right: Bools, bins: int = BINS) -> Reliability:
     """Compare the probabilities (Q,) of Q answers with which of them are right (Q,).
 
     Guo et al., On calibration of modern neural networks, ICML 2017, Eq. (3). Raises TruthError without answers, and

@@ -18,8 +18,7 @@ from vplog.geometry import se3, tum
 from vplog.localize.localize import TOP, LocalizedPicture, localize_log
 from vplog.localize.places import Places, opened
 from vplog.localize.trajectory import JoinedLog, join_by_odometry
-from vplog.results.localized_table import write_localized
-from vplog.results.tables import TableMetadata
+from vplog.results.tables import TableMetadata, write_localized
 from vplog.run.keyframes import select_keyframes
 from vplog.storage.scratch import check_file_output
 

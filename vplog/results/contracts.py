@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow as pa
 
 from vplog.errors import ResultError
-from vplog.results import feature_table, landmark_table, localized_table, messages, places_map, tables
+from vplog.results import feature_table, landmark_table, messages, places_map, tables
 from vplog.results.mcap import TOPICS
 from vplog.results.staging import check_contents
 from vplog.storage.parquet_limits import TABLE_VERSION, VERSION_ABOUT, VERSION_KEY
@@ -114,7 +114,7 @@ def table_schemas() -> dict[str, pa.Schema]:
         "placed": tables.PLACED,
         "features": feature_table.FEATURES,
         "landmarks": landmark_table.LANDMARKS,
-        "localized": localized_table.LOCALIZED,
+        "localized": tables.LOCALIZED,
         "map": pa.schema([*places_map.PLACE, tables.descriptors_schema(pa.binary()).field("descriptor")]),
     }
 

@@ -5,19 +5,17 @@ One row group for each keyframe, so that any of them is read alone.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from vplog.data import Features
-from vplog.errors import ResultError
-from vplog.results.tables import FLOAT32_LIST, column
-from vplog.storage.parquet_limits import VERSION_ABOUT, VERSION_KEY, check_columns, open_table, table_writer
-from vplog.storage.scratch import replacing
+from vplog.results.keyframe_table import KeyframeTable, write_groups
+from vplog.results.tables import FLOAT32_LIST, column, reading
+from vplog.storage.parquet_limits import VERSION_ABOUT, VERSION_KEY
 
 _LEVEL = 1
 """Level of zstd: descriptors shrink by a fifth at any level."""
@@ -59,70 +57,33 @@ def write_features(path: Path, count: int, features: Callable[[int], Features], 
     header = {"vplog.table": "features", "vplog.made_from": made_from, "vplog.most_features": str(most)}
     if count:  # an image without features does not tell
         header["vplog.descriptor_bytes"] = str(features(0).descriptors.shape[1])
-    schema = FEATURES.with_metadata(header)
-    with (
-        replacing(path) as stream,
-        table_writer(stream, schema, compression="zstd", compression_level=_LEVEL, use_dictionary=False) as writer,
-    ):
-        for row in range(count):
-            own = features(row)
-            floats = [own.points[:most, 0], own.points[:most, 1], own.sizes[:most], own.depth_m[:most]]
-            writer.write_table(
-                pa.Table.from_arrays(
-                    [
-                        *(pa.array([value], pa.int32()) for value in (row, own.width, own.height)),
-                        *(pa.array([np.ascontiguousarray(values, np.float32)], FLOAT32_LIST) for values in floats),
-                        pa.array([own.descriptors[:most].tobytes()], pa.binary()),
-                    ],
-                    schema=writer.schema,
-                )
-            )
+    groups = (_columns(row, features(row), most) for row in range(count))
+    write_groups(path, FEATURES.with_metadata(header), groups, _LEVEL)
 
 
-class FeatureTable:
-    """Features of keyframes in such a file. Reads are safe from any thread."""
+def _columns(row: int, own: Features, most: int) -> list[list[Any]]:
+    floats = (own.points[:most, 0], own.points[:most, 1], own.sizes[:most], own.depth_m[:most])
+    lists = [[np.ascontiguousarray(values, np.float32)] for values in floats]
+    return [[row], [own.width], [own.height], *lists, [own.descriptors[:most].tobytes()]]
+
+
+class FeatureTable(KeyframeTable[Features]):
+    """Features of keyframes in such a file."""
 
     def __init__(self, path: Path, made_from: str, most: int) -> None:
         """Raises ResultError where there is no such file, or one made from something else or of fewer features."""
-        try:
-            self._file = open_table(path)
-            check_columns(self._file.schema_arrow, FEATURES)
-            header = self._file.schema_arrow.metadata or {}
-            held = int(header.get(b"vplog.most_features", b"0")[:9])
-            self._descriptor_bytes = int(header.get(b"vplog.descriptor_bytes", b"128")[:9])
-        except (OSError, ValueError, pa.ArrowException) as error:
-            raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0].rstrip('.')}.") from None
-        self._path, self._lock = path, threading.Lock()
-        self._read = lru_cache(_IN_MEMORY)(self._from_file)
-        if header.get(b"vplog.made_from") != made_from.encode() or held < most:
-            self.close()
-            raise ResultError(f"{path} is of another state of the drive, or holds fewer features.")
+        super().__init__(path, FEATURES, made_from, self._features, 1, _IN_MEMORY)
+        with reading(path, "", ""):
+            held = int(self.header.get("vplog.most_features", "0")[:9])
+            self._descriptor_bytes = int(self.header.get("vplog.descriptor_bytes", "128")[:9])
+        if held < most:
+            self.refuse("is of another state of the drive, or holds fewer features")
 
-    def __len__(self) -> int:
-        return self._file.num_row_groups
-
-    def close(self) -> None:
-        self._file.close()
-
-    def __getitem__(self, row: int) -> Features:
-        """Raises ResultError where the file is damaged."""
-        return self._read(row)
-
-    def _from_file(self, row: int) -> Features:
-        try:
-            with self._lock:
-                table = self._file.read_row_group(row, FEATURES.names)
-            width, height = (int(table[name][0].as_py()) for name in ("width", "height"))
-            x, y, size, depth = (
-                table[name].combine_chunks().flatten().to_numpy() for name in ("x", "y", "size", "depth")
-            )
-            data = table["descriptors"][0].as_buffer()
-            descriptors = np.frombuffer(data, np.uint8).reshape(len(x), self._descriptor_bytes)
-            points = np.column_stack([x, y]).astype(np.float32)
-            if not len(y) == len(size) == len(depth) == len(x):
-                raise ValueError("columns of different length")
-        except (OSError, ValueError, IndexError, pa.ArrowException) as error:
-            raise ResultError(
-                f"{self._path}: keyframe {row} cannot be read: {str(error).splitlines()[0].rstrip('.')}."
-            ) from None
-        return Features(points, size.astype(np.float32), descriptors, depth.astype(np.float32), width, height)
+    def _features(self, table: pa.Table, at: int) -> Features:
+        width, height = (int(table[name][at].as_py()) for name in ("width", "height"))
+        x, y, size, depth = (np.array(table[name][at].values) for name in ("x", "y", "size", "depth"))
+        if not len(y) == len(size) == len(depth) == len(x):
+            raise ValueError("columns of different length")
+        data = table["descriptors"][at].as_buffer()
+        descriptors = np.frombuffer(data, np.uint8).reshape(len(x), self._descriptor_bytes)
+        return Features(np.column_stack([x, y]), size, descriptors, depth, width, height)

@@ -43,7 +43,10 @@ def on_earth(earth: Earth, world_from_body: Floats) -> Floats:
 
 def feature_collection(earth: Earth, world_from_body: Floats, stamp_ns: Ints, closures: Closures) -> dict[str, Any]:
     """GeoJSON of keyframes (N, 4, 4): the path as one line, and of each accepted closure the line between its ends."""
-    where = [_rounded(row) for row in on_earth(earth, world_from_body).tolist()]
+    where = [
+        [round(x, _DEGREE_DIGITS), round(y, _DEGREE_DIGITS), round(z, _METRE_DIGITS)]
+        for x, y, z in on_earth(earth, world_from_body).tolist()
+    ]
     features = []
     if len(where) > 1:
         about = {"name": "optimised", "start_ns": str(stamp_ns[0]), "end_ns": str(stamp_ns[-1])}
@@ -60,16 +63,15 @@ def write_geojson(path: Path, tree: dict[str, Any]) -> None:
         stream.write((json.dumps(tree, separators=(",", ":"), allow_nan=False) + "\n").encode())
 
 
-def write_kml(path: Path, earth: Earth, world_from_body: Floats, closures: Closures, name: str) -> None:
+def write_kml(path: Path, tree: dict[str, Any], name: str) -> None:
     """The lines of `feature_collection`, on the ground: a map's heights are not those of the ellipsoid."""
-    where = [f"{x:.{_DEGREE_DIGITS}f},{y:.{_DEGREE_DIGITS}f}" for x, y, _ in on_earth(earth, world_from_body).tolist()]
     kml = ElementTree.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
     document = ElementTree.SubElement(kml, "Document")
-    rows = np.flatnonzero(closures.accepted).tolist()
-    ends = [(f"closure {row}", [where[closures.match[row]], where[closures.query[row]]]) for row in rows]
-    for title, points in [(name, where), *ends]:
+    for feature in tree["features"]:
+        about, where = feature["properties"], feature["geometry"]["coordinates"]
+        points = [f"{x:.{_DEGREE_DIGITS}f},{y:.{_DEGREE_DIGITS}f}" for x, y, _ in where]
         mark = ElementTree.SubElement(document, "Placemark")
-        ElementTree.SubElement(mark, "name").text = title
+        ElementTree.SubElement(mark, "name").text = f"closure {about['closure']}" if "closure" in about else name
         line = ElementTree.SubElement(mark, "LineString")
         ElementTree.SubElement(line, "tessellate").text = "1"
         ElementTree.SubElement(line, "coordinates").text = " ".join(points)
@@ -120,7 +122,3 @@ def geo_header(low: Floats, high: Floats) -> dict[str, str]:
 def _line(where: list[list[float]], properties: dict[str, Any]) -> dict[str, Any]:
     geometry_ = {"type": "LineString", "coordinates": where}
     return {"type": "Feature", "geometry": geometry_, "properties": properties}
-
-
-def _rounded(row: list[float]) -> list[float]:
-    return [round(row[0], _DEGREE_DIGITS), round(row[1], _DEGREE_DIGITS), round(row[2], _METRE_DIGITS)]

@@ -7,9 +7,8 @@ of each value of its descriptor.
 from __future__ import annotations
 
 import json
-import threading
-from collections.abc import Iterable
-from functools import lru_cache
+from collections.abc import Iterable, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +16,11 @@ import numpy as np
 import pyarrow as pa
 
 from vplog.data import Bytes, Camera, Features, Floats
-from vplog.errors import ResultError
 from vplog.results.camera_record import camera_from
-from vplog.results.tables import column
+from vplog.results.keyframe_table import KeyframeTable, write_groups
+from vplog.results.tables import column, reading
 from vplog.storage.json_records import plain
-from vplog.storage.parquet_limits import (
-    VERSION_ABOUT,
-    VERSION_KEY,
-    check_columns,
-    check_size,
-    open_table,
-    table_writer,
-)
-from vplog.storage.scratch import replacing
+from vplog.storage.parquet_limits import VERSION_ABOUT, VERSION_KEY
 
 _LEVEL = 3
 """Level of zstd."""
@@ -87,79 +78,36 @@ def write_landmarks(
         "vplog.table": "landmarks", "vplog.made_from": made_from, "vplog.scale": scale,
         "vplog.camera": json.dumps(plain(dict(vars(camera)))),
     }  # fmt: skip
-    schema = LANDMARKS.with_metadata(header)
-    with (
-        replacing(path, parents=True) as stream,
-        table_writer(stream, schema, compression="zstd", compression_level=_LEVEL, use_dictionary=False) as writer,
-    ):
-        waiting: list[tuple[int, Features, Floats]] = []
-        for row, (features, sigma) in enumerate(keyframes):
-            waiting.append((row, features, sigma))
-            if len(waiting) == _KEYFRAMES_PER_GROUP:
-                writer.write_table(_group(waiting, writer.schema))
-                waiting = []
-        if waiting:
-            writer.write_table(_group(waiting, writer.schema))
+    rows = enumerate(keyframes)
+    groups = iter(lambda: list(islice(rows, _KEYFRAMES_PER_GROUP)), [])
+    write_groups(path, LANDMARKS.with_metadata(header), map(_columns, groups), _LEVEL)
 
 
-def _group(keyframes: list[tuple[int, Features, Floats]], schema: pa.Schema) -> pa.Table:
+def _columns(keyframes: Sequence[tuple[int, tuple[Features, Floats]]]) -> list[list[Any]]:
     shares = [
         np.rint((own.points + 0.5) / [own.width, own.height] * _PIXELS).clip(0, _PIXELS).astype(np.uint16)
-        for _, own, _ in keyframes
+        for _, (own, _) in keyframes
     ]
-    columns: list[Any] = [
-        [row for row, _, _ in keyframes],
+    return [
+        [row for row, _ in keyframes],
         [share[:, 0] for share in shares],
         [share[:, 1] for share in shares],
-        [(1.0 / own.depth_m).astype(np.float16) for _, own, _ in keyframes],
-        [sigma.astype(np.float16) for _, _, sigma in keyframes],
-        [quantised(own.descriptors).tobytes() for _, own, _ in keyframes],
+        [(1.0 / own.depth_m).astype(np.float16) for _, (own, _) in keyframes],
+        [sigma.astype(np.float16) for _, (_, sigma) in keyframes],
+        [quantised(own.descriptors).tobytes() for _, (own, _) in keyframes],
     ]
-    return pa.Table.from_arrays(
-        [pa.array(values, field.type) for values, field in zip(columns, schema, strict=True)], schema=schema
-    )
 
 
-class LandmarkTable:
-    """Landmarks of keyframes in such a file. Reads are safe from any thread."""
+class LandmarkTable(KeyframeTable[tuple[Features, Floats]]):
+    """Landmarks of keyframes in such a file: features (L,) with depths, and the standard deviation (L,) of the inverse
+    depths."""
 
     def __init__(self, path: Path, made_from: str) -> None:
         """Raises ResultError where there is no such file, or one made from something else."""
-        try:
-            self._file = open_table(path)
-            check_columns(self._file.schema_arrow, LANDMARKS)
-            check_size(path, self._file, LANDMARKS.names)
-            header = {key.decode(): value.decode() for key, value in (self._file.schema_arrow.metadata or {}).items()}
-            self.camera = camera_from(json.loads(header["vplog.camera"]), "Run `vplog localize` again.")
-            self.scale = header["vplog.scale"]
-        except (OSError, ValueError, KeyError, RecursionError, pa.ArrowException) as error:
-            raise ResultError(f"{path} cannot be read: {str(error).splitlines()[0].rstrip('.')}.") from None
-        self._path, self._lock = path, threading.Lock()
-        self._read = lru_cache(_IN_MEMORY)(self._group)
-        if header.get("vplog.made_from") != made_from:
-            self.close()
-            raise ResultError(f"{path} is of another state of the drive.")
-
-    def __len__(self) -> int:
-        return self._file.metadata.num_rows
-
-    def close(self) -> None:
-        self._file.close()
-
-    def __getitem__(self, row: int) -> tuple[Features, Floats]:
-        """Landmarks of a keyframe as features (L,) with depths, and the standard deviation (L,) of the inverse depths.
-        Raises ResultError where the file is damaged."""
-        try:
-            return self._read(row // _KEYFRAMES_PER_GROUP)[row % _KEYFRAMES_PER_GROUP]
-        except (OSError, ValueError, IndexError, pa.ArrowException) as error:
-            raise ResultError(
-                f"{self._path}: keyframe {row} cannot be read: {str(error).splitlines()[0].rstrip('.')}."
-            ) from None
-
-    def _group(self, number: int) -> list[tuple[Features, Floats]]:
-        with self._lock:
-            table = self._file.read_row_group(number, LANDMARKS.names)
-        return [self._landmarks(table, at) for at in range(len(table))]
+        super().__init__(path, LANDMARKS, made_from, self._landmarks, _KEYFRAMES_PER_GROUP, _IN_MEMORY)
+        with reading(path, "", ""):
+            self.camera = camera_from(json.loads(self.header["vplog.camera"]), "Run `vplog localize` again.")
+            self.scale = self.header["vplog.scale"]
 
     def _landmarks(self, table: pa.Table, at: int) -> tuple[Features, Floats]:
         x, y, rho, sigma = (

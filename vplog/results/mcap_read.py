@@ -23,10 +23,10 @@ from mcap.reader import McapReader, make_reader
 from mcap.writer import MCAP0_MAGIC
 
 from vplog.data import Floats, Gps
-from vplog.errors import ResultError
 from vplog.geometry import se3
 from vplog.results.foxglove import CAMERA
 from vplog.results.mcap import FIXES, PICTURES
+from vplog.results.tables import reading
 from vplog.storage.parquet_limits import crc_of
 
 _DATA_END = struct.Struct("<BQI")
@@ -113,15 +113,9 @@ def read_camera_pose(path: Path) -> Floats | None:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[McapReader]:
-    try:
-        with path.open("rb") as stream:
-            _check_crcs(stream)
-            yield make_reader(stream, validate_crcs=True)
-    except FileNotFoundError:
-        raise ResultError(f"{path} does not exist. Give the folder that `vplog run -o` wrote.") from None
-    except (OSError, McapError, DecodeError, ValueError, EOFError, struct.error) as error:
-        why = (str(error).splitlines() or [type(error).__name__])[0]
-        raise ResultError(f"{path} cannot be read: {why} Run `vplog run` again.") from None
+    with reading(path, more=(McapError, DecodeError, EOFError, struct.error)), path.open("rb") as stream:
+        _check_crcs(stream)
+        yield make_reader(stream, validate_crcs=True)
 
 
 def _check_crcs(stream: BinaryIO) -> None:

@@ -42,6 +42,7 @@ PLACE = pa.schema(
     ]
 )
 """As in keyframes.parquet; the poses of each drive are in a frame of its own."""
+_AGAIN = "Write it again: vplog map export MAP -o FILE.parquet"
 _COUNTED = ("keyframe", "stamp_ns")
 """Columns that grow by little from row to row."""
 
@@ -181,7 +182,7 @@ class PlacesHeader:
 
 def read_places_header(path: Path) -> PlacesHeader:
     """The header of a map of places. Raises ResultError where it is none."""
-    with _reading(path):
+    with tables.reading(path, _AGAIN, _AGAIN):
         header = {key.decode(): value.decode() for key, value in (read_schema(path).metadata or {}).items()}
         settings, drives = (json.loads(header.get(f"vplog.{name}", "null")) for name in ("settings", "drives"))
         canonical_json([settings, drives])  # not nested deeper than can be written again
@@ -197,7 +198,7 @@ def read_places_header(path: Path) -> PlacesHeader:
 def places_by_drive(path: Path) -> dict[str, int]:
     """Number of places of each drive in a map. Raises ResultError."""
     found: dict[str, int] = {}
-    with _reading(path), _opened(path, ["drive"]) as file:
+    with tables.reading(path, _AGAIN, _AGAIN), _opened(path, ["drive"]) as file:
         for batch in file.iter_batches(ROWS_PER_GROUP, columns=["drive"]):
             for value in batch.column(0).value_counts():
                 drive = str(value["values"])
@@ -213,7 +214,7 @@ def read_drives(path: Path, kind: pa.DataType) -> Iterator[DrivePlaces]:
         raise ResultError(f"{path} is not a map of places of this recogniser.")
     schema = pa.schema([*PLACE, *(pa.field(name, _stored(part), False) for name, part in parts)])
     done, waiting = set[str](), list[pa.Table]()
-    with _reading(path), _opened(path, schema.names) as file:
+    with tables.reading(path, _AGAIN, _AGAIN), _opened(path, schema.names) as file:
         for number in range(file.num_row_groups):
             if (rows := file.metadata.row_group(number).num_rows) > _MOST_ROWS:
                 raise ResultError(f"{path} has {rows} places in a row group; write it with at most {_MOST_ROWS}.")
@@ -239,18 +240,6 @@ def _opened(path: Path, columns: list[str]) -> Iterator[pq.ParquetFile]:
     with open_table(path, read_dictionary=["drive"]) as file:
         check_size(path, file, columns)
         yield file
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Raises ResultError in place of the errors of a damaged file."""
-    try:
-        yield
-    except (OSError, ValueError, KeyError, RecursionError, pa.ArrowException) as error:
-        why = next(iter(str(error).splitlines()), type(error).__name__)
-        raise ResultError(
-            f"{path} cannot be read: {why} Write it again: vplog map export MAP -o FILE.parquet"
-        ) from None
 
 
 def _stretches(table: pa.Table) -> Iterator[tuple[str, pa.Table]]:

@@ -176,6 +176,25 @@ PLACED = pa.schema(
     ]
 )
 """Answers of a query of a map, by view, then by rank."""
+LOCALIZED = pa.schema(
+    [
+        column("picture", pa.string(), "", "File of the picture, or its stamp in a log."),
+        column("stamp_ns", pa.int64(), "ns", "Stamp of the picture, in the log's clock."),
+        column("verdict", pa.string(), "", "`accepted` where it has a pose."),
+        column("sentence", pa.string(), "", "The verdict in one sentence."),
+        column("drive", pa.string(), "", "Drive of the keyframe that explains it best; null without one.", True),
+        column("keyframe", pa.int32(), "row", "That keyframe, 0 is the drive's first; null without one.", True),
+        column("frame", pa.string(), "", "Frame of the pose: the first of the drives joined with that one.", True),
+        column("matches", pa.int32(), "features", "Feature matches with that keyframe's landmarks."),
+        column("inliers", pa.int32(), "features", "Features that agree with the pose."),
+        column("places", pa.int32(), "keyframes", "Keyframes whose landmarks they match."),
+        *pose_columns("", "world_from_camera, null where not localised", nullable=True),
+        column("covariance", MATRIX, "rad^2, rad m, m^2", "6x6 of the pose in the camera, relative to the map.", True),
+        column("longitude", pa.float64(), "deg", "WGS84; null where the frame's place on earth is not known.", True),
+        column("latitude", pa.float64(), "deg", "WGS84; null where the frame's place on earth is not known.", True),
+        column("altitude_m", pa.float64(), "m", "WGS84; null where the frame's place on earth is not known.", True),
+    ]
+)
 _SCHEMAS = {"keyframes": KEYFRAMES, "closures": CLOSURES, "joins": JOINS, "edges": EDGES, "trajectory": TRAJECTORY}
 
 
@@ -409,7 +428,7 @@ def write_descriptors(path: Path, keyframes: Keyframes, descriptors: pa.Array, m
 
 def read_descriptors(path: Path) -> tuple[pa.Array, str]:
     """The descriptors in the order of the keyframes, and the hash of the library they belong to."""
-    with _reading(path), open_table(path) as file:
+    with reading(path), open_table(path) as file:
         _check_name(path, "descriptors", file.schema_arrow)
         table = read_table(path, file, ["descriptor"])
         return table["descriptor"].combine_chunks(), (table.schema.metadata or {}).get(b"vplog.library", b"").decode()
@@ -428,7 +447,7 @@ def read_arrow(path: Path) -> pa.Table:
 
 def read_stamps(path: Path) -> Ints:
     """Stamps (N,) of the rows of a table of descriptors, in ns. Raises ResultError."""
-    with _reading(path), open_table(path) as file:
+    with reading(path), open_table(path) as file:
         stamp_ns = read_table(path, file, ["stamp_ns"])["stamp_ns"]
     if stamp_ns.type != pa.int64() or stamp_ns.null_count:
         raise ResultError(f"{path} is damaged: its stamps are no whole numbers of ns. Run `vplog run` again.")
@@ -437,13 +456,13 @@ def read_stamps(path: Path) -> Ints:
 
 def descriptors_type(path: Path) -> pa.DataType:
     """The recogniser's own type of a table of descriptors, of which the footer alone is read. Raises ResultError."""
-    with _reading(path):
+    with reading(path):
         return read_schema(path).field("descriptor").type
 
 
 def read_metadata(path: Path) -> dict[str, str]:
     """The header of a table: `vplog.settings`, `vplog.library`, `vplog.version`, `vplog.table`."""
-    with _reading(path):
+    with reading(path):
         header = read_schema(path).metadata or {}
         return {key.decode(): value.decode() for key, value in sorted(header.items()) if key.startswith(b"vplog.")}
 
@@ -469,6 +488,12 @@ def placed_table(columns: Sequence[Any]) -> pa.Table:
 def write_placed(path: Path, table: pa.Table, metadata: TableMetadata) -> None:
     """Write the places of a log's views in a map; `metadata` is that of the map."""
     _write(path, "placed", table, metadata, None)
+
+
+def write_localized(path: Path, records: Sequence[dict[str, Any]], metadata: TableMetadata) -> None:
+    """Write the records of pictures, in order; `metadata` is that of the map."""
+    rows = [{**one, "covariance": np.ravel(one["covariance"])} if "covariance" in one else one for one in records]
+    _write(path, "localized", pa.Table.from_pylist(rows, LOCALIZED), metadata, None)
 
 
 def _table(schema: pa.Schema, columns: dict[str, Any]) -> pa.Table:
@@ -501,7 +526,7 @@ def _array(values: Any, column: pa.Field) -> pa.Array:
 
 def _read(path: Path, name: str, schema: pa.Schema) -> pa.Table:
     """The table with the columns of the schema, checked; null where an older vplog wrote none. Raises ResultError."""
-    with _reading(path), open_table(path) as file:
+    with reading(path), open_table(path) as file:
         _check_name(path, name, file.schema_arrow)
         check_columns(file.schema_arrow, schema)
         table = filled(read_table(path, file, schema.names), schema)
@@ -518,15 +543,25 @@ def _check_name(path: Path, name: str, schema: pa.Schema) -> None:
 
 
 @contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Raises ResultError in place of the errors of a missing or damaged table."""
+def reading(
+    what: Path | str,
+    again: str = "Run `vplog run` again.",
+    missing: str = "Give the folder that `vplog run -o` wrote.",
+    more: tuple[type[Exception], ...] = (),
+) -> Iterator[None]:
+    """Raises ResultError in place of the errors of a file that is missing or damaged, and of `more`, with a remedy."""
     try:
         yield
     except FileNotFoundError:
-        raise ResultError(f"{path} does not exist. Give the folder that `vplog run -o` wrote.") from None
-    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
-        why = next(iter(str(error).splitlines()), type(error).__name__)
-        raise ResultError(f"{path} cannot be read: {why} Run `vplog run` again.") from None
+        raise ResultError(f"{what} does not exist. {missing}".rstrip()) from None
+    except (OSError, LookupError, ValueError, RecursionError, pa.ArrowException, *more) as error:
+        raise unreadable(what, error, again) from None
+
+
+def unreadable(what: Path | str, error: Exception, again: str = "") -> ResultError:
+    """The error of a damaged file in one line, with a remedy."""
+    why = next(iter(str(error).splitlines()), type(error).__name__)
+    return ResultError(f"{what} cannot be read: {why.rstrip('.')}. {again}".rstrip())
 
 
 def _pose_values(prefix: str, poses: Floats) -> dict[str, Floats]:

@@ -30,7 +30,7 @@ from vplog.geometry import se3
 from vplog.graph import build, consistency, correct_trajectory
 from vplog.graph.consistency import is_loop
 from vplog.graph.factors import Factors
-from vplog.graph.gps_factors import Fixes, GpsSettings, cost_of_fixes, fixes_on, noisier, with_fixes
+from vplog.graph.gps_factors import GpsSettings, cost_of_fixes, fixes_on, noisier, with_fixes
 from vplog.graph.hypotheses import bounded
 from vplog.graph.least_squares import Objective
 from vplog.graph.marginals import pose_covariances
@@ -61,8 +61,6 @@ class Solved:
     closures: Closures
     """The ledger, judged."""
     refined: Refined
-    fixes: Fixes | None
-    """GPS fixes, with `gps.use`."""
     trajectory: Trajectory
     noise_source: str
     """Source of the odometry's noise, as `edge_covariance` names it."""
@@ -96,14 +94,8 @@ def solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps
     warnings += _confirmed(closures, refined.solution.world_from_body)
     for warning in warnings:
         _log.warning(warning)
-    return Solved(
-        judged_ledger(closures, graph, refined, rows),
-        refined,
-        refined.fixes,
-        correct_trajectory.correct_trajectory(odometry, keyframes, refined.solution.world_from_body),
-        source,
-        warnings,
-    )
+    trajectory = correct_trajectory.correct_trajectory(odometry, keyframes, refined.solution.world_from_body)
+    return Solved(judged_ledger(closures, graph, refined, rows), refined, trajectory, source, warnings)
 
 
 def _apart(broken: Ints, keyframes: Keyframes, graph: PoseGraph, solution: Solution) -> list[str]:
@@ -157,7 +149,7 @@ def by_odometry(graph: PoseGraph, closures: Closures, rows: Ints) -> NDArray[np.
 
 def about_gps(solved: Solved) -> dict[str, Any] | None:
     """Field `gps` of run.json: number of inlier fixes, and the georeference of the trajectory's frame."""
-    fixes, refined = solved.fixes, solved.refined
+    fixes, refined = solved.refined.fixes, solved.refined
     if fixes is None or refined.world_from_enu is None:
         return None
     latitude, longitude, altitude = fixes.origin
@@ -172,7 +164,7 @@ def about_gps(solved: Solved) -> dict[str, Any] | None:
 def keyframe_covariances(solved: Solved) -> Floats | None:
     """(N, 6, 6) of the keyframes as the graph has them in the end, with the noise as estimated, the GPS fixes kept and
     the scales that are not known; None where edges and fixes do not determine them."""
-    refined, fixes = solved.refined, solved.fixes
+    refined, fixes = solved.refined, solved.refined.fixes
     factors, poses, weight = Factors.of(refined.graph), refined.solution.world_from_body, refined.solution.weight
     objective = Objective(factors, weight)
     if fixes is not None and refined.inlier.any():

@@ -121,7 +121,7 @@ def parts_of(
 
 def missing_parts(cache: Path, parts: Iterable[Part]) -> list[Part]:
     """The parts that the cache does not hold, or not whole."""
-    return [part for part in parts if not _is_cached(cache, part)]
+    return [part for part in parts if not is_whole(cache / part.file, part.key, part.stamp_ns)]
 
 
 def compute_part(part: Part, execution: Execution = Execution()) -> bytes:
@@ -213,7 +213,10 @@ def extract(
     """
     cache = steps.cache
     parts = split_keyframes(cache.drive, topics, settings, keyframes, cache.inputs)
-    missing = [part for part in parts if not (cache.keep and _is_cached(cache.folder, part, cache.damaged))]
+    missing = [
+        part for part in parts
+        if not (cache.keep and is_whole(cache.folder / part.file, part.key, part.stamp_ns, cache.damaged))
+    ]  # fmt: skip
     total = sum(len(part.stamp_ns) for part in parts)
     done = total - sum(len(part.stamp_ns) for part in missing)
     # one stream over all that is missing: workers do not wait at the end of a part
@@ -265,15 +268,15 @@ def poor_pictures(found: Extracted, least: int) -> str:
     )
 
 
-def _is_cached(
-    cache: Path, part: Part, damaged: Callable[[Path, Exception], object] = lambda _path, _error: None
+def is_whole(
+    path: Path, key: str, stamp_ns: Sequence[int], damaged: Callable[[Path, Exception], object] = lambda *_: None
 ) -> bool:
-    """Whether the cache holds the part whole; `damaged` gets the file that is not."""
-    path, found = cache / part.file, Extracted()
+    """Whether a file holds a part with this key and these keyframes whole; `damaged` gets one that does not."""
+    found = Extracted()
     try:
-        check_file(path, part.key)
+        check_file(path, key)
         found.add(path)
-        if not set(found.stamp_ns) <= set(part.stamp_ns) or found.stamp_ns != sorted(set(found.stamp_ns)):
+        if not set(found.stamp_ns) <= set(stamp_ns) or found.stamp_ns != sorted(set(found.stamp_ns)):
             raise DamagedError("it holds other keyframes")
     except AbsentError:
         return False
@@ -285,14 +288,22 @@ def _is_cached(
 
 def _content(log: Log, part: Part, frames: Iterable[Decoded]) -> bytes:
     """Content of the file of a part; `frames` gives its keyframes in order, and maybe more."""
+    found, lost = described(islice(frames, len(part.stamp_ns)), part.pipeline.pictures)
+    account = getattr(log, "account", None)
+    return packed(found, lost, [] if account is None else account.undecodable(part.stamp_ns))
+
+
+def described(
+    frames: Iterable[Decoded], pictures: PictureSettings
+) -> tuple[list[tuple[int, Features, bytes]], list[str]]:
+    """Stamp, features and picture of the frames that decode, and why others do not."""
     found, lost = [], []
-    for stamp_ns, frame, features, why in islice(frames, len(part.stamp_ns)):
+    for stamp_ns, frame, features, why in frames:
         if frame is None or features is None:
             lost.append(why)
         else:
-            found.append((stamp_ns, features, preview(frame.image, part.pipeline.pictures)))
-    account = getattr(log, "account", None)
-    return packed(found, lost, [] if account is None else account.undecodable(part.stamp_ns))
+            found.append((stamp_ns, features, preview(frame.image, pictures)))
+    return found, lost
 
 
 def _count_losses(log: Log, undecodable: Iterable[tuple[str, int]]) -> None:

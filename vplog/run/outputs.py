@@ -122,7 +122,7 @@ def finish(folder: Path, run: Run, record: dict[str, Any], steps: Steps) -> Run:
 def _results_record(run: Run) -> dict[str, Any]:
     """Fields of run.json about the results."""
     solution, refined, verdicts = run.solution, run.solved.refined, run.closures.verdict
-    constrained = set(run.graph.kind) - {EdgeKind.ODOMETRY} or run.solved.fixes
+    constrained = set(run.graph.kind) - {EdgeKind.ODOMETRY} or run.solved.refined.fixes
     return {
         "library": {
             "hash": run.state.hash,

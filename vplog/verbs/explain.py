@@ -60,7 +60,14 @@ def explain(
         view = _view(number, row, explanation, folder, record, pipeline, reopened(record, log, topics))
         file = picture or folder / f"closure-{number}.png"
         draw(file, view)
-        shown = {"file": str(file), **_counts(view)}
+        shown = {
+            "file": str(file),
+            "matches": len(view.agreement.agrees),
+            "agree": int(view.agreement.agrees.sum()),
+            "agree_with": view.agreement.model,
+            "references": [one.reference for one in view.boxes],
+            "without_boxes": view.missing,
+        }
     return {"run": str(folder), "closure": number, "row": row, **asdict(explanation), "picture": shown}
 
 
@@ -97,17 +104,6 @@ def _view(
     agreement = find_agreement(query[1], match[1], pose, row["inliers"], log.camera(), pipeline.verify)
     boxes, missing = _boxes(row, folder, record, pipeline)
     return View(number, row, explanation, query[0], match[0], agreement, boxes, missing)
-
-
-def _counts(view: View) -> dict[str, Any]:
-    """The picture in numbers, for the record."""
-    return {
-        "matches": len(view.agreement.agrees),
-        "agree": int(view.agreement.agrees.sum()),
-        "agree_with": view.agreement.model,
-        "references": [one.reference for one in view.boxes],
-        "without_boxes": view.missing,
-    }
 
 
 def _boxes(

@@ -45,15 +45,11 @@ def export(
             poses.write_euroc(path, tracks.after)
         case "g2o":
             _copy(folder / "graph.g2o", path, record.get("graph_sha256"))
-        case "geojson":
-            closures = tables.read_closures(folder / "closures.parquet")
+        case "geojson" | "kml":
+            closures, keyframes = tables.read_closures(folder / "closures.parquet"), tracks.keyframes
             where = _earth(folder, kind, tracks)
-            tree = geo.feature_collection(where, tracks.world_from_body, tracks.keyframes.stamp_ns, closures)
-            geo.write_geojson(path, tree)
-        case "kml":
-            closures = tables.read_closures(folder / "closures.parquet")
-            where = _earth(folder, kind, tracks)
-            geo.write_kml(path, where, tracks.world_from_body, closures, tracks.keyframes.drive)
+            tree = geo.feature_collection(where, tracks.world_from_body, keyframes.stamp_ns, closures)
+            geo.write_geojson(path, tree) if kind == "geojson" else geo.write_kml(path, tree, keyframes.drive)
         case "utm":
             geo.write_utm(path, tracks.after, _earth(folder, kind, tracks))
         case "geoparquet":

@@ -17,6 +17,7 @@ from vplog.features.store import FeatureStore
 from vplog.loops.structure import pairs_to_match, triangulate
 from vplog.pipeline import recorded_pipeline
 from vplog.results import colmap, run_record, tables
+from vplog.results.previews import jpeg
 from vplog.results.staging import check_contents, staged
 from vplog.run.provenance import reopened
 from vplog.storage.folders import check_regular, is_below
@@ -71,8 +72,7 @@ def _pictures(
     def work(encoded: EncodedFrame) -> tuple[str, Features]:
         frame = encoded.decode(colour=True)
         name = f"{frame.stamp_ns}.jpg"
-        data = cv2.imencode(".jpg", np.asarray(frame.colour)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
-        (made / "images" / name).write_bytes(data.tobytes())
+        (made / "images" / name).write_bytes(jpeg(np.asarray(frame.colour)[..., ::-1], _QUALITY))
         return name, describe(pipeline.features, replace(frame, depth=None))
 
     names = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -82,9 +81,10 @@ def solve_parts(
     poses, weight, information = np.array(graph.world_from_body), np.ones(len(graph.a)), np.array(graph.information)
     solutions, warnings = [], []
     size = np.bincount(part)
-    rows_of, edges_of = _by_part(part, len(size)), _by_part(part[graph.a], len(size))
-    for number in np.flatnonzero(size > 1).tolist():
-        rows, edges = rows_of(number), edges_of(number)
+    of_part = zip(_by_part(part, len(size)), _by_part(part[graph.a], len(size)), strict=True)
+    for rows, edges in of_part:
+        if len(rows) == 1:
+            continue
         alone, repairs = checked(subgraph(graph, rows, edges))
         solution = decided(alone, optimiser).solution
         where = f"Part from {ids[rows[0]]} on: " if (size > 1).sum() > 1 else ""
@@ -95,26 +95,16 @@ def solve_parts(
         raise GraphError(
             "No edge joins two poses, so there is nothing to solve. Give a graph with edges between two poses."
         )
-    return (
-        Solution(
-            poses,
-            weight,
-            sum(one.error_before for one in solutions),
-            sum(one.error_after for one in solutions),
-            max(one.iterations for one in solutions),
-            all(one.converged for one in solutions),
-            " ".join(one.reason for one in solutions),
-        ),
-        replace(graph, information=information),
-        warnings,
-    )
+    before, after = (sum(getattr(one, f"error_{when}") for one in solutions) for when in ("before", "after"))
+    iterations, converged = max(one.iterations for one in solutions), all(one.converged for one in solutions)
+    reason = " ".join(one.reason for one in solutions)
+    solution = Solution(poses, weight, before, after, iterations, converged, reason)
+    return solution, replace(graph, information=information), warnings
 
 
-def _by_part(part: Ints, parts: int) -> Callable[[int], Ints]:
+def _by_part(part: Ints, parts: int) -> list[Ints]:
     """The rows of each part, in order, of the part that each row (N,) is of."""
-    order = np.argsort(part, kind="stable")
-    first = np.searchsorted(part[order], np.arange(parts + 1))
-    return lambda number: order[first[number] : first[number + 1]]
+    return np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part, minlength=parts))[:-1])
 
 
 def _with_fixed(solution: Solution, graph: PoseGraph, part: np.ndarray, row: int) -> Solution:

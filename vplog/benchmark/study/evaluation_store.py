@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog.benchmark.method_scores import describe_traversal, score_table, search, stored_bytes
-from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal, images_at
+from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal, images_at, references_of
 from vplog.data import Bytes, Ints, Reference
 from vplog.errors import ResultError
 from vplog.evaluate import retrieval
@@ -94,30 +94,21 @@ class Bench:
         """The drive's frames as features."""
         if drive not in self._traversals:
             traversal = extract_traversal(
-                self.logs[drive], self.pipeline.features, self.folders[drive], self.frames[drive],
-                execution=self.execution,
+                self.logs[drive], self.pipeline.features, self.folders[drive], self.frames[drive], self.execution
             )  # fmt: skip
             self.warnings += traversal.warnings
             self._traversals[drive] = traversal
         return self._traversals[drive]
 
     def images(self, drive: int, rows: Sequence[int]) -> list[Bytes]:
-        """The grey images of rows of a traversal, in the order given. Raises LogError where one is gone."""
-        wanted = sorted(set(rows))
-        found = dict(zip(wanted, images_at(self.logs[drive], self.traversal(drive).stamp_ns[wanted]), strict=True))
-        return [found[row] for row in rows]
+        """The grey images of increasing rows of a traversal. Raises LogError where one is gone."""
+        return images_at(self.logs[drive], self.traversal(drive).stamp_ns[rows])
 
     def references(self, library: Library) -> list[Reference]:
         """Frames as `vplog compare` chooses them; those that cannot be decoded are left out after the choice."""
-        traversal, covered = self.traversal(library.drive), self.frames[library.drive]
+        covered = self.frames[library.drive]
         wanted = LibrarySettings(choose="random", size=library.size, seed=library.seed)
-        numbers = set(covered[choose(covered, wanted)].tolist())
-        rows = [row for row, number in enumerate(traversal.frames.tolist()) if number in numbers]
-        images = self.images(library.drive, rows)
-        return [
-            Reference(image, traversal.store[row], traversal.name, int(traversal.stamp_ns[row]))
-            for image, row in zip(images, rows, strict=True)
-        ]
+        return references_of(self.traversal(library.drive), covered[choose(covered, wanted)])
 
     def learn(self, method: str, library: Library) -> PlaceState:
         """The trained state of a method on a library; the references of the last library are cached for the other

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from vplog.benchmark.study.charts import explain
 from vplog.benchmark.study.experiments import StudyOptions, box_methods
-from vplog.data import Boxes, Bytes, Floats
+from vplog.data import Boxes, Bytes, Floats, Ints
 from vplog.run.figures.canvas import as_text, saved_figure
 
 if TYPE_CHECKING:
@@ -33,26 +32,25 @@ _CLOSE_UP = 10
 def references(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, Any], list[str]]:
     """Fig. 9: how often each reference of the first drive explains a frame of any drive."""
     name, state = _learned(bench, options, 0)
-    count = np.zeros(len(state.references), np.int64)
-    on: list[list[Floats]] = [[] for _ in count]
+    on: list[list[Floats]] = [[] for _ in state.references]
     images = 0
     total = sum(len(frames) for frames in bench.frames)
     for drive in range(len(bench.names)):
         for place in bench.describe(state, drive, "references", images, total):
             found = state.boxes(place)
-            count[found.references] += 1
             for reference, corners in zip(found.references.tolist(), found.corners, strict=True):
                 on[reference].append(corners)
             images += 1
-    use = _ReferenceUse(name, count, on, images)
-    rest = float(count[use.order[len(use.order) // 2 :]].mean())
-    ratio = round(float(count[use.order[0]]) / rest, 2) if rest else None
-    _draw_references(bench, state, use, out)
+    count = np.array([len(boxes) for boxes in on])
+    order = np.argsort(-count, kind="stable")  # most used first
+    rest = float(count[order[len(order) // 2 :]].mean())
+    ratio = round(float(count[order[0]]) / rest, 2) if rest else None
+    _draw_references(bench, state, name, order, on, images, out)
     about = {
         "method": name,
         "library": bench.names[0],
         "images": images,
-        "chosen": {str(reference): int(count[reference]) for reference in use.order.tolist()},
+        "chosen": {str(reference): int(count[reference]) for reference in order.tolist()},
         "most_against_mean_of_least_half": ratio,
     }
     return about, ["references"]
@@ -81,6 +79,7 @@ def examples(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, 
             file = f"examples-{len(files) + 1:02d}-{kind}"
             outcome = f"{kind}: the true frame is no. {int(ranks.better[row]) + 1} of {int(ranks.candidates[row])}"
             sides = (query, row, places[query][row]), (other, match, places[other][match])
+            mine, theirs = (state.boxes(place).references for _, _, place in sides)
             _draw_example(bench, state, *sides, outcome, file, out)
             files.append(file)
             rows.append(
@@ -92,7 +91,7 @@ def examples(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, 
                     "query_frame": int(bench.traversal(query).frames[row]),
                     "map_frame": int(bench.traversal(other).frames[match]),
                     "rank": int(ranks.better[row]),
-                    "shared_references": _shared(state, places[query][row], places[other][match]),
+                    "shared_references": len(np.intersect1d(mine, theirs)),
                     "figure": f"{file}.png",
                 }
             )
@@ -142,29 +141,11 @@ def _learned(bench: Bench, options: StudyOptions, drive: int) -> tuple[str, BoxS
     return name, state
 
 
-def _shared(state: BoxState, a: Any, b: Any) -> int:
-    return len(np.intersect1d(state.boxes(a).references, state.boxes(b).references))
-
-
-@dataclass(frozen=True, eq=False)
-class _ReferenceUse:
-    """How often the references of a library explain an image."""
-
-    method: str
-    count: np.ndarray
-    """(L,) images that each reference explains."""
-    boxes: list[list[Floats]]
-    """By reference: (I, 4) boxes of each of these images."""
-    images: int
-
-    @property
-    def order(self) -> np.ndarray:
-        """(L,) references, most used first."""
-        return np.argsort(-self.count, kind="stable")
-
-
-def _draw_references(bench: Bench, state: BoxState, use: _ReferenceUse, out: Path) -> None:
-    count, order, images, method = use.count, use.order, use.images, use.method
+def _draw_references(
+    bench: Bench, state: BoxState, method: str, order: Ints, on: list[list[Floats]], images: int, out: Path
+) -> None:
+    """The references in `order`, most used first; `on` are the boxes (I, 4) on each, of each image it explains."""
+    count = np.array([len(boxes) for boxes in on])
     shown = min(_SHOWN, len(order) // 2)
     with saved_figure(out, "references", 11.0, 6.9) as figure:
         grid = figure.add_gridspec(3, max(shown, 1), height_ratios=(1.25, 1, 1))
@@ -185,7 +166,7 @@ def _draw_references(bench: Bench, state: BoxState, use: _ReferenceUse, out: Pat
             for column, reference in enumerate(rows.tolist()):
                 axes = figure.add_subplot(grid[1 + line, column])
                 _show(axes, state.references[reference].image)
-                corners = np.concatenate(use.boxes[reference]) if use.boxes[reference] else np.zeros((0, 4))
+                corners = np.concatenate(on[reference]) if on[reference] else np.zeros((0, 4))
                 corners = corners[~np.isnan(corners).any(axis=-1)]
                 _overlay(axes, _coverage(corners))
                 kinds, often = np.unique(corners, axis=0, return_counts=True)

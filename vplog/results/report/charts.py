@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -91,9 +91,16 @@ def histogram(above: Floats, below: Floats, label: str, thresholds: Sequence[tup
     )
 
 
-def curves(named: Sequence[tuple[str, Floats]]) -> Chart:
-    """Precision (P, second column) over recall (first), each named curve with its class."""
-    return _lines(named, "precision over recall", (0.0, 1.0), "recall", (0.0, 1.0), "precision")
+def curves(named: Mapping[str, Floats]) -> Chart:
+    """Precision (P, second column) over recall (first) of two curves, by their names."""
+    return _lines(
+        list(zip(("after", "other"), named.values(), strict=False)),
+        "precision over recall",
+        (0.0, 1.0),
+        "recall",
+        (0.0, 1.0),
+        "precision",
+    )
 
 
 def over_time(lines: Sequence[tuple[str, Floats, Floats]], label: str, end_s: float) -> Chart | None:

@@ -116,7 +116,7 @@ def page(content: Content) -> str:
         map_lines=legend,
         judged=judged,
         truth=_truth(judged) if judged else [],
-        curves=_curves(judged) if judged else None,
+        curves=charts.curves(judged.curves) if judged and judged.curves else None,
         verdicts=[(verdict.value, figure(count), verdict.sentence) for verdict, count in counts if count],
         candidates=len(closures),
         examples=examples,
@@ -253,11 +253,6 @@ def _truth(judged: TruthComparison) -> list[list[str]]:
     ]
     alignment = mapping(scores.get("ate_after")).get("alignment", "")
     return [[f"{heading} ({alignment})" if "ATE" in heading else heading, *values] for heading, *values in rows]
-
-
-def _curves(judged: TruthComparison) -> charts.Chart | None:
-    """Precision over recall by score and by inliers, None where nothing was revisited."""
-    return charts.curves(list(zip(("after", "other"), judged.curves.values(), strict=False))) if judged.curves else None
 
 
 def _examples(content: Content) -> list[dict[str, Any]]:
