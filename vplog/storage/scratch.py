@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from glob import escape
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -158,10 +158,8 @@ def put_in_place(part: Path, path: Path) -> None:
 
 def sync_all(path: Path) -> None:
     """Have a file, or a folder with all that is in it, on the disk. Raises OSError."""
-    names = list(regular_files(path))
-    below = {*names, *(str(above) for name in names for above in PurePosixPath(name).parents), "."}
-    for name in sorted(below):
-        sync(path / name)
+    for one in [*path.rglob("*"), path]:
+        sync(one)
 
 
 def sync(path: Path) -> None:

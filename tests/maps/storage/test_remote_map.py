@@ -287,7 +287,7 @@ def test_two_writers(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         put(store, "two", 2)
         lock = gone.mirror.lock  # pyright: ignore[reportOptionalMemberAccess]
         assert lock is not None
-        lease_lock._write(lock, lock.etag)
+        lease_lock._write(lock, lease_lock._content(lock))
         gone.staging.mkdir(parents=True)
         with pytest.raises(ResultError, match="taken"):
             put(gone, "two", 3)

@@ -8,7 +8,6 @@ import re
 import shutil
 from collections.abc import Collection
 from dataclasses import replace
-from functools import cache
 from pathlib import Path, PurePath
 from typing import Any
 from urllib.parse import quote
@@ -153,7 +152,6 @@ def set_drive_id(path: Path, drive: str) -> None:
     tables.write_keyframes(path, replace(keyframes, drive=drive), world_from_body, about, covariance)
 
 
-@cache
 def code_hash() -> str:
     """sha256 over the files of the package that a run uses."""
     return code_of("vplog.pipeline")["code"]

@@ -116,30 +116,27 @@ class Mirror:
         one is gone or damaged, and ResultError."""
         with self._locks[drive]:
             for _ in range(3):
-                if drive not in self.manifests:
+                if (manifest := self.manifests.get(drive)) is None:
                     return
+                place = self.remote / "runs" / folder_name(drive) / manifest["generation"]
                 try:
-                    self._fetch(drive, names)
-                    return
+                    for name in names:
+                        if why := self._fetch_file(place / name, self.run(drive) / name, manifest["files"].get(name)):
+                            raise DamagedDriveError(f"{why}. Copy it back, or {ADD_AGAIN}", drive)
                 except FileNotFoundError:
                     self._reread_manifest(drive)
+                else:
+                    self._fetched.add(drive)
+                    return
             raise ResultError(f"{self.remote}: {drive} is replaced faster than it can be read. Try again later.")
-
-    def _fetch(self, drive: str, names: Iterable[str]) -> None:
-        manifest, place = self.manifests[drive], self.remote / "runs" / folder_name(drive)
-        for name in names:
-            path = place / manifest["generation"] / name
-            if why := self._fetch_file(path, self.run(drive) / name, manifest["files"].get(name)):
-                raise DamagedDriveError(f"{why}. Copy it back, or {ADD_AGAIN}", drive)
-        self._fetched.add(drive)
 
     def damaged_files(self, drive: str, names: Iterable[str]) -> list[str]:
         """A line for each file of a drive that is gone, and for the first of `names` that is damaged: these are
         fetched. Raises UnreachableError."""
-        manifest, place = self.manifests[drive], self.remote / "runs" / folder_name(drive)
+        manifest = self.manifests[drive]
+        place = self.remote / "runs" / folder_name(drive) / manifest["generation"]
         with store_errors(self.remote):
-            there = objects.files_below(place / manifest["generation"])
-        gone = [f"{place / manifest['generation'] / name} is not there." for name in manifest["files"].keys() - there]
+            gone = [f"{place / name} is not there." for name in manifest["files"].keys() - objects.files_below(place)]
         try:
             self.fetch(drive, names)
         except DamagedDriveError as error:
@@ -203,15 +200,16 @@ class Mirror:
             raise ResultError(f"{damage}. Join the drives again: vplog map join {self.remote}")
         if damage:
             self.rest_damage = damage
-            self.rest_manifest = self.rest_manifest or self._rest_without_manifest()
+            if (
+                not self.rest_manifest
+            ):  # then of the copies that joins have by their own names, whose hashes are unknown
+                with store_errors(self.remote):
+                    below = [
+                        f"{top}/{name}" for top in ("joint", "joins") for name in objects.files_below(self.remote / top)
+                    ]
+                self.rest_manifest = {"files": {name: {"sha256": ""} for name in ("joint.json", *below)}}
             (self.local / "joint.json").unlink(missing_ok=True)
             shutil.rmtree(self.local / "joint", ignore_errors=True)
-
-    def _rest_without_manifest(self) -> dict[str, Any]:
-        """A manifest of the copies that joins have by their own names; it has none of their lengths and hashes."""
-        with store_errors(self.remote):
-            below = [f"{top}/{name}" for top in ("joint", "joins") for name in objects.files_below(self.remote / top)]
-        return {"files": {name: {"sha256": ""} for name in ("joint.json", *below)}}
 
     def _fetch_rest(self, names: Collection[str]) -> str:
         """The first damage of it, if any. Raises ResultError."""
