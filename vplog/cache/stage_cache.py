@@ -300,7 +300,6 @@ class StageCache:
             self._disk_full = True
 
     def _remove(self, retained: set[str]) -> None:
-        """Remove the cache's own files but these."""
         for file in [file for pattern in CACHE_FILES for file in self.folder.glob(pattern)]:
             if file.name not in retained:
                 file.unlink(missing_ok=True)

@@ -125,7 +125,6 @@ class Steps:
     def _result(
         self, one: Step[T], name: str, inputs: Sequence[Any], execution: Execution | None = None
     ) -> tuple[T, bool]:
-        """The value, and whether it was found."""
         given = {"execution": execution or self._execution, "steps": self}
         given = {key: value for key, value in given.items() if key in one.parameters}
         if one.codec is None:

@@ -64,7 +64,6 @@ def localize_paths(
 
 
 def _check_out(out: Path | None) -> None:
-    """Raises ResultError where it cannot be written, before any work."""
     if out is None:
         return
     if out.suffix not in (".parquet", ".tum"):
@@ -73,7 +72,6 @@ def _check_out(out: Path | None) -> None:
 
 
 def _frames(log: Log, places: Places) -> tuple[Any, Keyframes | None, list[str]]:
-    """Stamps of the pictures: of the keyframes where there is odometry."""
     odometry, stamps = log.odometry(), log.stamps()
     if odometry is None or len(odometry.stamp_ns) < 2:
         return stamps, None, []

@@ -118,7 +118,6 @@ def _drive(store: Store, drive: str, about: dict[str, Any]) -> dict[str, Any]:
 
 
 def _figure(totals: Any, name: str) -> float | None:
-    """A number of the totals of run.json; None where there is none."""
     value = totals.get(name) if isinstance(totals, dict) else None
     return value if is_finite(value) else None
 
@@ -150,7 +149,6 @@ def _components(store: Store, known: Mapping[str, Any], problems: list[str]) -> 
 
 
 def _unused_folders(store: Store, drives: list[str]) -> list[str]:
-    """Warnings about folders of drives that the map does not have."""
     if store.mirror is not None:
         return []  # a writer there removes them
     known, root = {map_store.folder_name(drive) for drive in drives}, store.root

@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,29 +42,24 @@ def merge_maps(
         raise SettingsError(f"{target} is given as a source and as the target. Choose another map with -o.")
     if len({str(source.resolve()) for source in sources}) < len(sources):
         raise SettingsError("A map is given twice. Give each once.")
-    with ExitStack() as stack:
-        here = [stack.enter_context(local_copy(one)) if one.is_file() else one for one in sources]
-        return _merge(here, target, execution, chosen)
-
-
-def _merge(sources: Sequence[Path], target: Path, execution: Execution, chosen: Sequence[str]) -> dict[str, Any]:
-    library = _check_libraries(sources, target)
-    _check_chosen(sources, chosen)
     outcomes, warnings = list[dict[str, Any]](), list[str]()
-    with map_store.writing(target) as store:
+    with ExitStack() as stack:
+        opened = [stack.enter_context(_opened(source)) for source in sources]
+        library = _check_libraries(opened, target)
+        _check_chosen(opened, chosen)
+        store = stack.enter_context(map_store.writing(target))
         target_drives = _TargetDrives(store.drives())
-        for number, source in enumerate(sources, start=1):
-            if source.is_file():
+        for number, source in enumerate(opened, start=1):
+            if isinstance(source, Path):
                 outcomes += _merge_places(store, source, target_drives, chosen)
                 continue
-            with map_store.reading(source) as other:
-                _, drives = map_store.common_library(other)
-                _copy_library(store, other, library)
-                for drive in natural_order(drives.keys() & set(chosen) if chosen else drives):
-                    taken = _merge_drive(store, other, drives[drive], target_drives, f"{os.getpid()}-{len(outcomes)}")
-                    outcomes += [] if taken is None else [taken]
-                    execution.progress(f"merge {number} of {len(sources)}", len(outcomes), len(outcomes))
-                warnings += damage_warnings(other)
+            _, drives = map_store.common_library(source)
+            _copy_library(store, source, library)
+            for drive in natural_order(drives.keys() & set(chosen) if chosen else drives):
+                taken = _merge_drive(store, source, drives[drive], target_drives)
+                outcomes += [] if taken is None else [taken]
+                execution.progress(f"merge {number} of {len(sources)}", len(outcomes), len(outcomes))
+            warnings += damage_warnings(source)
         return {
             "map": str(store),
             "library": library,
@@ -73,23 +68,27 @@ def _merge(sources: Sequence[Path], target: Path, execution: Execution, chosen: 
         }
 
 
-def _check_libraries(sources: Sequence[Path], target: Path) -> str:
+def _opened(source: Path) -> AbstractContextManager[Store | Path]:
+    """A map, or an exported file."""
+    if not source.exists():
+        raise ResultError(f"There is neither a map nor an exported file at {source}.{nearest_path(source)}")
+    return local_copy(source) if source.is_file() else map_store.reading(source)
+
+
+def _check_libraries(sources: Sequence[Store | Path], target: Path) -> str:
     """The one library of the maps. Raises LibraryError where their places do not compare."""
     wanted, whose = None, str(target)
     if (target / "map.json").exists():
         with map_store.reading(target) as store:
             wanted = map_store.common_library(store)[0] if store.drives() else store.head().library
     for source in sources:
-        if not source.exists():
-            raise ResultError(f"There is neither a map nor an exported file at {source}.{nearest_path(source)}")
-        if source.is_file():
+        if isinstance(source, Path):
             found, name = read_places_header(source).library, original(source)
             again = "Describe its map again (vplog map redescribe), and export that."
         else:
-            with map_store.reading(source) as other:
-                found, name = map_store.common_library(other)[0], source
+            found, name = map_store.common_library(source)[0], source
             again = f"Write it again: vplog map redescribe {source} --library {whose}/libraries/{wanted} -o MAP."
-        if wanted is None and source.is_file():
+        if wanted is None and isinstance(source, Path):
             raise LibraryError(
                 f"{name} holds places without their library {found[:12]}. Name a map that has it first, or as -o."
             )
@@ -103,15 +102,13 @@ def _check_libraries(sources: Sequence[Path], target: Path) -> str:
     return str(wanted)
 
 
-def _check_chosen(sources: Sequence[Path], chosen: Sequence[str]) -> None:
-    """Raises SettingsError where no map has one of the drives chosen."""
+def _check_chosen(sources: Sequence[Store | Path], chosen: Sequence[str]) -> None:
     known: set[str] = set()
     for source in sources if chosen else ():
-        if source.is_file():
+        if isinstance(source, Path):
             known |= drives_of_file(source).keys()
-            continue
-        with map_store.reading(source) as other:
-            known |= other.drives().keys() | other.damaged.keys()
+        else:
+            known |= source.drives().keys() | source.damaged.keys()
     if unknown := [drive for drive in chosen if drive not in known]:
         raise SettingsError(f"No map given has a drive {unknown[0]!r}. Drives: {', '.join(natural_order(known))}.")
 
@@ -152,7 +149,7 @@ class _TargetDrives:
 
 
 def _merge_drive(
-    store: Store, other: Store, record: dict[str, Any], target_drives: _TargetDrives, staged: str
+    store: Store, other: Store, record: dict[str, Any], target_drives: _TargetDrives
 ) -> dict[str, Any] | None:
     """Take one drive; its fate, None where it is damaged. A whole one replaces its places alone."""
     drive = record["drive"]
@@ -168,7 +165,7 @@ def _merge_drive(
     if wrong:
         other.damaged[drive] = wrong[0]
         return None
-    taken, made = same or target_drives.free_name(drive, record["log"]), store.staging / staged
+    taken, made = same or target_drives.free_name(drive, record["log"]), store.staging / f"{os.getpid()}-merge"
 
     def copied(_: Path) -> None:
         shutil.rmtree(made, ignore_errors=True)

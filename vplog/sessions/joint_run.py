@@ -41,7 +41,6 @@ class DriveRun:
     name: str
     run: Run
     drive: Drive
-    """Input of the verification of its candidates."""
     solved: SolvedDrive
 
 
@@ -117,11 +116,7 @@ def _drive_run(name: str, run: Run, pipeline: Pipeline) -> DriveRun:
 def _ledgers(drives: Sequence[DriveRun], state: PlaceState, pipeline: Pipeline, execution: Execution) -> Ledgers:
     """The ledger of every pair of drives; empty where too few candidates are proposed."""
     places = [drive_run.run.places for drive_run in drives]
-    calibrated = [drive_run.drive.camera.matrix is not None for drive_run in drives]
-    share = [
-        calibration_share(drive_run.drive, execution) if known else 0.0
-        for drive_run, known in zip(drives, calibrated, strict=True)
-    ]
+    share = [calibration_share(one.drive, execution) if one.drive.camera.matrix is not None else 0.0 for one in drives]
     later = {number: places[number] for number in range(1, len(drives))}
     searched = {number: range(number) for number in later}
     found = candidates_among(later, places.__getitem__, searched, state, pipeline, execution)
@@ -152,7 +147,6 @@ def _names(names: Sequence[str]) -> list[str]:
 
 
 def _write_maps(out: Path, drives: Sequence[DriveRun], joined: Joined, header: tables.TableMetadata) -> None:
-    """The graph of each map of several drives, and the keyframes and trajectories of its drives in the map's frame."""
     for number, members in enumerate(joined.maps):
         if members not in joined.solved:
             continue
@@ -165,7 +159,6 @@ def _write_maps(out: Path, drives: Sequence[DriveRun], joined: Joined, header: t
 
 
 def _joint_record(drives: Sequence[DriveRun], ledgers: Ledgers, joined: Joined) -> dict[str, Any]:
-    """Maps, pairs and warnings as run.json has them."""
     names = [drive_run.name for drive_run in drives]
     maps = [
         {

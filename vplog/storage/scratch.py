@@ -66,7 +66,6 @@ def _sweep(among: Path) -> None:
 
 
 def _is_left(path: Path) -> bool:
-    """Whether the process that locked a file has ended."""
     with suppress(OSError), path.open() as lock:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # OSError where its process lives
         return True

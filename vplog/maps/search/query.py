@@ -257,7 +257,6 @@ def _named(
 
 
 def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints) -> pa.Table:
-    """One row for every answer."""
     there = np.arange(answers.score.shape[1]) < answers.count[:, None]
     query, rank = np.nonzero(there)
     number, keyframe = answers.drive[there], answers.keyframe[there]

@@ -159,7 +159,6 @@ def _check_expired(found: bytes, age_s: float, root: RemotePath) -> None:
 
 
 def _renew(lock: Lock) -> None:
-    """Renew the lease until the lock is released or lost."""
     last = time.monotonic()
     while not lock.lost and not lock.released.wait(LEASE_S / RENEWALS):
         lock.renewed += 1
