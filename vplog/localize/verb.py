@@ -18,9 +18,9 @@ from vplog.geometry import se3, tum
 from vplog.localize.localize import TOP, LocalizedPicture, localize_log
 from vplog.localize.places import Places, opened
 from vplog.localize.trajectory import JoinedLog, join_by_odometry
+from vplog.maps.search.query import select_views
 from vplog.results.localized_table import write_localized
 from vplog.results.tables import TableMetadata
-from vplog.run.keyframes import select_keyframes
 from vplog.storage.scratch import check_file_output
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def localize_paths(
     is_log = len(paths) == 1 and not logs.is_image_file(paths[0])
     log = logs.open(paths[0], topics) if is_log else logs.open_images(paths, topics)
     with opened(root, execution) as places:
-        stamps, keyframes, warnings = _frames(log, places)
+        stamps, keyframes, warnings = select_views(log, places.pipeline.keyframes)
         found = list(localize_log(places, log, stamps, execution, top))
         joined = None
         if keyframes is not None:
@@ -69,14 +69,6 @@ def _check_out(out: Path | None) -> None:
     if out.suffix not in (".parquet", ".tum"):
         raise ResultError(f"Cannot write {out}: poses are a table or a trajectory. Name FILE.parquet or FILE.tum.")
     check_file_output(out)
-
-
-def _frames(log: Log, places: Places) -> tuple[Any, Keyframes | None, list[str]]:
-    odometry, stamps = log.odometry(), log.stamps()
-    if odometry is None or len(odometry.stamp_ns) < 2:
-        return stamps, None, []
-    keyframes, warnings = select_keyframes(log.name, stamps, odometry, places.pipeline.keyframes)
-    return keyframes.stamp_ns, keyframes, warnings
 
 
 def _joined(

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from vplog.pipeline import Pipeline
 
 _CHOICE = 3
-"""Drives searched for each that may be verified: `likely_drives` chooses from enough. Single views and sequences seldom differ in which drives score high,
-but in their order."""
+"""Drives searched for each that may be verified, so that `likely_drives` has enough to choose from. Single views and
+sequences seldom differ in which drives score high, but in their order."""
 _AT_ONCE = 64
 """New drives that are searched in one earlier drive while its places are in memory; theirs are too, some 40 MB."""
 
