@@ -17,7 +17,7 @@ from vplog.execution.execution import Execution
 from vplog.geometry import se3, tum
 from vplog.localize.localize import TOP, LocalizedPicture, localize_log
 from vplog.localize.places import Places, opened
-from vplog.localize.trajectory import JoinedLog, join_by_odometry
+from vplog.localize.trajectory import join_by_odometry
 from vplog.maps.search.query import select_views
 from vplog.results.localized_table import write_localized
 from vplog.results.tables import TableMetadata
@@ -73,7 +73,7 @@ def _check_out(out: Path | None) -> None:
 
 def _joined(
     log: Log, keyframes: Keyframes, found: list[LocalizedPicture], places: Places
-) -> tuple[list[LocalizedPicture], JoinedLog | None]:
+) -> tuple[list[LocalizedPicture], Trajectory | None]:
     """The pictures of a log, without those at odds with its odometry, and its trajectory in the frame of most; None
     where none is localised, or no two agree with the odometry."""
     odometry = log.odometry()
@@ -83,13 +83,15 @@ def _joined(
     frame = frames.most_common(1)[0][0]
     rows = np.flatnonzero([one.localized and one.frame == frame for one in found])
     poses, covariances = zip(*(_of_body(found[row]) for row in rows.tolist()), strict=True)
-    joined = join_by_odometry(odometry, keyframes, rows, np.stack(poses), np.stack(covariances), places.pipeline)
-    if not joined.agrees.any():
+    trajectory, agrees = join_by_odometry(
+        odometry, keyframes, rows, np.stack(poses), np.stack(covariances), places.pipeline
+    )
+    if not agrees.any():
         return found, None
-    for row in rows[~joined.agrees].tolist():
+    for row in rows[~agrees].tolist():
         lost = replace(found[row].found, verdict=Verdict.REJECTED_BY_SOLVER, world_from_camera=None, covariance=None)
         found[row] = replace(found[row], found=lost, sentence=_AT_ODDS, earth_deg_m=None)
-    return found, joined
+    return found, trajectory
 
 
 def _of_body(one: LocalizedPicture) -> tuple[Any, Any]:
@@ -101,14 +103,14 @@ def _of_body(one: LocalizedPicture) -> tuple[Any, Any]:
 
 
 def _write(
-    out: Path, records: list[dict[str, Any]], found: list[LocalizedPicture], joined: JoinedLog | None,
+    out: Path, records: list[dict[str, Any]], found: list[LocalizedPicture], joined: Trajectory | None,
     header: TableMetadata,
 ) -> None:  # fmt: skip
     if out.suffix == ".parquet":
         write_localized(out, records, header)
         return
     if joined is not None:
-        tum.write_tum(out, joined.trajectory)
+        tum.write_tum(out, joined)
         return
     known = {one.stamp_ns: pose for one in found if (pose := one.found.world_from_camera) is not None}
     if not known:

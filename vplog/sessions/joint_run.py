@@ -27,6 +27,7 @@ from vplog.run.reference_library import build_library, check_library
 from vplog.run.run_folder import CacheOptions, staged_run
 from vplog.sessions.inter_session import candidates_among, closures_between, likely_pairs, with_shared
 from vplog.sessions.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
+from vplog.storage.folders import numbered
 
 if TYPE_CHECKING:
     from vplog.graph.joint import Joined
@@ -62,7 +63,9 @@ def run_joint(
         raise SettingsError("GPS is for one drive at a time: run each by itself with --gps, or several without.")
     pipeline.decisions.check_single_drive()
     opened = [logs.open(path, topics) for path in paths]
-    drives_at = dict(zip(_names([log.name for log in opened]), paths, strict=True))
+    drives_at: dict[str, Path] = {}
+    for log, path in zip(opened, paths, strict=True):
+        drives_at[numbered(log.name, log.name, {"library", *drives_at})] = path
     check_library(library, pipeline)
     for log in opened:  # before the first drive is computed
         is_visual(log, topics or logs.TopicChoice())
@@ -133,17 +136,6 @@ def _ledgers(drives: Sequence[DriveRun], state: PlaceState, pipeline: Pipeline, 
         return with_shared(ledger, pair.proposals, pair.shared)
 
     return {(number, earlier): verified(number, earlier) for number in later for earlier in range(number)}
-
-
-def _names(names: Sequence[str]) -> list[str]:
-    """A folder name for each drive: its own, with a number where several have the same, or the library has it."""
-    result: list[str] = []
-    for name in names:
-        number, free = 2, name
-        while free in ("library", *result):
-            free, number = f"{name}-{number}", number + 1
-        result.append(free)
-    return result
 
 
 def _write_maps(out: Path, drives: Sequence[DriveRun], joined: Joined, header: tables.TableMetadata) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -56,6 +56,14 @@ def regular_files(folder: Path) -> Iterator[str]:
 def is_unicode(name: str) -> bool:
     """Whether the name of a file is UTF-8: Python has half a character for each byte of any other."""
     return not any("\ud800" <= character <= "\udfff" for character in name)
+
+
+def numbered(name: str, base: str, taken: Container[str]) -> str:
+    """The name, or where it is taken `base` with the first free number."""
+    number, free = 2, name
+    while free in taken:
+        free, number = f"{base}-{number}", number + 1
+    return free
 
 
 def is_below(name: object) -> bool:

@@ -244,7 +244,7 @@ def test_a_reader_that_comes_late_takes_the_new_drive(root: Any) -> None:
             put(writer, "two", 5)
         assert seeds(store.run("one")) == {5}
         with pytest.raises(ResultError, match="replaced"):  # of which a part was handed out
-            store.table("keyframes", "two")
+            store.file("two", "keyframes.parquet")
         with map_store.writing(root) as writer:
             map_store.remove(writer, ["one"])
         store.evict("one")

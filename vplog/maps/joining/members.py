@@ -17,7 +17,7 @@ from vplog.errors import LogError, ResultError
 from vplog.features.store import FeatureStore
 from vplog.loops.calibration import turning_pairs
 from vplog.loops.verify import VerifySettings, calibration_share, drive_of
-from vplog.maps.storage.layout import folder_name, key_of
+from vplog.maps.storage.layout import folder_name
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables
 from vplog.results.camera_record import camera_from
@@ -25,7 +25,7 @@ from vplog.results.feature_table import FeatureTable, write_features
 from vplog.run.feature_extraction import Extracted, stored_features
 from vplog.run.provenance import stored_log
 from vplog.run.reextraction import ReextractedFeatures
-from vplog.storage.json_records import plain
+from vplog.storage.json_records import key_of, plain
 from vplog.storage.scratch import scratch
 
 if TYPE_CHECKING:

@@ -113,7 +113,8 @@ def exchange_folders(one: Path, other: Path) -> bool:
 def link_tables(store: Store, drive: str) -> None:
     """Each table of the run folder under its data set; a copy on file systems without hard links."""
     for name in TABLES:
-        source, path = store.run(drive) / f"{name}.parquet", store.table(name, drive)
+        source = store.run(drive) / f"{name}.parquet"
+        path = store.root / name / folder_name(drive) / source.name
         if not source.is_file():
             raise ResultError(f"{source} is not there. Copy it back, or {ADD_AGAIN}")
         if path.exists():
