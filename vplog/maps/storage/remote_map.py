@@ -200,14 +200,11 @@ class Mirror:
             raise ResultError(f"{damage}. Join the drives again: vplog map join {self.remote}")
         if damage:
             self.rest_damage = damage
-            if (
-                not self.rest_manifest
-            ):  # then of the copies that joins have by their own names, whose hashes are unknown
+            if not self.rest_manifest:  # of the copies that joins have by their own names; their hashes are unknown
                 with store_errors(self.remote):
-                    below = [
-                        f"{top}/{name}" for top in ("joint", "joins") for name in objects.files_below(self.remote / top)
-                    ]
-                self.rest_manifest = {"files": {name: {"sha256": ""} for name in ("joint.json", *below)}}
+                    below = {top: objects.files_below(self.remote / top) for top in ("joint", "joins")}
+                left = ["joint.json", *(f"{top}/{name}" for top in below for name in below[top])]
+                self.rest_manifest = {"files": {name: {"sha256": ""} for name in left}}
             (self.local / "joint.json").unlink(missing_ok=True)
             shutil.rmtree(self.local / "joint", ignore_errors=True)
 
@@ -226,13 +223,14 @@ class Mirror:
             except ResultError as error:
                 return str(error).partition(". ")[0]
             self.rest_manifest, place = manifest, self.remote / "rest" / manifest["generation"]
-            wanted = {name for name in manifest["files"] if self._is_of_a_drive(name) and (name in names or not names)}
+            known = {folder_name(drive) for drive in self.manifests}  # files of other drives are not wanted
+            parts = {name: PurePosixPath(name).parts for name in manifest["files"] if name in names or not names}
+            wanted = {one for one in parts if {part for part in parts[one] if part.startswith("drive=")} <= known}
             damaged, gone = list[str](), list[str]()
             for name in sorted(wanted):
                 try:
-                    damaged += filter(
-                        None, [self._fetch_file(place / name, self.local / name, manifest["files"][name])]
-                    )
+                    if why := self._fetch_file(place / name, self.local / name, manifest["files"][name]):
+                        damaged.append(why)
                 except FileNotFoundError:
                     gone.append(f"{place / name} is not there")
             if not gone or manifest["generation"] == before:
@@ -241,11 +239,6 @@ class Mirror:
             for name in wanted:
                 (self.local / name).unlink(missing_ok=True)
         raise ResultError(f"{self.remote}/rest is replaced faster than it can be read. Try again later.")
-
-    def _is_of_a_drive(self, name: str) -> bool:
-        """Whether the drive whose partition a file is in, if it is in one, is in the map."""
-        known = {folder_name(drive) for drive in self.manifests}
-        return all(part in known for part in PurePosixPath(name).parts if part.startswith("drive="))
 
     def _fetch_file(self, place: RemotePath, target: Path, about: dict[str, Any] | None) -> str:
         """Fetch an object, if the manifest names it and it is not here yet; what is wrong with it, if anything. Raises
