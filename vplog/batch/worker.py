@@ -134,14 +134,14 @@ def compute_drive(task: Task) -> Outcome:
 def _compute(task: Task, path: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:
     """Make the run folder of a drive: its run.json, the name of the drive in its tables, and its drive.json."""
     execution, log = Execution(task.threads), logs.open(path, task.topics)
-    if is_pictures(log):
+    if _is_pictures(log):
         return _write_pictures(task, path, log, execution), task.drive, {**task.record, layout.PICTURES: True}
     options = CacheOptions(task.cache, use=task.cache is not None)
     done = run_alone(path, task.folder, task.pipeline, task.library, task.topics, execution, options)
     return done.record, done.keyframes.drive, task.record
 
 
-def is_pictures(log: Log) -> bool:
+def _is_pictures(log: Log) -> bool:
     """Whether a log is a folder of images without odometry, or depth that gives one: these can be found again in a map,
     and no more than that."""
     return log.file_names() is not None and log.odometry() is None and not gives_visual(log)

@@ -115,13 +115,13 @@ def groups_of(every: Drives, pair_ledgers: Sequence[PairLedger], pipeline: Pipel
     return found
 
 
-def solve_group(store: Store, group: Group, pipeline: Pipeline, library: str, staging: Path) -> dict[str, Any]:
+def solve_group(group: Group, runs: Sequence[Path], pipeline: Pipeline, library: str, staging: Path) -> dict[str, Any]:
     """Solve a group, and make a folder in `staging` for each component that comes of it.
 
     Returns the group as joint.json has it: `components`, and the pairs kept `apart` with reasons. Raises GraphError
     where it cannot be solved, and ResultError where a drive's folder is damaged.
     """
-    drives = [_drive(drive, store.run(drive)) for drive in group.drives]
+    drives = list(map(_drive, group.drives, runs))
     at = {drive: number for number, drive in enumerate(group.drives)}
     ledgers = {(at[entry.later], at[entry.earlier]): _ledger(entry) for entry in group.pair_ledgers}
     joined, ledgers = solve_drives(drives, ledgers, pipeline)
@@ -230,8 +230,9 @@ def _is_whole(component: Path, drives: Sequence[str]) -> bool:
 def _solved(store: Store, group: Group, pipeline: Pipeline, library: str) -> dict[str, Any]:
     staging = store.staging / "joint"
     shutil.rmtree(staging, ignore_errors=True)
+    runs = [store.run(drive) for drive in group.drives]
     try:
-        record = solve_group(store, group, pipeline, library, staging)
+        record = solve_group(group, runs, pipeline, library, staging)
     except DamagedDriveError:  # the others are solved without it
         raise
     except VplogError as error:  # one group must not take the others along; it is tried again

@@ -136,7 +136,7 @@ def check_removable(store: Store, drives: Sequence[str]) -> None:
     """Raises ResultError where this user may not remove a folder of these drives."""
     for path in [folder for drive in drives for folder in store.root.glob(f"*/{folder_name(drive)}")]:
         for folder in [path.parent, *(Path(below) for below, _, _ in os.walk(path))]:
-            if not os.access(folder, os.W_OK | os.X_OK):
+            if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
                 raise ResultError(
                     f"Cannot remove {', '.join(drives)} from {store}: no permission to change {folder}. The map is as "
                     "it was. Ask the owner of that folder for the permission, or let the owner remove the drive."
