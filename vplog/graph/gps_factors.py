@@ -321,7 +321,8 @@ def cost_of_fixes(factors: Factors, weight: Floats, poses: Floats, fixes: Fixes)
         return most * len(fixes)
     alone, noise = Objective(factors, weight), max(factor, 1.0) / fixes.alike
     cost = together.cost(se3.between(fit[:1], fit)) - alone.cost(poses)
-    cost += (most * float((1.0 - inlier).sum()) + 1.5 * math.log(noise) * float(inlier.sum())) / fixes.alike
+    # errors that are alike tell less by as much, but those of a jump are none of them
+    cost += most * float((1.0 - inlier).sum()) + 1.5 * math.log(noise) * float(inlier.sum()) / fixes.alike
     return cost + 0.5 * (together.information(fit).log_determinant() - _log_determinant(alone, poses))
 
 

@@ -15,17 +15,18 @@ import numpy as np
 
 from vplog.errors import GraphError
 from vplog.graph.build import informed
-from vplog.graph.consistency import OdometryChain, is_loop, residual_sigma
-from vplog.graph.evidence import agreeing, log_evidence, runs
+from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, residual_sigma
+from vplog.graph.evidence import agreeing, log_evidence, log_room, runs
 from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
 from vplog.graph.least_squares import Objective, descend
+from vplog.graph.leave_one_out import distance
 from vplog.graph.odometry_mixture import modes
 from vplog.graph.robust_kernels import DcsSettings
 from vplog.graph.variance_components import Sigmas, claimed_times, estimate
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from vplog.data import Bools, Floats, Ints, PoseGraph
     from vplog.stages import Optimiser
@@ -50,6 +51,10 @@ a true one good: Kass and Raftery, Bayes Factors, 1995, call it very strong. Wha
 of them is used where the odds are even."""
 _FLIPS, _MOST_FLIPS = 4, 10
 """Runs of either kind that are tried at once, and turns."""
+_LEAST_FAMILY = 3
+"""Closures of a family that is tried as a whole; runs are smaller."""
+_GROWTH = 30
+"""Rounds in which a set of closures grows at most: each adds as large a share of the runs."""
 _STEPS, _TOLERANCE = 100, 1e-4
 
 
@@ -83,7 +88,7 @@ def best_hypothesis(
         solution = optimiser(graph)
         kept = np.where(solution.weight > 0.5, 1.0, 0.0)
         found.append(_refit(graph, kept, solution.world_from_body, Sigmas()))
-    likeliest = [one.sigmas for one in sorted(found, key=lambda one: -one.log_evidence)[:1]]
+    likeliest = [one.sigmas for one in _likeliest(found)]
     for sigmas in dict.fromkeys([Sigmas(), *likeliest]):  # others would be of what false closures happen to share
         alone = _judged(graph, none, chain.poses, sigmas)
         margin = _VERY_STRONG if isinstance(optimiser, GncSettings) else 0.0
@@ -126,7 +131,8 @@ def _searched(graph: PoseGraph, gnc: GncSettings, loops: Ints, chain: OdometryCh
     of_families = []
     sigmas = likely_modes[0][0]
     starts = [sigmas, Sigmas()] if sigmas.differ(Sigmas(), math.log(_AS_CLAIMED)) else [sigmas]
-    for likely in [one for sigmas in starts for one in _families(graph, loops, sigmas)]:
+    families = [one for sigmas in starts for one in _families(graph, loops, sigmas)]
+    for likely in families:
         if _is_new(likely, tried):
             weight = np.ones(len(graph.a))
             weight[loops] = likely
@@ -135,7 +141,39 @@ def _searched(graph: PoseGraph, gnc: GncSettings, loops: Ints, chain: OdometryCh
     for one in of_families:
         found += _attempted(lambda one=one: _tested(graph, gnc, one.weight, one.poses, one.sigmas))
     found += of_families
-    return [*found, _improved(graph, max(found, key=lambda one: one.log_evidence))] if found else []
+    grown = _attempted(lambda: [_grown(graph, sigmas, chain)])
+    whole = [loops[one] for one in families if one.sum() >= _LEAST_FAMILY]
+    found += [_improved(graph, one, whole) for one in [*_likeliest(found), *grown]]
+    for one in _likeliest(found):
+        found += _attempted(lambda one=one: _tested(graph, gnc, one.weight, one.poses, one.sigmas))
+    return found
+
+
+def _likeliest(found: list[Hypothesis]) -> list[Hypothesis]:
+    """The one of greatest evidence, if there is any."""
+    return sorted(found, key=lambda one: -one.log_evidence)[:1]
+
+
+def _grown(graph: PoseGraph, sigmas: Sigmas, chain: OdometryChain) -> Hypothesis:
+    """The closures that are accepted run by run, always those of the best odds by the graph of the ones before: what
+    is near in odometry tells how far the rest has drifted. It ends where chance brings the next as near."""
+    factors = Factors.of(claimed_times(graph, sigmas))
+    weight, poses = np.where(is_loop(graph), 0.0, 1.0), chain.poses
+    left = list(runs(graph, np.flatnonzero(is_loop(graph))))
+    room, at_once = log_room(factors.graph, poses), -(-len(left) // _GROWTH)
+    while left:
+        apart, log_spread = distance(factors, weight, poses, np.concatenate(left))
+        odds = room - 0.5 * (apart + degrees_of_freedom(graph) * math.log(2.0 * math.pi)) - log_spread
+        ends = np.cumsum([len(run) for run in left])[:-1]
+        of_run = np.array([np.median(one) for one in np.split(odds, ends)])
+        surest = np.argsort(-of_run, kind="stable")[:at_once].tolist()
+        best = [at for at in surest if of_run[at] > _VERY_STRONG]
+        if not best:
+            break
+        weight[np.concatenate([left[at] for at in best])] = 1.0
+        left = [run for at, run in enumerate(left) if at not in best]
+        poses = descend(factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
+    return _refit(graph, weight, poses, sigmas)
 
 
 def _is_new(likely: Bools, tried: list[Bools]) -> bool:
@@ -166,10 +204,11 @@ def _families(graph: PoseGraph, loops: Ints, sigmas: Sigmas) -> list[Bools]:
     return found
 
 
-def _improved(graph: PoseGraph, best: Hypothesis) -> Hypothesis:
+def _improved(graph: PoseGraph, best: Hypothesis, families: Sequence[Ints] = ()) -> Hypothesis:
     """The hypothesis after flips of runs of closures, each the best of some, as long as they make it likelier.
 
-    Tried are the rejected runs that fit best, and the accepted ones that fit worst.
+    Tried are the rejected runs that fit best, the accepted ones that fit worst, and `families` rejected as a whole:
+    their members support each other.
     """
     loops = is_loop(graph)
     for _ in range(_MOST_FLIPS):
@@ -178,6 +217,7 @@ def _improved(graph: PoseGraph, best: Hypothesis) -> Hypothesis:
         for accepted, sign in ((False, 1.0), (True, -1.0)):
             edges = np.flatnonzero(loops & ((best.weight > 0) == accepted))
             flips += sorted(runs(graph, edges), key=lambda run: sign * float(misfit[run].mean()))[:_FLIPS]
+        flips += [accepted for family in families if len(accepted := family[best.weight[family] > 0])]
         tried = [one for run in flips for one in _flipped(graph, best, run)]
         better = max(tried, key=lambda one: one.log_evidence, default=best)
         if better.log_evidence <= best.log_evidence:
