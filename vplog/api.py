@@ -477,8 +477,8 @@ class Map:
 
 def _localizer(owner: object, root: Path) -> Callable[..., LocalizedPicture]:
     """`localize_image` of a run or map that is open as long as `owner` lives."""
+    from vplog.localize.localize import localize_image
     from vplog.localize.places import opened
-    from vplog.localize.single_image import localize_image
 
     with ExitStack() as stack:
         places = stack.enter_context(opened(root, Execution()))

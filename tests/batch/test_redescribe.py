@@ -63,7 +63,7 @@ def test_a_map_in_a_bucket_is_described_anew(finished: Path, drive: Drive, verb:
         assert fate == [("drive", "drive", "computed"), ("lost", "lost", "failed")]
         assert "/no/such.mcap no longer exists" in told["drives"][1]["error"]
         with map_store.reading(new) as store:
-            made_by = tables.read_metadata(store.table("descriptors", "drive"))["vplog.library"]
+            made_by = tables.read_metadata(store.file("drive", "descriptors.parquet"))["vplog.library"]
             assert map_store.common_library(store)[0] == told["library"] == made_by != library
             settings = run_record.read_run_json(store.file("drive", "run.json"))["settings"]
             assert settings["features"]["max_features"] == 200, "those of the map"

@@ -163,7 +163,7 @@ def test_tables_are_copies_where_there_are_no_links(root: Path, monkeypatch: pyt
         raise PermissionError(1, "no links here")
 
     store = map_store.Store(root)
-    path, source = store.table("edges", "ten"), store.run("ten") / "edges.parquet"
+    path, source = store.root / "edges" / "drive=ten" / "edges.parquet", store.run("ten") / "edges.parquet"
     path.unlink()
     monkeypatch.setattr("os.link", refuse)
     with map_store.writing(root):

@@ -154,7 +154,6 @@ def _failed(store: Store) -> dict[str, dict[str, Any]]:
 
 
 def _is_damaged(store: Store, drive: str) -> bool:
-    """Whether a file of a drive is not as it was written; then the drive is left out until it is computed."""
     if wrong := store.damaged_files(drive):
         store.damaged[drive] = wrong[0]
     return bool(wrong)
@@ -208,12 +207,10 @@ def _other_versions(others: Sequence[dict[str, Any]], common: dict[str, Any]) ->
 
 
 def _cache(store: Store, drive: str) -> Path:
-    """Stage cache of a drive, until it is in the map."""
     return store.root / ".cache" / folder_name(drive)
 
 
 def _clear_caches(store: Store) -> None:
-    """Remove the caches of the drives in the map."""
     for drive in store.drives():
         shutil.rmtree(_cache(store, drive), ignore_errors=True)
     with suppress(OSError):  # not empty: what failed goes on there
@@ -298,7 +295,6 @@ def _common_record(pipeline: Pipeline, topics: TopicChoice, library: str) -> dic
 
 
 def _publish(store: Store, task: Task, outcome: Outcome, attempts: int) -> Drive:
-    """Rename a finished drive in."""
     error = outcome.error
     if not error:
         try:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog import logs
-from vplog.data import Ints
 from vplog.errors import LibraryError, LogError, VplogError
 from vplog.execution.execution import Execution
 from vplog.maps.storage import map_store
@@ -20,10 +19,9 @@ if TYPE_CHECKING:
     from vplog.logs import TopicChoice
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
-    from vplog.stages import Log
 
 _TRIED = 8
-"""Frames of a log that are decoded before it is relied on: one that does is enough."""
+"""Frames of a log, over the whole drive, that are decoded before it is relied on: one that does is enough."""
 
 
 def map_library(
@@ -73,8 +71,15 @@ def _decodable(paths: Sequence[Path], topics: TopicChoice) -> list[Path]:
     for path in paths:
         try:
             log = logs.open(path, topics)
-            if _decodes(log, log.stamps()):
-                sound.append(path)
+            stamps = log.stamps()
+            for encoded in log.frames(stamps[evenly(len(stamps), _TRIED)]) if len(stamps) else ():
+                try:
+                    encoded.decode()
+                except VplogError as error:
+                    first = first or error
+                else:
+                    sound.append(path)
+                    break
         except VplogError as error:
             first = first or error
         except OSError as error:
@@ -84,18 +89,3 @@ def _decodable(paths: Sequence[Path], topics: TopicChoice) -> list[Path]:
     if not sound:
         raise first or LibraryError("None of the logs has a frame, so there is nothing to build a library from.")
     return sound
-
-
-def _decodes(log: Log, stamps: Ints) -> bool:
-    """Whether one of a few frames does, over the whole drive. Raises the first error where none does."""
-    first = None
-    for encoded in log.frames(stamps[evenly(len(stamps), _TRIED)]) if len(stamps) else ():
-        try:
-            encoded.decode()
-        except VplogError as error:
-            first = first or error
-        else:
-            return True
-    if first is not None:
-        raise first
-    return False

@@ -152,7 +152,6 @@ class RayEngine:
         }
 
     def _answer(self, answer: Any) -> Any:
-        """The result of a task, or its error."""
         try:
             return self._ray.get(answer, timeout=_PROBE_S)
         except self._ray.exceptions.RayError as error:
@@ -294,7 +293,6 @@ def compute_remote_drive(task: Task, library: dict[str, Bytes], parts: list[tupl
 
 
 def _put_files(folder: Path) -> Files:
-    """The files of a folder as pieces in the object store, drive.json last."""
     import ray
 
     names = sorted(files_in(folder), key=lambda name: (name == "drive.json", name))

@@ -93,7 +93,6 @@ def redescribe_map(
 
 
 def _drives_of(store: Store) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
-    """drive.json and the topics of each drive."""
     _, drives = map_store.common_library(store)
     topics = {}
     for drive in drives:

@@ -10,22 +10,29 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vplog.batch.picture_drive import pictures_of, write_pictures
+import numpy as np
+
+from vplog import logs
 from vplog.cache.input_hashes import hash_inputs
+from vplog.data import Keyframes
 from vplog.errors import VplogError
 from vplog.execution.cores import limited
 from vplog.execution.execution import Execution
 from vplog.execution.timing import peak_memory_mb
+from vplog.maps.import_places import write_places_run
+from vplog.maps.search.query import describe_log
 from vplog.maps.storage import layout
 from vplog.pipeline import Pipeline
 from vplog.pipeline import run as run_alone
-from vplog.results import run_record
+from vplog.results import run_record, tables
 from vplog.run import provenance
+from vplog.run.odometry import gives_visual
 from vplog.run.run_folder import CacheOptions
 from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
     from vplog.logs import TopicChoice
+    from vplog.stages import Log
 
 
 @dataclass(frozen=True)
@@ -60,17 +67,13 @@ class Outcome:
     retryable: bool = False
     """Whether the cause of the error may be gone at another attempt."""
     seconds: float = 0.0
-    """Wall time in the worker."""
     worker: str = ""
     """Machine and process; none of a worker that died."""
     peak_memory_mb: float = 0.0
     """Largest resident memory of the worker, in MB (10^6 bytes); 0 where unknown."""
     keyframes: int = 0
-    """Keyframes of the drive."""
     accepted: int = 0
-    """Closures within it."""
     warnings: tuple[str, ...] = ()
-    """Warnings of the run."""
 
 
 @dataclass(frozen=True)
@@ -128,13 +131,39 @@ def compute_drive(task: Task) -> Outcome:
     return Outcome(error, retryable, seconds, worker, max(peak, round(peak_memory_mb(), 1)), **found)
 
 
-def _compute(task: Task, log: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:
+def _compute(task: Task, path: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:
     """Make the run folder of a drive: its run.json, the name of the drive in its tables, and its drive.json."""
-    execution = Execution(task.threads)
-    if (pictures := pictures_of(log, task.topics)) is not None:
-        about = {"log": task.record["log"], "inputs": hash_inputs(log), "topics": task.topics.model_dump(mode="json")}
-        record = write_pictures(task.folder, task.drive, pictures, task.library, task.pipeline, about, execution)
-        return record, task.drive, {**task.record, layout.PICTURES: True}
+    execution, log = Execution(task.threads), logs.open(path, task.topics)
+    if _is_pictures(log):
+        return _write_pictures(task, path, log, execution), task.drive, {**task.record, layout.PICTURES: True}
     options = CacheOptions(task.cache, use=task.cache is not None)
-    done = run_alone(log, task.folder, task.pipeline, task.library, task.topics, execution, options)
+    done = run_alone(path, task.folder, task.pipeline, task.library, task.topics, execution, options)
     return done.record, done.keyframes.drive, task.record
+
+
+def _is_pictures(log: Log) -> bool:
+    """Whether a log is a folder of images without odometry, or depth that gives one: these can be found again in a map,
+    and no more than that."""
+    return log.file_names() is not None and log.odometry() is None and not gives_visual(log)
+
+
+def _write_pictures(task: Task, path: Path, log: Log, execution: Execution) -> dict[str, Any]:
+    """Describe every picture with the map's library, and write the run folder of the drive; its run.json.
+
+    Poses are not known: all are the identity, and the drive is joined with no other.
+    """
+    state = task.pipeline.places.load(task.library, execution)
+    stamps, descriptors, warnings = describe_log(log, task.pipeline, state, execution)
+    rows, names = np.searchsorted(log.stamps(), stamps).tolist(), log.file_names() or []
+    account = {
+        "log": task.record["log"],
+        "inputs": hash_inputs(path),
+        "topics": task.topics.model_dump(mode="json"),
+        "library": {"hash": state.hash, "from": str(task.library)},
+        "names": [names[row] for row in rows],
+        "warnings": [*log.warnings, *warnings],
+    }
+    header = tables.TableMetadata(task.pipeline.model_dump(mode="json"), state.hash)
+    keyframes = Keyframes(task.drive, stamps, np.tile(np.eye(4), (len(stamps), 1, 1)))
+    task.folder.mkdir(parents=True, exist_ok=True)
+    return write_places_run(task.folder, keyframes, state.to_arrow(descriptors), header, account)

@@ -24,7 +24,7 @@ from vplog.cache.input_hashes import hash_inputs, stat_signature
 from vplog.errors import ResultError
 from vplog.results.run_record import read_run_json, write_run_json
 from vplog.settings import Settings
-from vplog.storage.json_records import canonical_json
+from vplog.storage.json_records import canonical_json, key_of
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
@@ -118,11 +118,6 @@ class Inputs:
     def lengths(self) -> str:
         """sha256 over the lengths of the files: copies on other machines have other times."""
         return key_of(_lengths(self.signature))
-
-
-def key_of(made_from: Any) -> str:
-    """sha256 over all that a result depends on, a tree of plain values."""
-    return hashlib.sha256(canonical_json(made_from).encode()).hexdigest()
 
 
 def digest_of(value: Any) -> str:
@@ -300,7 +295,6 @@ class StageCache:
             self._disk_full = True
 
     def _remove(self, retained: set[str]) -> None:
-        """Remove the cache's own files but these."""
         for file in [file for pattern in CACHE_FILES for file in self.folder.glob(pattern)]:
             if file.name not in retained:
                 file.unlink(missing_ok=True)

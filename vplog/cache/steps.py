@@ -20,11 +20,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, Self, TypeVar
 
 from vplog.cache.code_hash import code_of
-from vplog.cache.stage_cache import AbsentError, StageCache, digest_of, key_of
+from vplog.cache.stage_cache import AbsentError, StageCache, digest_of
 from vplog.execution.cores import limited
 from vplog.execution.execution import Execution, logged_warnings
 from vplog.execution.timing import StageTimer
 from vplog.settings import Settings
+from vplog.storage.json_records import key_of
 
 if TYPE_CHECKING:
     from vplog.cache.codecs import Codec
@@ -125,7 +126,6 @@ class Steps:
     def _result(
         self, one: Step[T], name: str, inputs: Sequence[Any], execution: Execution | None = None
     ) -> tuple[T, bool]:
-        """The value, and whether it was found."""
         given = {"execution": execution or self._execution, "steps": self}
         given = {key: value for key, value in given.items() if key in one.parameters}
         if one.codec is None:

@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 
-from vplog.data import Camera, Features, Frame, Ints, Verdict
-from vplog.errors import LibraryError, LogError
+from vplog import logs
+from vplog.data import Bytes, Camera, Features, Frame, Ints, Verdict
+from vplog.errors import LibraryError, LogError, SettingsError
+from vplog.execution.execution import Execution
 from vplog.features.extraction import describe
 from vplog.geometry import se3
 from vplog.geometry.masking import masked
@@ -18,9 +22,9 @@ from vplog.loops.localize import Localization, localize
 from vplog.results.geo import on_earth
 from vplog.results.tables import POSE_COLUMNS
 from vplog.stages import EncodedFrame, FrameState, Log, StoredState
+from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
     from vplog.localize.places import Places
 
 TOP = 10
@@ -92,9 +96,35 @@ def localize_log(
             yield found
 
 
+def localize_image(places: Places, image: Bytes | Path | str, camera: Camera | Path | str) -> LocalizedPicture:
+    """The pose of an image: a file, or (H, W) or (H, W, 3) uint8 in red, green, blue; its camera, or a calibration
+    file. Raises LogError where the file is no image or the camera's size is another."""
+    return localize_frame(places, _frame(image, camera), Execution())
+
+
 def localize_frame(places: Places, frame: Frame, execution: Execution) -> LocalizedPicture:
-    """One picture."""
     return next(_localized(places, [_describe(places, frame)], execution, TOP, {}))
+
+
+def _frame(image: Bytes | Path | str, camera: Camera | Path | str) -> Frame:
+    if isinstance(image, np.ndarray):
+        if not isinstance(camera, Camera):
+            raise SettingsError("An image in memory needs its camera as vplog.data.Camera, not a file.")
+        return _of_pixels(image, camera)
+    file = None if isinstance(camera, Camera) else located(camera)
+    log = logs.open_images([located(image)], logs.TopicChoice(calibration_file=file))
+    frame = next(iter(log.frames(log.stamps()))).decode(colour=True)
+    return _of_pixels(np.asarray(frame.colour), camera) if isinstance(camera, Camera) else frame
+
+
+def _of_pixels(image: Any, camera: Camera) -> Frame:
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
+        raise LogError(f"An image is (H, W) or (H, W, 3) uint8, not {image.shape} {image.dtype}.")
+    if image.shape[:2] != (camera.height, camera.width):
+        size = f"{image.shape[1]}x{image.shape[0]}"
+        raise LogError(f"The image is {size}, and the camera {camera.width}x{camera.height}. Scale its matrix along.")
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    return Frame(0, camera, np.asarray(grey, np.uint8), colour=image if image.ndim == 3 else np.dstack([image] * 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +139,6 @@ class _Picture:
 
 
 def _described(places: Places, frames: Iterator[EncodedFrame], execution: Execution) -> Iterator[_Picture]:
-    """Features and descriptor of each frame."""
     colour = isinstance(places.state, FrameState) and places.state.colour
 
     def work(encoded: EncodedFrame) -> _Picture:
@@ -136,7 +165,6 @@ def _describe(places: Places, frame: Frame) -> _Picture:
 def _localized(
     places: Places, block: Sequence[_Picture], execution: Execution, top: int, names: dict[int, str]
 ) -> Iterator[LocalizedPicture]:
-    """Some pictures, in order."""
     sound = [one for one in block if one.features is not None]
     likely = dict(zip(map(id, sound), places.search([one.descriptor for one in sound], top), strict=True))
     for drive in sorted({drive for found in likely.values() for drive, _ in found}):
@@ -172,7 +200,6 @@ def _answer(places: Places, one: _Picture, likely: list[tuple[int, int]], name: 
 
 
 def _with_neighbours(places: Places, likely: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """The places and those around the first of each drive."""
     first, found = dict(reversed(likely)), list(likely)
     for drive, row in first.items():
         count = len(places.drives[drive].loaded.world_from_body)
@@ -181,7 +208,6 @@ def _with_neighbours(places: Places, likely: list[tuple[int, int]]) -> list[tupl
 
 
 def _sentence(found: Localization, drive: str, keyframe: int) -> str:
-    """The verdict in words."""
     if found.world_from_camera is not None:
         sigma_m, sigma_deg = sigmas(found)
         places = "1 keyframe" if found.places == 1 else f"{found.places} keyframes"

@@ -95,14 +95,11 @@ class Places:
     warnings: list[str]
 
 
-@contextmanager
-def opened(root: Path, execution: Execution) -> Iterator[Places]:
+def opened(root: Path, execution: Execution) -> AbstractContextManager[Places]:
     """A run folder or a map. Raises VplogError where it is neither, or a map by URL."""
-    with ExitStack() as stack:
-        if isinstance(root, RemotePath):
-            raise ResultError(f"{root} is read from a local folder to localise in it. Copy it to this machine.")
-        is_map = (root / "map.json").exists()
-        yield stack.enter_context((_of_map if is_map else _of_run)(root, execution))
+    if isinstance(root, RemotePath):
+        raise ResultError(f"{root} is read from a local folder to localise in it. Copy it to this machine.")
+    return _of_map(root, execution) if (root / "map.json").exists() else _of_run(root, execution)
 
 
 @contextmanager

@@ -3,7 +3,7 @@ and every sample gets a pose."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,21 +18,12 @@ if TYPE_CHECKING:
     from vplog.pipeline import Pipeline
 
 
-class JoinedLog(NamedTuple):
-    """The drive of a log in the frame of a map."""
-
-    trajectory: Trajectory
-    """Every sample of the odometry."""
-    agrees: Bools
-    """(L,) localised frames that the rest agrees with."""
-
-
 def join_by_odometry(
     odometry: Odometry, keyframes: Keyframes, rows: Ints, world_from_body: Floats, covariance: Floats,
     pipeline: Pipeline,
-) -> JoinedLog:  # fmt: skip
+) -> tuple[Trajectory, Bools]:  # fmt: skip
     """The trajectory by odometry and the poses (L, 4, 4), with covariance (L, 6, 6) in the body, of keyframes `rows`
-    (L,), one at least. Raises GraphError where there is none."""
+    (L,), one at least; and (L,) which of these the rest agrees with. Raises GraphError where there is none."""
     edges, _, _ = edge_covariance(odometry, keyframes.stamp_ns, pipeline.noise)
     graph, _, _ = build_graph(keyframes, edges, None)
     world = len(keyframes.stamp_ns)  # the map is one more node, to which only localised frames lead
@@ -50,4 +41,4 @@ def join_by_odometry(
     poses = solution.world_from_body
     solved = se3.between(np.broadcast_to(poses[world], (world, 4, 4)), poses[:world])
     agrees = solution.weight[is_loop(graph)] > 0.5
-    return JoinedLog(correct_trajectory(odometry, keyframes, solved), agrees)
+    return correct_trajectory(odometry, keyframes, solved), agrees

@@ -17,9 +17,9 @@ from vplog.execution.execution import Execution
 from vplog.geometry import se3, tum
 from vplog.localize.localize import TOP, LocalizedPicture, localize_log
 from vplog.localize.places import Places, opened
-from vplog.localize.trajectory import JoinedLog, join_by_odometry
+from vplog.localize.trajectory import join_by_odometry
+from vplog.maps.search.query import select_views
 from vplog.results.tables import TableMetadata, write_localized
-from vplog.run.keyframes import select_keyframes
 from vplog.storage.scratch import check_file_output
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def localize_paths(
     is_log = len(paths) == 1 and not logs.is_image_file(paths[0])
     log = logs.open(paths[0], topics) if is_log else logs.open_images(paths, topics)
     with opened(root, execution) as places:
-        stamps, keyframes, warnings = _frames(log, places)
+        stamps, keyframes, warnings = select_views(log, places.pipeline.keyframes)
         found = list(localize_log(places, log, stamps, execution, top))
         joined = None
         if keyframes is not None:
@@ -63,7 +63,6 @@ def localize_paths(
 
 
 def _check_out(out: Path | None) -> None:
-    """Raises ResultError where it cannot be written, before any work."""
     if out is None:
         return
     if out.suffix not in (".parquet", ".tum"):
@@ -71,18 +70,9 @@ def _check_out(out: Path | None) -> None:
     check_file_output(out)
 
 
-def _frames(log: Log, places: Places) -> tuple[Any, Keyframes | None, list[str]]:
-    """Stamps of the pictures: of the keyframes where there is odometry."""
-    odometry, stamps = log.odometry(), log.stamps()
-    if odometry is None or len(odometry.stamp_ns) < 2:
-        return stamps, None, []
-    keyframes, warnings = select_keyframes(log.name, stamps, odometry, places.pipeline.keyframes)
-    return keyframes.stamp_ns, keyframes, warnings
-
-
 def _joined(
     log: Log, keyframes: Keyframes, found: list[LocalizedPicture], places: Places
-) -> tuple[list[LocalizedPicture], JoinedLog | None]:
+) -> tuple[list[LocalizedPicture], Trajectory | None]:
     """The pictures of a log, without those at odds with its odometry, and its trajectory in the frame of most; None
     where none is localised, or no two agree with the odometry."""
     odometry = log.odometry()
@@ -92,13 +82,15 @@ def _joined(
     frame = frames.most_common(1)[0][0]
     rows = np.flatnonzero([one.localized and one.frame == frame for one in found])
     poses, covariances = zip(*(_of_body(found[row]) for row in rows.tolist()), strict=True)
-    joined = join_by_odometry(odometry, keyframes, rows, np.stack(poses), np.stack(covariances), places.pipeline)
-    if not joined.agrees.any():
+    trajectory, agrees = join_by_odometry(
+        odometry, keyframes, rows, np.stack(poses), np.stack(covariances), places.pipeline
+    )
+    if not agrees.any():
         return found, None
-    for row in rows[~joined.agrees].tolist():
+    for row in rows[~agrees].tolist():
         lost = replace(found[row].found, verdict=Verdict.REJECTED_BY_SOLVER, world_from_camera=None, covariance=None)
         found[row] = replace(found[row], found=lost, sentence=_AT_ODDS, earth_deg_m=None)
-    return found, joined
+    return found, trajectory
 
 
 def _of_body(one: LocalizedPicture) -> tuple[Any, Any]:
@@ -110,14 +102,14 @@ def _of_body(one: LocalizedPicture) -> tuple[Any, Any]:
 
 
 def _write(
-    out: Path, records: list[dict[str, Any]], found: list[LocalizedPicture], joined: JoinedLog | None,
+    out: Path, records: list[dict[str, Any]], found: list[LocalizedPicture], joined: Trajectory | None,
     header: TableMetadata,
 ) -> None:  # fmt: skip
     if out.suffix == ".parquet":
         write_localized(out, records, header)
         return
     if joined is not None:
-        tum.write_tum(out, joined.trajectory)
+        tum.write_tum(out, joined)
         return
     known = {one.stamp_ns: pose for one in found if (pose := one.found.world_from_camera) is not None}
     if not known:

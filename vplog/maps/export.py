@@ -37,7 +37,6 @@ class _Source:
     drives: dict[str, dict[str, Any]]
     """Entries of the file's header, by ID."""
     earth: Callable[[str], Earth | None]
-    """Georeference of a drive."""
     read: Callable[[str, Callable[[Path], Any], Sequence[str]], Any]
     """Calls a function with a drive's run folder, which has the files of these names."""
     evict: Callable[[str], None]

@@ -44,15 +44,13 @@ def import_places_of(store: Store, path: Path, wanted: dict[str, str]) -> Iterat
     """Put the places of the drives that are `wanted`, by their IDs in the file, into the map under the IDs given; each
     by its ID in the file when it is in. Raises ResultError."""
     about, kind = read_places_header(path), _kind(store, path)
-    number = 0
+    made = store.staging / f"{os.getpid()}-import"
     for places in read_drives(path, kind):
         if places.drive not in wanted:
             continue
-        taken, number = wanted[places.drive], number + 1
-        made = store.staging / f"{os.getpid()}-import-{number}"
         shutil.rmtree(made, ignore_errors=True)
         made.mkdir()
-        record = _record(path, about, places.drive)
+        taken, record = wanted[places.drive], _record(path, about, places.drive)
         _write_run(made, places, taken, about)
         earth = earth_record(earth_from_record(record["earth"]), places.world_from_body)
         record = {**record, "drive": taken, "earth": earth}
@@ -94,7 +92,6 @@ def _kind(store: Store, path: Path) -> pa.DataType:
 
 
 def _write_run(folder: Path, places: DrivePlaces, drive: str, about: PlacesHeader) -> None:
-    """Write the run folder of a drive of which the places alone are known."""
     stamps, poses = places.stamp_ns, places.world_from_body
     if not np.isfinite(poses).all() or np.any(np.diff(stamps) <= 0):
         raise ResultError(f"{places.source}: {drive} has poses that are not finite, or stamps that do not increase.")

@@ -103,30 +103,24 @@ def _drive(store: Store, drive: str, about: dict[str, Any]) -> dict[str, Any]:
             "log": about["log"],
             "keyframes": store.rows("descriptors", drive),
             "candidates": store.rows("closures", drive),
-            "accepted": _accepted(record.get("counts")),
+            "accepted": _figure(record, "counts", "verdicts", "accepted") or 0,
             "on_earth": store.earth(drive) is not None,
             "bounds": bounds_of(about.get("earth")),
             "descriptor_bytes": sizes.get("descriptors.parquet", 0),
             "descriptor_bits": record.get("descriptor_bits"),
             "bytes": sum(sizes.values()),
-            "seconds": _figure(record.get("totals"), "seconds"),
-            "peak_memory_mb": _figure(record.get("totals"), "peak_memory_mb"),
+            "seconds": _figure(record, "totals", "seconds"),
+            "peak_memory_mb": _figure(record, "totals", "peak_memory_mb"),
             "warnings": record.get("warnings", []),
         }
 
     return store.read(drive, read, ())
 
 
-def _figure(totals: Any, name: str) -> float | None:
-    """A number of the totals of run.json; None where there is none."""
-    value = totals.get(name) if isinstance(totals, dict) else None
-    return value if is_finite(value) else None
-
-
-def _accepted(counts: Any) -> int:
-    verdicts = counts.get("verdicts") if isinstance(counts, dict) else None
-    found = verdicts.get("accepted", 0) if isinstance(verdicts, dict) else 0
-    return found if isinstance(found, int) else 0
+def _figure(record: Any, *names: str) -> float | None:
+    for name in names:
+        record = record.get(name) if isinstance(record, dict) else None
+    return record if is_finite(record) else None
 
 
 def _components(store: Store, known: Mapping[str, Any], problems: list[str]) -> list[dict[str, Any]] | None:
@@ -150,7 +144,6 @@ def _components(store: Store, known: Mapping[str, Any], problems: list[str]) -> 
 
 
 def _unused_folders(store: Store, drives: list[str]) -> list[str]:
-    """Warnings about folders of drives that the map does not have."""
     if store.mirror is not None:
         return []  # a writer there removes them
     known, root = {map_store.folder_name(drive) for drive in drives}, store.root

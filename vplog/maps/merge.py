@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,29 +42,25 @@ def merge_maps(
         raise SettingsError(f"{target} is given as a source and as the target. Choose another map with -o.")
     if len({str(source.resolve()) for source in sources}) < len(sources):
         raise SettingsError("A map is given twice. Give each once.")
-    with ExitStack() as stack:
-        here = [stack.enter_context(local_copy(one)) if one.is_file() else one for one in sources]
-        return _merge(here, target, execution, chosen)
-
-
-def _merge(sources: Sequence[Path], target: Path, execution: Execution, chosen: Sequence[str]) -> dict[str, Any]:
-    library = _check_libraries(sources, target)
-    _check_chosen(sources, chosen)
     outcomes, warnings = list[dict[str, Any]](), list[str]()
-    with map_store.writing(target) as store:
-        target_drives = _TargetDrives(store.drives())
-        for number, source in enumerate(sources, start=1):
-            if source.is_file():
-                outcomes += _merge_places(store, source, target_drives, chosen)
+    with ExitStack() as stack:
+        opened = [stack.enter_context(_opened(source)) for source in sources]
+        library = _check_libraries(opened, target)
+        _check_chosen(opened, chosen)
+        store = stack.enter_context(map_store.writing(target))
+        known = store.drives()
+        by_content = {_content(record): drive for drive, record in known.items()}
+        for number, source in enumerate(opened, start=1):
+            if isinstance(source, Path):
+                outcomes += _merge_places(store, source, known, by_content, chosen)
                 continue
-            with map_store.reading(source) as other:
-                _, drives = map_store.common_library(other)
-                _copy_library(store, other, library)
-                for drive in natural_order(drives.keys() & set(chosen) if chosen else drives):
-                    taken = _merge_drive(store, other, drives[drive], target_drives, f"{os.getpid()}-{len(outcomes)}")
-                    outcomes += [] if taken is None else [taken]
-                    execution.progress(f"merge {number} of {len(sources)}", len(outcomes), len(outcomes))
-                warnings += damage_warnings(other)
+            _, drives = map_store.common_library(source)
+            _copy_library(store, source, library)
+            for drive in natural_order(drives.keys() & set(chosen) if chosen else drives):
+                taken = _merge_drive(store, source, drives[drive], known, by_content)
+                outcomes += [] if taken is None else [taken]
+                execution.progress(f"merge {number} of {len(sources)}", len(outcomes), len(outcomes))
+            warnings += damage_warnings(source)
         return {
             "map": str(store),
             "library": library,
@@ -73,23 +69,27 @@ def _merge(sources: Sequence[Path], target: Path, execution: Execution, chosen: 
         }
 
 
-def _check_libraries(sources: Sequence[Path], target: Path) -> str:
+def _opened(source: Path) -> AbstractContextManager[Store | Path]:
+    """A map, or an exported file."""
+    if not source.exists():
+        raise ResultError(f"There is neither a map nor an exported file at {source}.{nearest_path(source)}")
+    return local_copy(source) if source.is_file() else map_store.reading(source)
+
+
+def _check_libraries(sources: Sequence[Store | Path], target: Path) -> str:
     """The one library of the maps. Raises LibraryError where their places do not compare."""
     wanted, whose = None, str(target)
     if (target / "map.json").exists():
         with map_store.reading(target) as store:
             wanted = map_store.common_library(store)[0] if store.drives() else store.head().library
     for source in sources:
-        if not source.exists():
-            raise ResultError(f"There is neither a map nor an exported file at {source}.{nearest_path(source)}")
-        if source.is_file():
+        if isinstance(source, Path):
             found, name = read_places_header(source).library, original(source)
             again = "Describe its map again (vplog map redescribe), and export that."
         else:
-            with map_store.reading(source) as other:
-                found, name = map_store.common_library(other)[0], source
+            found, name = map_store.common_library(source)[0], source
             again = f"Write it again: vplog map redescribe {source} --library {whose}/libraries/{wanted} -o MAP."
-        if wanted is None and source.is_file():
+        if wanted is None and isinstance(source, Path):
             raise LibraryError(
                 f"{name} holds places without their library {found[:12]}. Name a map that has it first, or as -o."
             )
@@ -103,15 +103,13 @@ def _check_libraries(sources: Sequence[Path], target: Path) -> str:
     return str(wanted)
 
 
-def _check_chosen(sources: Sequence[Path], chosen: Sequence[str]) -> None:
-    """Raises SettingsError where no map has one of the drives chosen."""
+def _check_chosen(sources: Sequence[Store | Path], chosen: Sequence[str]) -> None:
     known: set[str] = set()
     for source in sources if chosen else ():
-        if source.is_file():
+        if isinstance(source, Path):
             known |= drives_of_file(source).keys()
-            continue
-        with map_store.reading(source) as other:
-            known |= other.drives().keys() | other.damaged.keys()
+        else:
+            known |= source.drives().keys() | source.damaged.keys()
     if unknown := [drive for drive in chosen if drive not in known]:
         raise SettingsError(f"No map given has a drive {unknown[0]!r}. Drives: {', '.join(natural_order(known))}.")
 
@@ -129,36 +127,15 @@ def _copy_library(store: Store, other: Store, library: str) -> None:
     store.write_head(map_store.Head(library, settings))
 
 
-class _TargetDrives:
-    """The drives of the target, and those that come."""
-
-    def __init__(self, records: Mapping[str, dict[str, Any]]) -> None:
-        self._by_content: dict[str, str] = {}
-        self._alone: dict[str, bool] = {}
-        for drive, record in records.items():
-            self.add(drive, record)
-
-    def add(self, drive: str, record: dict[str, Any]) -> None:
-        self._by_content[_content(record)] = drive
-        self._alone[drive] = PLACES_ONLY in record
-
-    def same(self, record: dict[str, Any]) -> tuple[str | None, bool]:
-        """The drive of this content, and whether places alone are known of it."""
-        drive = self._by_content.get(_content(record))
-        return drive, drive is not None and self._alone[drive]
-
-    def free_name(self, drive: str, log: str) -> str:
-        return layout.free_name(drive, log, self._alone)
-
-
 def _merge_drive(
-    store: Store, other: Store, record: dict[str, Any], target_drives: _TargetDrives, staged: str
+    store: Store, other: Store, record: dict[str, Any], known: dict[str, dict[str, Any]], by_content: dict[str, str]
 ) -> dict[str, Any] | None:
-    """Take one drive; its fate, None where it is damaged. A whole one replaces its places alone."""
+    """Take one drive; its fate, None where it is damaged. A whole one replaces its places alone. `known` and
+    `by_content` are the drives of the target, and those that come."""
     drive = record["drive"]
     entry = {"from": str(other), "drive": drive, "as": drive, "log": record["log"]}
-    same, alone = target_drives.same(record)
-    if same is not None and (not alone or PLACES_ONLY in record):
+    same = by_content.get(_content(record))
+    if same is not None and (PLACES_ONLY not in known[same] or PLACES_ONLY in record):
         return {**entry, "as": same, "state": "there already"}
     try:
         whole = other.full_run(drive)  # of a store, files that have their sha256
@@ -168,7 +145,7 @@ def _merge_drive(
     if wrong:
         other.damaged[drive] = wrong[0]
         return None
-    taken, made = same or target_drives.free_name(drive, record["log"]), store.staging / staged
+    taken, made = same or layout.free_name(drive, record["log"], known), store.staging / f"{os.getpid()}-merge"
 
     def copied(_: Path) -> None:
         shutil.rmtree(made, ignore_errors=True)
@@ -183,7 +160,7 @@ def _merge_drive(
     run_record.write_run_json(made / "drive.json", record if taken == drive else layout.renamed(record, taken))
     map_store.publish(store, taken, made)
     other.evict(drive)
-    target_drives.add(taken, record)
+    known[taken], by_content[_content(record)] = record, taken
     return {**entry, "as": taken, "state": "taken"}
 
 
@@ -201,21 +178,22 @@ def _link_join_inputs(other: Store, drive: str, store: Store, taken: str) -> Non
 
 
 def _merge_places(
-    store: Store, source: Path, target_drives: _TargetDrives, chosen: Sequence[str]
+    store: Store, source: Path, known: dict[str, dict[str, Any]], by_content: dict[str, str], chosen: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Take the places of an exported file; the fate of each drive. More places of a drive replace fewer."""
     outcomes, wanted, counts = [], dict[str, str](), places_by_drive(source)
     for drive, record in drives_of_file(source).items():
         if chosen and drive not in chosen:
             continue
-        same, alone = target_drives.same(record)
+        same = by_content.get(_content(record))
+        alone = same is not None and PLACES_ONLY in known[same]
         more = same is None or (alone and counts.get(drive, 0) > store.rows("descriptors", same))
-        taken = same or target_drives.free_name(drive, drive)
+        taken = same or layout.free_name(drive, drive, known)
         entry = {"from": str(original(source)), "drive": drive, "as": taken, "log": record["log"]}
         outcomes.append({**entry, "state": "places taken" if more else "there already"})
         if more:
             wanted[drive] = taken
-            target_drives.add(taken, record)
+            known[taken], by_content[_content(record)] = record, taken
     done = set(import_places_of(store, source, wanted))
     if lost := [drive for drive in wanted if drive not in done]:
         raise ResultError(f"{source} has no place of {lost[0]}, which its header names; export it again.")

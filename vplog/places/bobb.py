@@ -246,7 +246,8 @@ class BobbState(RecordState):
         return votes / max(float(votes.max()), 1e-12)
 
     def index(self, descriptors: Sequence[Place]) -> CodeIndex:
-        lists = build_lists(*self.arrays(descriptors), len(self.matcher), BLOCK)
+        references, weights, boxes = self.arrays(descriptors)
+        lists = build_lists(references, weights, boxes, len(self.matcher), BLOCK)
         return CodeIndex(lists, self.overlaps(), self.pairing)
 
     @property

@@ -177,7 +177,8 @@ class PaperBobbState(RecordState):
         return votes / max(float(votes.max()), 1e-12)
 
     def index(self, descriptors: Sequence[BoxPlace]) -> BoxIndex:
-        return BoxIndex(*self.arrays(descriptors), len(self.library), self.settings.grid)
+        references, boxes = self.arrays(descriptors)
+        return BoxIndex(references, boxes, len(self.library), self.settings.grid)
 
     def shared(self, places: Sequence[BoxPlace], query: Int32s, match: Int32s) -> SharedReferences:
         """The parts of Eq. (1) of pairs (C,) of rows of `places`, by reference; equal boxes overlap by 1."""

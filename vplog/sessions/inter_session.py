@@ -33,7 +33,6 @@ class Candidates:
     """The best candidates of each keyframe of a drive in other drives, ranked together: by query, then rank."""
 
     drive: Int32s
-    """(C,) number of the other drive."""
     proposals: Proposals
     """C rows, ranked over all drives."""
 
@@ -120,7 +119,6 @@ class DrivePair(NamedTuple):
     """The candidates of one drive (queries) in another (matches)."""
 
     later: int
-    """Number of the drive."""
     earlier: int
     proposals: Proposals
     shared: SharedReferences

@@ -96,7 +96,6 @@ def write_drive(
 
 
 def _verified_closures(later: int, earlier: int, ledger: Closures) -> graph_joint.Between:
-    """The verified closures of a ledger, for the graph."""
     rows = np.flatnonzero(ledger.accepted)
     shared = busier(ledger.match[rows], ledger.query[rows])
     return graph_joint.Between(

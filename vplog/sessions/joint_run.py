@@ -27,6 +27,7 @@ from vplog.run.reference_library import build_library, check_library
 from vplog.run.run_folder import CacheOptions, staged_run
 from vplog.sessions.inter_session import candidates_among, closures_between, likely_pairs, with_shared
 from vplog.sessions.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
+from vplog.storage.folders import numbered
 
 if TYPE_CHECKING:
     from vplog.graph.joint import Joined
@@ -41,7 +42,6 @@ class DriveRun:
     name: str
     run: Run
     drive: Drive
-    """Input of the verification of its candidates."""
     solved: SolvedDrive
 
 
@@ -63,7 +63,9 @@ def run_joint(
         raise SettingsError("GPS is for one drive at a time: run each by itself with --gps, or several without.")
     pipeline.decisions.check_single_drive()
     opened = [logs.open(path, topics) for path in paths]
-    drives_at = dict(zip(_names([log.name for log in opened]), paths, strict=True))
+    drives_at: dict[str, Path] = {}
+    for log, path in zip(opened, paths, strict=True):
+        drives_at[numbered(log.name, log.name, {"library", *drives_at})] = path
     check_library(library, pipeline)
     for log in opened:  # before the first drive is computed
         is_visual(log, topics or logs.TopicChoice())
@@ -117,11 +119,7 @@ def _drive_run(name: str, run: Run, pipeline: Pipeline) -> DriveRun:
 def _ledgers(drives: Sequence[DriveRun], state: PlaceState, pipeline: Pipeline, execution: Execution) -> Ledgers:
     """The ledger of every pair of drives; empty where too few candidates are proposed."""
     places = [drive_run.run.places for drive_run in drives]
-    calibrated = [drive_run.drive.camera.matrix is not None for drive_run in drives]
-    share = [
-        calibration_share(drive_run.drive, execution) if known else 0.0
-        for drive_run, known in zip(drives, calibrated, strict=True)
-    ]
+    share = [calibration_share(one.drive, execution) if one.drive.camera.matrix is not None else 0.0 for one in drives]
     later = {number: places[number] for number in range(1, len(drives))}
     searched = {number: range(number) for number in later}
     found = candidates_among(later, places.__getitem__, searched, state, pipeline, execution)
@@ -140,19 +138,7 @@ def _ledgers(drives: Sequence[DriveRun], state: PlaceState, pipeline: Pipeline, 
     return {(number, earlier): verified(number, earlier) for number in later for earlier in range(number)}
 
 
-def _names(names: Sequence[str]) -> list[str]:
-    """A folder name for each drive: its own, with a number where several have the same, or the library has it."""
-    result: list[str] = []
-    for name in names:
-        number, free = 2, name
-        while free in ("library", *result):
-            free, number = f"{name}-{number}", number + 1
-        result.append(free)
-    return result
-
-
 def _write_maps(out: Path, drives: Sequence[DriveRun], joined: Joined, header: tables.TableMetadata) -> None:
-    """The graph of each map of several drives, and the keyframes and trajectories of its drives in the map's frame."""
     for number, members in enumerate(joined.maps):
         if members not in joined.solved:
             continue
@@ -165,7 +151,6 @@ def _write_maps(out: Path, drives: Sequence[DriveRun], joined: Joined, header: t
 
 
 def _joint_record(drives: Sequence[DriveRun], ledgers: Ledgers, joined: Joined) -> dict[str, Any]:
-    """Maps, pairs and warnings as run.json has them."""
     names = [drive_run.name for drive_run in drives]
     maps = [
         {

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from vplog.errors import ResultError
@@ -43,16 +44,26 @@ def regular_files(folder: Path) -> Iterator[str]:
             yield from (f"{entry.name}/{name}" for name in regular_files(folder / entry.name))
         elif entry.is_file(follow_symlinks=False):
             yield entry.name
-        elif kind := _kind(entry):
-            raise ResultError(
-                f"{folder / entry.name} is a {kind}, and maps, runs and libraries hold only files of their own. "
-                "Replace it with a copy of the file."
-            )
+        else:
+            with suppress(FileNotFoundError):  # deleted meanwhile
+                kind = _KINDS.get(stat.S_IFMT(entry.stat(follow_symlinks=False).st_mode), "special file")
+                raise ResultError(
+                    f"{folder / entry.name} is a {kind}, and maps, runs and libraries hold only files of their own. "
+                    "Replace it with a copy of the file."
+                )
 
 
 def is_unicode(name: str) -> bool:
     """Whether the name of a file is UTF-8: Python has half a character for each byte of any other."""
     return not any("\ud800" <= character <= "\udfff" for character in name)
+
+
+def numbered(name: str, base: str, taken: Container[str]) -> str:
+    """The name, or where it is taken `base` with the first free number."""
+    number, free = 2, name
+    while free in taken:
+        free, number = f"{base}-{number}", number + 1
+    return free
 
 
 def is_below(name: object) -> bool:
@@ -85,11 +96,3 @@ def check_regular(folder: Path, record: str = "") -> None:
     if os.path.lexists(folder / record):
         for _ in regular_files(folder):
             pass
-
-
-def _kind(entry: os.DirEntry[str]) -> str:
-    """Kind of a file that is not regular; empty where it was deleted meanwhile."""
-    try:
-        return _KINDS.get(stat.S_IFMT(entry.stat(follow_symlinks=False).st_mode), "")
-    except FileNotFoundError:
-        return ""

@@ -56,17 +56,12 @@ def google_file_system(endpoint: str, bucket: str, wait_s: float = _PROBE_S) -> 
     )  # fmt: skip
     if not anonymous:
         with plain_errors():
-            _try_credentials(system, bucket)
+            try:  # a first request reads the credentials, which need not permit it
+                system.get_file_info(f"{bucket}/vplog")
+            except OSError as error:
+                if "access token" in str(error):
+                    raise
     return system
-
-
-def _try_credentials(system: FileSystem, bucket: str) -> None:
-    """Read the credentials with a first request, which they need not permit."""
-    try:
-        system.get_file_info(f"{bucket}/vplog")
-    except OSError as error:
-        if "access token" in str(error):
-            raise
 
 
 def _probe(endpoint: str, bucket: str, wait_s: float) -> None:

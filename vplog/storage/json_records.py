@@ -16,16 +16,17 @@ editor wrote it."""
 def with_checksum(record: dict[str, Any]) -> dict[str, Any]:
     """A record as plain values, with its checksum in place of the one that it may have."""
     record = {name: value for name, value in record.items() if name != CHECKSUM}
-    return {**plain(record), CHECKSUM: _sha256(record)}
+    return {**plain(record), CHECKSUM: key_of(record)}
 
 
 def has_checksum(record: dict[str, Any]) -> bool:
     """Whether a record has the checksum in it, which is taken out, or none at all."""
-    return CHECKSUM not in record or record.pop(CHECKSUM) == _sha256(record)
+    return CHECKSUM not in record or record.pop(CHECKSUM) == key_of(record)
 
 
-def _sha256(record: dict[str, Any]) -> str:
-    return hashlib.sha256(canonical_json(record).encode()).hexdigest()
+def key_of(made_from: Any) -> str:
+    """sha256 over a tree of values, as all that a result depends on."""
+    return hashlib.sha256(canonical_json(made_from).encode()).hexdigest()
 
 
 def canonical_json(tree: Any) -> str:

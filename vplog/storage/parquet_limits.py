@@ -118,9 +118,7 @@ def read_schema(path: Path) -> pa.Schema:
 
 def _check_seal(path: Path, footer_alone: bool = False) -> None:
     with path.open("rb") as stream:
-        size = stream.seek(0, io.SEEK_END)
-        stream.seek(max(size - _TAIL, 0))
-        start = size - _TAIL - int.from_bytes(stream.read(4), "little") - _SEAL.size
+        start = footer_start(stream) - _SEAL.size
         if start < 0:
             return  # left to pyarrow
         stream.seek(start)
@@ -133,6 +131,13 @@ def _check_seal(path: Path, footer_alone: bool = False) -> None:
             sound = crc_of(stream, start) == body
     if not sound:
         raise ValueError("It is damaged: its checksum does not match.")
+
+
+def footer_start(stream: BinaryIO) -> int:
+    """Offset of the footer of a Parquet file; negative where there is none."""
+    end = stream.seek(0, io.SEEK_END) - _TAIL
+    stream.seek(max(end, 0))
+    return end - int.from_bytes(stream.read(4), "little")
 
 
 def crc_of(stream: BinaryIO, count: int) -> int:

@@ -16,7 +16,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, cast
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 from vplog.errors import LogError, ResultError, SettingsError
 from vplog.storage.gcs import gcs_endpoint, google_file_system, plain, plain_errors
@@ -34,12 +35,6 @@ _TIMEOUT_S = 30.0
 """Timeout of a server without an answer."""
 _DENIED = re.compile(r"ACCESS_DENIED|AccessDenied|PERMISSION_DENIED|HTTP response code 403")
 """Errors of pyarrow's clients where this account lacks the permission."""
-
-
-class Stat(NamedTuple):
-    """The part of `Path.stat` that is used."""
-
-    st_size: int
 
 
 def located(text: str | Path | RemotePath) -> Path:
@@ -132,8 +127,8 @@ class RemotePath:
     def is_dir(self) -> bool:
         return self._kind == "folder"
 
-    def stat(self) -> Stat:
-        return Stat(self._length)
+    def stat(self) -> SimpleNamespace:
+        return SimpleNamespace(st_size=self._length)
 
     def version(self) -> str:
         """A text that changes with the object, without reading it: its length and time, or the server's tag."""

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from glob import escape
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -66,7 +66,6 @@ def _sweep(among: Path) -> None:
 
 
 def _is_left(path: Path) -> bool:
-    """Whether the process that locked a file has ended."""
     with suppress(OSError), path.open() as lock:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # OSError where its process lives
         return True
@@ -158,10 +157,8 @@ def put_in_place(part: Path, path: Path) -> None:
 
 def sync_all(path: Path) -> None:
     """Have a file, or a folder with all that is in it, on the disk. Raises OSError."""
-    names = list(regular_files(path))
-    below = {*names, *(str(above) for name in names for above in PurePosixPath(name).parents), "."}
-    for name in sorted(below):
-        sync(path / name)
+    for one in [*path.rglob("*"), path]:
+        sync(one)
 
 
 def sync(path: Path) -> None:
@@ -183,11 +180,8 @@ def files_in(folder: Path) -> list[str]:
 
 def pieces(path: Path) -> Iterator[Bytes]:
     """The bytes of a file, a piece at a time; one empty piece of an empty file."""
-    with path.open("rb") as stream:
-        block = stream.read(_PIECE_BYTES)
-        yield np.frombuffer(block, np.uint8)
-        while block := stream.read(_PIECE_BYTES):
-            yield np.frombuffer(block, np.uint8)
+    for start in range(0, max(path.stat().st_size, 1), _PIECE_BYTES):
+        yield np.fromfile(path, np.uint8, _PIECE_BYTES, offset=start)
 
 
 def write_pieces(folder: Path, name: str, parts: Iterator[Bytes]) -> None:

@@ -244,7 +244,7 @@ def test_a_query_says_what_cannot_be_found(copy: Path, drive: Drive, verb: Calla
 
 def test_a_merged_map_is_joined_without_logs(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     merge_maps([whole], tmp_path / "other")
-    monkeypatch.setattr("vplog.maps.joining.members.located", lambda _: tmp_path / "gone.mcap")
+    monkeypatch.setattr("vplog.maps.joining.members.stored_log", lambda *_: tmp_path / "gone.mcap")
     told = joined(tmp_path / "other")
     assert (told["warnings"], [one["drives"] for one in told["components"]]) == ([], [["after", "before"]])
 

@@ -132,7 +132,9 @@ def test_a_writer_killed_anywhere_leaves_the_old_drive_or_the_new(
             [settled] = writer.read("one", seeds)
             assert list(writer.drives()) == ["one", "two"]
         for name in map_store.TABLES:
-            assert store.table(name, "one").read_bytes() == (store.run("one") / f"{name}.parquet").read_bytes()
+            assert (store.root / name / "drive=one" / f"{name}.parquet").read_bytes() == (
+                store.run("one") / f"{name}.parquet"
+            ).read_bytes()
         assert not store.staging.exists()
         assert settled in (1, 9)
         if ended == 0:

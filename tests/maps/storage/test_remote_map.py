@@ -244,7 +244,7 @@ def test_a_reader_that_comes_late_takes_the_new_drive(root: Any) -> None:
             put(writer, "two", 5)
         assert seeds(store.run("one")) == {5}
         with pytest.raises(ResultError, match="replaced"):  # of which a part was handed out
-            store.table("keyframes", "two")
+            store.file("two", "keyframes.parquet")
         with map_store.writing(root) as writer:
             map_store.remove(writer, ["one"])
         store.evict("one")
@@ -287,7 +287,7 @@ def test_two_writers(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         put(store, "two", 2)
         lock = gone.mirror.lock  # pyright: ignore[reportOptionalMemberAccess]
         assert lock is not None
-        lease_lock._write(lock, lock.etag)
+        lease_lock._write(lock, lease_lock._content(lock))
         gone.staging.mkdir(parents=True)
         with pytest.raises(ResultError, match="taken"):
             put(gone, "two", 3)

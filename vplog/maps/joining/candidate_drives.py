@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from vplog.pipeline import Pipeline
 
 _CHOICE = 3
-"""Drives searched for each that may be verified. Single views and sequences seldom differ in which drives score high,
-but in their order."""
+"""Drives searched for each that may be verified, so that `likely_drives` has enough to choose from. Single views and
+sequences seldom differ in which drives score high, but in their order."""
 _AT_ONCE = 64
 """New drives that are searched in one earlier drive while its places are in memory; theirs are too, some 40 MB."""
 
@@ -41,7 +41,7 @@ def candidates_of(
 ) -> dict[int, Candidates]:  # fmt: skip
     """For each new drive, by number, its best candidates in the drives of `drives_to_search`."""
     found: dict[int, Candidates] = {}
-    counts = [min(number, max_drives_searched(pipeline)) for number in new]
+    counts = [min(number, _CHOICE * pipeline.join.most_drives) for number in new]
     for first in range(0, len(new), _AT_ONCE):
         block = {number: places_of(store, members[number], state) for number in new[first : first + _AT_ONCE]}
         searched = drives_to_search(store, members, block, state, pipeline, Execution(execution.threads))
@@ -50,11 +50,6 @@ def candidates_of(
             execution.part(sum(counts[:first]), sum(counts)),
         )  # fmt: skip
     return found
-
-
-def max_drives_searched(pipeline: Pipeline) -> int:
-    """Drives that one is searched in, at most: so many that `likely_drives` chooses from enough."""
-    return _CHOICE * pipeline.join.most_drives
 
 
 def drives_to_search(
@@ -67,7 +62,7 @@ def drives_to_search(
     So what a drive more costs grows as a query of the map does, not with its drives. Maps without an index, which are
     those of other recognisers and those on object stores, are searched drive by drive.
     """
-    most = max_drives_searched(pipeline)
+    most = _CHOICE * pipeline.join.most_drives
     searched: dict[int, Container[int]] = {number: range(number) for number in later}
     if max(later) <= most or not isinstance(state, CodedState) or store.mirror is not None:
         return searched

@@ -13,7 +13,7 @@ KEY stands for all that the folder is made from, so one that a new drive does no
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,9 +27,10 @@ from vplog.graph.build import parts
 from vplog.graph.refine import Refined, about_odometry
 from vplog.maps.joining.joint_record import read_joint, write_joint
 from vplog.maps.storage.damage import DamagedDriveError, damaged_table, reading_drive
-from vplog.maps.storage.layout import folder_name, key_of
+from vplog.maps.storage.layout import folder_name
 from vplog.results import g2o, run_record, tables
 from vplog.sessions.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
+from vplog.storage.json_records import key_of
 from vplog.storage.scratch import put_in_place
 
 if TYPE_CHECKING:
@@ -68,7 +69,6 @@ class PairLedger:
     later: str
     earlier: str
     path: Path
-    """Table of the ledger."""
     key: str
     """sha256 over all that the ledger depends on."""
     verified: int
@@ -92,15 +92,12 @@ def _settings(pipeline: Pipeline) -> dict[str, Any]:
     return {**chosen, "join": pipeline.join.model_dump(mode="json", include={"least_closures", "spacing"})}
 
 
-def groups_of(
-    order: Sequence[str], keys: dict[str, str], pair_ledgers: Sequence[PairLedger], pipeline: Pipeline
-) -> list[Group]:
-    """The groups of two drives and more, in the order of their first ones. `keys` are those of drive.json."""
-    at = {drive: number for number, drive in enumerate(order)}
+def groups_of(every: Drives, pair_ledgers: Sequence[PairLedger], pipeline: Pipeline) -> list[Group]:
+    """The groups of two drives and more, in the order of their first ones."""
+    order, at = [member.drive for member in every.members], every.number
     good = [entry for entry in pair_ledgers if entry.verified >= pipeline.join.least_closures]
-    number = parts(
-        len(order), np.array([at[t.earlier] for t in good], np.int64), np.array([at[t.later] for t in good], np.int64)
-    )
+    a, b = (np.array([at[getattr(one, end)] for one in good], np.int64) for end in ("earlier", "later"))
+    number = parts(len(order), a, b)
     code = code_of("vplog.maps.joining.components", type(pipeline.solve).__module__)["code"]
     found = []
     for one in np.flatnonzero(np.bincount(number, minlength=1) > 1).tolist():
@@ -109,7 +106,7 @@ def groups_of(
         between = [entry for entry in pair_ledgers if {entry.later, entry.earlier} <= inside]
         own = tuple(sorted(between, key=lambda entry: (at[entry.later], at[entry.earlier])))
         made_from = {
-            "drives": [[drive, keys[drive]] for drive in drives],
+            "drives": [[drive, every.keys[drive]] for drive in drives],
             "ledgers": [[entry.later, entry.earlier, entry.key] for entry in own],
             "settings": _settings(pipeline),
             "code": code,
@@ -118,18 +115,13 @@ def groups_of(
     return found
 
 
-def solve_group(
-    group: Group, runs: Mapping[str, Path], pipeline: Pipeline, library: str, staging: Path
-) -> dict[str, Any]:
+def solve_group(group: Group, runs: Sequence[Path], pipeline: Pipeline, library: str, staging: Path) -> dict[str, Any]:
     """Solve a group, and make a folder in `staging` for each component that comes of it.
 
     Returns the group as joint.json has it: `components`, and the pairs kept `apart` with reasons. Raises GraphError
     where it cannot be solved, and ResultError where a drive's folder is damaged.
     """
-    drives = []
-    for drive in group.drives:
-        with reading_drive(drive):
-            drives.append(_drive(drive, runs[drive]))
+    drives = list(map(_drive, group.drives, runs))
     at = {drive: number for number, drive in enumerate(group.drives)}
     ledgers = {(at[entry.later], at[entry.earlier]): _ledger(entry) for entry in group.pair_ledgers}
     joined, ledgers = solve_drives(drives, ledgers, pipeline)
@@ -141,34 +133,30 @@ def solve_group(
         made.mkdir(parents=True, exist_ok=True)
         g2o.write_g2o(made / "graph.g2o", refined.graph, refined.solution.world_from_body)
         for name, member in zip(names, members, strict=True):
-            (made / runs[name].name).mkdir(exist_ok=True)
-            write_drive(made / runs[name].name, "", drives[member], joined.world_from_body[member], header)
+            (made / folder_name(name)).mkdir(exist_ok=True)
+            write_drive(made / folder_name(name), "", drives[member], joined.world_from_body[member], header)
         inside = {pair: ledger for pair, ledger in ledgers.items() if set(pair) <= set(members)}
         write_ledgers(made / "joins.parquet", drives, inside, header)
         joins = [pair_record(group.drives[pair[0]], group.drives[pair[1]], one) for pair, one in inside.items()]
         run_record.write_run_json(made / "component.json", _record(group, names, joins, refined))  # last: it is whole
         components.append({"folder": folder, "drives": names})
+    pairs = [(group.pair_ledgers[pair], reason) for pair, reason in sorted(joined.apart.items())]
     apart = [
-        {
-            "query_drive": group.pair_ledgers[pair].later,
-            "match_drive": group.pair_ledgers[pair].earlier,
-            "reason": reason.strip(),
-        }
-        for pair, reason in sorted(joined.apart.items())
+        {"query_drive": pair.later, "match_drive": pair.earlier, "reason": reason.strip()} for pair, reason in pairs
     ]
     return {"key": group.key, "drives": list(group.drives), "components": components, "apart": apart}
 
 
 def _drive(name: str, run: Path) -> SolvedDrive:
-    """A drive from its run folder. Raises ResultError."""
-    keyframes, poses = tables.read_keyframes(run / "keyframes.parquet")
-    graph, weight, _ = tables.read_edges(run / "edges.parquet", poses)
+    with reading_drive(name):
+        keyframes, poses = tables.read_keyframes(run / "keyframes.parquet")
+        graph, weight, _ = tables.read_edges(run / "edges.parquet", poses)
+        own = own_drive(graph, weight, tables.read_closures(run / "closures.parquet"))
 
     def read_odometry() -> Odometry:
         with reading_drive(name):
             return tables.read_trajectory(run / "trajectory.parquet")[1]
 
-    own = own_drive(graph, weight, tables.read_closures(run / "closures.parquet"))
     return SolvedDrive(keyframes, own, read_odometry)
 
 
@@ -197,7 +185,7 @@ def solve_groups(
     store: Store, drives: Drives, pair_ledgers: Sequence[PairLedger], pipeline: Pipeline, execution: Execution
 ) -> dict[str, Any]:
     """Solve the groups that are not solved yet, write joint.json, and remove the folders of other groups."""
-    groups = groups_of([member.drive for member in drives.members], drives.keys, pair_ledgers, pipeline)
+    groups = groups_of(drives, pair_ledgers, pipeline)
     known = {group["key"]: group for group in _joint(store).get("groups", [])}
     folder, solved = store.root / "joint", []
     for done, group in enumerate(groups):
@@ -240,10 +228,9 @@ def _is_whole(component: Path, drives: Sequence[str]) -> bool:
 
 
 def _solved(store: Store, group: Group, pipeline: Pipeline, library: str) -> dict[str, Any]:
-    """Solve a group, and rename in its components."""
     staging = store.staging / "joint"
     shutil.rmtree(staging, ignore_errors=True)
-    runs = {drive: store.run(drive) for drive in group.drives}
+    runs = [store.run(drive) for drive in group.drives]
     try:
         record = solve_group(group, runs, pipeline, library, staging)
     except DamagedDriveError:  # the others are solved without it

@@ -19,9 +19,10 @@ from vplog.data import SharedReferences
 from vplog.errors import ResultError
 from vplog.maps.joining.members import CameraTrust, Member, camera_trust, keep_features, opened_drive
 from vplog.maps.storage.damage import damaged_table
-from vplog.maps.storage.layout import folder_name, key_of, quoted
+from vplog.maps.storage.layout import folder_name, quoted
 from vplog.results import run_record, tables
 from vplog.sessions.inter_session import closures_between, with_shared
+from vplog.storage.json_records import key_of
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:

@@ -176,7 +176,6 @@ def _is_up_to_date(store: Store, drives: Drives, at: int, pipeline: Pipeline) ->
 
 
 def _search(work: _Work, places: Callable[[], PlaceState] | None) -> list[DrivePair]:
-    """The candidates of new drives that are worth verifying."""
     store, members, pipeline = work.store, work.drives.members, work.pipeline
     later = [at for at in work.new if at]  # the first has none before it
     if not later:
@@ -243,7 +242,6 @@ def _cameras(work: _Work, wanted: Sequence[DrivePair]) -> tuple[dict[int, Camera
 
 
 def _record_pairs(work: _Work, wanted: Sequence[DrivePair], reasons: dict[tuple[str, str], str]) -> None:
-    """Write the pairs of each new drive."""
     store, drives = work.store, work.drives
     for at in work.new:
         member, pairs = drives.members[at], []

@@ -17,7 +17,7 @@ from vplog.errors import LogError, ResultError
 from vplog.features.store import FeatureStore
 from vplog.loops.calibration import turning_pairs
 from vplog.loops.verify import VerifySettings, calibration_share, drive_of
-from vplog.maps.storage.layout import folder_name, key_of
+from vplog.maps.storage.layout import folder_name
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables
 from vplog.results.camera_record import camera_from
@@ -25,8 +25,7 @@ from vplog.results.feature_table import FeatureTable, write_features
 from vplog.run.feature_extraction import Extracted, stored_features
 from vplog.run.provenance import stored_log
 from vplog.run.reextraction import ReextractedFeatures
-from vplog.storage.json_records import plain
-from vplog.storage.remote_path import located
+from vplog.storage.json_records import key_of, plain
 from vplog.storage.scratch import scratch
 
 if TYPE_CHECKING:
@@ -47,7 +46,6 @@ class Member:
 
     drive: str
     keyframes: Path
-    """Table of its keyframes."""
     cache: Path
     """Stage cache of its run, with its features while it is new."""
     features: Path
@@ -57,7 +55,6 @@ class Member:
     """sha256 of the log's files, by name."""
     topics: logs.TopicChoice
     pipeline: Pipeline
-    """Settings of its run."""
     key: str
     """sha256 over all that its keyframes, features and places depend on."""
 
@@ -85,23 +82,16 @@ def member_of(store: Store, about: dict[str, Any]) -> Member:
     )  # fmt: skip
 
 
-def opened_log(member: Member) -> Log:
-    """Raises LogError where it is not there any more."""
+def opened_log(member: Member, check: bool = False) -> Log:
+    """Raises LogError where it is not there any more or, with `check`, another one."""
     path = stored_log(member.log, f"The log of {member.drive}", "Give it again: vplog batch LOG -o MAP")
     try:
-        return logs.open_drive([path], member.topics)
-    except OSError as error:
-        raise LogError(f"The log of {member.drive}, {path}, cannot be read: {error.strerror or error}.") from None
-
-
-def check_unchanged(member: Member) -> None:
-    path = located(member.log)
-    try:
-        found = hash_inputs(path)
+        log, found = logs.open_drive([path], member.topics), hash_inputs(path) if check else {}
     except OSError as error:
         raise LogError(f"The log of {member.drive}, {path}, cannot be read: {error.strerror or error}.") from None
     if any(member.inputs.get(name) != text for name, text in found.items()):
         raise LogError(f"The log of {member.drive}, {path}, has changed since. Run `vplog batch` with it again.")
+    return log
 
 
 def why_not_joined(member: Member, library: str, made_by: str) -> str:
@@ -188,8 +178,7 @@ def opened_drive(
         if features is not None:
             stack.enter_context(closing(features))
         elif (features := _from_run(member)) is None:
-            log = opened_log(member)
-            check_unchanged(member)
+            log = opened_log(member, check=True)
             store = stack.enter_context(FeatureStore(stack.enter_context(scratch("features")) / "features"))
             features = ReextractedFeatures(log, keyframes.stamp_ns, member.pipeline, store, execution)
         yield drive_of(keyframes, camera, features.__getitem__, verify), getattr(features, "fetch", lambda _: None)

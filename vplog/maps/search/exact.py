@@ -7,7 +7,7 @@ their files, and the answers of shards are merged to those of one search.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import BrokenExecutor, Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -57,17 +57,6 @@ def no_answers(views: int, top: int) -> Answers:
     """(Q, K) none, to be written to."""
     drive, keyframe, support = np.zeros((3, views, top), np.int32)
     return Answers(drive, keyframe, np.full((views, top), NO_SCORE, np.float32), support)
-
-
-def answers_in_drive(rankings: Iterable[tuple[Ranking, Int32s]], views: int, drive: int, top: int) -> Answers:
-    """Answers in one drive, from the ranking of its rows and their support for each view in order."""
-    found = no_answers(views, top)
-    found.drive[:] = drive
-    for view, (ranking, support) in enumerate(rankings):
-        count = len(ranking.rows)
-        found.keyframe[view, :count], found.score[view, :count] = ranking.rows, ranking.score
-        found.support[view, :count] = support
-    return found
 
 
 def merge(parts: Sequence[Answers], top: int) -> Answers:

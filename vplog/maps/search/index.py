@@ -28,7 +28,7 @@ from vplog.maps.storage.contents import library_mismatch
 from vplog.maps.storage.damage import DamagedDriveError, reading_drive
 from vplog.maps.storage.layout import ADD_AGAIN
 from vplog.results import tables
-from vplog.storage.parquet_limits import check_file
+from vplog.storage.parquet_limits import check_file, footer_start
 
 if TYPE_CHECKING:
     from vplog.maps.storage.map_store import Store
@@ -101,14 +101,11 @@ def _footer_hash(path: Path) -> str:
     try:
         check_file(path)
         with path.open("rb") as stream:
-            size = stream.seek(0, 2)
-            stream.seek(max(size - 8, 0))
-            end = stream.read(8)
-            length = int.from_bytes(end[:4], "little")  # of the footer, as Parquet ends
-            if end[4:] != b"PAR1" or length > size - 8:
+            start = footer_start(stream)
+            if start < 0 or stream.read() != b"PAR1":
                 raise ResultError(f"{path} is damaged. Copy it back, or {ADD_AGAIN}")
-            stream.seek(size - 8 - length)
-            return hashlib.sha256(stream.read(length)).hexdigest()
+            stream.seek(start)
+            return hashlib.sha256(stream.read()[:-8]).hexdigest()
     except OSError as error:
         why = error.strerror or error
         raise ResultError(f"{path} cannot be read: {why}. Check its permissions, or {ADD_AGAIN}") from None

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog import logs
-from vplog.data import Ints
+from vplog.data import Ints, Keyframes
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
@@ -27,7 +27,7 @@ from vplog.places.sequence import SequenceSettings
 from vplog.places.views import views_of
 from vplog.results import tables
 from vplog.results.run_record import read_run_json
-from vplog.run.keyframes import select_keyframes
+from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.stages import CodedState, FrameState, Log, PlaceState, StoredState
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.scratch import check_file_output
@@ -143,6 +143,15 @@ def open_map(store: Store, execution: Execution) -> tuple[dict[str, dict[str, An
     return drives, pipeline, pipeline.places.load(folder, Execution(execution.threads))
 
 
+def select_views(log: Log, settings: KeyframeSettings) -> tuple[Ints, Keyframes | None, list[str]]:
+    """Stamps (Q,) of the keyframes of a log, or of all its frames without odometry, and warnings."""
+    odometry, stamps = log.odometry(), log.stamps()
+    if odometry is None or len(odometry.stamp_ns) < 2:
+        return stamps, None, []
+    keyframes, warnings = select_keyframes(log.name, stamps, odometry, settings)
+    return keyframes.stamp_ns, keyframes, warnings
+
+
 def describe_log(
     log: Log, pipeline: Pipeline, state: PlaceState, execution: Execution
 ) -> tuple[Ints, list[Any], list[str]]:
@@ -150,11 +159,8 @@ def describe_log(
 
     A descriptor takes some hundred bytes, and no image or feature is kept.
     """
-    odometry, stamps, warnings = log.odometry(), log.stamps(), []
-    if odometry is not None and len(odometry.stamp_ns) > 1:
-        keyframes, warnings = select_keyframes(log.name, stamps, odometry, pipeline.keyframes)
-        stamps = keyframes.stamp_ns
-    elif log.file_names() is None:  # pictures never have any
+    stamps, keyframes, warnings = select_views(log, pipeline.keyframes)
+    if keyframes is None and log.file_names() is None:  # pictures never have odometry
         warnings.append(f"{log.name} has no odometry, so every frame is a query.")
     described, descriptors, lost = [], [], []
     found = _descriptors(log, stamps, pipeline, state, execution)
@@ -257,7 +263,6 @@ def _named(
 
 
 def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints) -> pa.Table:
-    """One row for every answer."""
     there = np.arange(answers.score.shape[1]) < answers.count[:, None]
     query, rank = np.nonzero(there)
     number, keyframe = answers.drive[there], answers.keyframe[there]

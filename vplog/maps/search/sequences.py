@@ -16,7 +16,7 @@ import numpy as np
 
 from vplog.data import Floats, Int32s, Ints
 from vplog.execution.execution import Execution
-from vplog.maps.search.exact import NO_SCORE, Answers, answers_in_drive, merge, no_answers
+from vplog.maps.search.exact import NO_SCORE, Answers, merge, no_answers
 from vplog.maps.search.index import read_column
 from vplog.maps.storage.damage import reading_drive
 from vplog.places.sequence import SequenceSettings, rank_places
@@ -49,7 +49,13 @@ def best_lines(
             index = index_of_part(state, state.from_arrow(column))
         stops = np.full(len(descriptors), len(column), np.int64)
         rankings = rank_places(index, descriptors, stops, top, settings, Execution(execution.threads))
-        best = merge([best, answers_in_drive(rankings, len(descriptors), number, top)], top)
+        found = no_answers(len(descriptors), top)
+        found.drive[:] = number
+        for view, (ranking, support) in enumerate(rankings):
+            count = len(ranking.rows)
+            found.keyframe[view, :count], found.score[view, :count] = ranking.rows, ranking.score
+            found.support[view, :count] = support
+        best = merge([best, found], top)
     return best
 
 

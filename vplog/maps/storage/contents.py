@@ -91,12 +91,6 @@ class Store:
         if self.mirror is not None:
             self.mirror.evict(drive)
 
-    def table(self, name: str, drive: str) -> Path:
-        """One table of a drive, under its data set; of a map on a store, in the run folder."""
-        if self.mirror is not None:
-            return self.file(drive, f"{name}.parquet")
-        return self.root / name / folder_name(drive) / f"{name}.parquet"
-
     def library(self, digest: str) -> Path:
         """The folder of a library."""
         if self.mirror is not None:

@@ -8,7 +8,6 @@ import re
 import shutil
 from collections.abc import Collection
 from dataclasses import replace
-from functools import cache
 from pathlib import Path, PurePath
 from typing import Any
 from urllib.parse import quote
@@ -16,7 +15,8 @@ from urllib.parse import quote
 from vplog.cache.code_hash import code_of
 from vplog.errors import NewerError, ResultError
 from vplog.results import run_record, tables
-from vplog.storage.json_records import CHECKSUM, canonical_json, plain
+from vplog.storage.folders import numbered
+from vplog.storage.json_records import CHECKSUM, canonical_json, key_of, plain
 
 FORMAT = run_record.FORMAT
 """Version of this layout. A reader refuses a newer one."""
@@ -123,14 +123,6 @@ def drive_names(names: list[str], logs: list[str], known: dict[str, dict[str, An
     return [result[at] for at in range(len(names))]
 
 
-def numbered(name: str, base: str, taken: Collection[str]) -> str:
-    """The name, or where it is taken `base` with the first free number."""
-    number, free = 2, name
-    while free in taken:
-        free, number = f"{base}-{number}", number + 1
-    return free
-
-
 def free_name(drive: str, log: str, known: Collection[str]) -> str:
     """The ID of a drive from another map: its own, or where that is taken the log's name with the first free number, by
     which `drive_names` still knows it."""
@@ -153,12 +145,6 @@ def set_drive_id(path: Path, drive: str) -> None:
     tables.write_keyframes(path, replace(keyframes, drive=drive), world_from_body, about, covariance)
 
 
-@cache
 def code_hash() -> str:
     """sha256 over the files of the package that a run uses."""
     return code_of("vplog.pipeline")["code"]
-
-
-def key_of(made_from: dict[str, Any]) -> str:
-    """sha256 over all that a drive's results depend on."""
-    return hashlib.sha256(canonical_json(made_from).encode()).hexdigest()

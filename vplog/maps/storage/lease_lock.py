@@ -97,12 +97,13 @@ def _acquire(lock: Lock, root: RemotePath) -> None:
     found = objects.get_with_etag(lock.place)
     if found is not None:
         _check_expired(found[0], found[2], root)
+    data = _content(lock)
     if objects.has_conditional_writes(lock.place):
-        _write(lock, None if found is None else found[1])
-        if not lock.lost and objects.put_if(lock.place, _content(lock), None) is not None:
+        lock.etag = objects.put_if(lock.place, data, None if found is None else found[1]) or _read_back(lock)
+        if not lock.lost and objects.put_if(lock.place, data, None) is not None:
             lock.etag = None  # it exists, so a store with conditional writes refuses to create it
     else:
-        objects.put(lock.place, _content(lock))
+        objects.put(lock.place, data)
     if lock.etag is None and not lock.lost:
         time.sleep(_SETTLE_S)
         _read_back(lock)
@@ -124,11 +125,14 @@ def _holder(found: bytes) -> dict[str, Any]:
     return holder if isinstance(holder, dict) else {}
 
 
-def _write(lock: Lock, etag: str | None) -> None:
-    """Write the lock where it has this ETag. A refusal is read back: it may follow a write whose response was lost."""
-    lock.etag = objects.put_if(lock.place, _content(lock), etag)
-    if lock.etag is None:
-        lock.etag = _read_back(lock)
+def _write(lock: Lock, data: bytes) -> None:
+    """Write the lock while it is held. A refusal is read back: it may follow a write whose response was lost."""
+    if lock.etag is not None:
+        lock.etag = objects.put_if(lock.place, data, lock.etag) or _read_back(lock)
+        return
+    _read_back(lock)
+    if not lock.lost:
+        objects.put(lock.place, data)
 
 
 def _read_back(lock: Lock) -> str | None:
@@ -155,31 +159,18 @@ def _check_expired(found: bytes, age_s: float, root: RemotePath) -> None:
 
 
 def _renew(lock: Lock) -> None:
-    """Renew the lease until the lock is released or lost."""
     last = time.monotonic()
     while not lock.lost and not lock.released.wait(LEASE_S / RENEWALS):
         lock.renewed += 1
         try:
-            if lock.etag is not None:
-                _write(lock, lock.etag)
-            else:
-                _put_if_held(lock, _content(lock))
+            _write(lock, _content(lock))
             last = time.monotonic()
         except OSError as error:
             if time.monotonic() - last > LEASE_S:
                 lock.lost = f"{lock.place} could not be renewed for {LEASE_S:.0f} s: {reason(error)}."
 
 
-def _put_if_held(lock: Lock, data: bytes) -> None:
-    _read_back(lock)
-    if not lock.lost:
-        objects.put(lock.place, data)
-
-
 def _release(lock: Lock) -> None:
     """Leave the lock without a holder. Where that fails the lease ends by itself."""
     with suppress(OSError):
-        if lock.etag is not None:
-            objects.put_if(lock.place, b"{}", lock.etag)
-        else:
-            _put_if_held(lock, b"{}")
+        _write(lock, b"{}")

@@ -8,13 +8,13 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.storage.damage import complete_record
 from vplog.maps.storage.layout import ADD_AGAIN, TABLES, drive_record, folder_name, sha256_of
-from vplog.storage.folders import check_regular, regular_files
+from vplog.storage.folders import check_regular
 from vplog.storage.scratch import made_folder, replacing, sync, sync_all
 
 if TYPE_CHECKING:
@@ -58,8 +58,11 @@ def recover(store: Store) -> None:
     """Put in what a killed writer had finished: a folder with drive.json, which is written last. Drives that are being
     removed are taken out first, so what is left of them here is tables without a run folder."""
     for file in sorted(store.staging.glob("*/drive.json")):
-        drive = _finished_drive(file.parent)
-        if drive is not None and not store.run(drive).exists():
+        try:
+            drive = drive_record(file.parent)["drive"]
+        except ResultError:
+            continue
+        if all((file.parent / f"{name}.parquet").is_file() for name in TABLES) and not store.run(drive).exists():
             publish(store, drive, file.parent)
     shutil.rmtree(store.staging, ignore_errors=True)
     store.staging.mkdir(parents=True, exist_ok=True)
@@ -72,15 +75,6 @@ def recover(store: Store) -> None:
             link_tables(store, drive)
         except ResultError as error:
             store.damaged[drive] = str(error)
-
-
-def _finished_drive(made: Path) -> str | None:
-    """The drive of a folder that a writer had finished; None of one that it had not."""
-    try:
-        record = drive_record(made)
-    except ResultError:
-        return None
-    return record["drive"] if all((made / f"{name}.parquet").is_file() for name in TABLES) else None
 
 
 def publish(store: Store, drive: str, made: Path) -> None:
@@ -119,7 +113,8 @@ def exchange_folders(one: Path, other: Path) -> bool:
 def link_tables(store: Store, drive: str) -> None:
     """Each table of the run folder under its data set; a copy on file systems without hard links."""
     for name in TABLES:
-        source, path = store.run(drive) / f"{name}.parquet", store.table(name, drive)
+        source = store.run(drive) / f"{name}.parquet"
+        path = store.root / name / folder_name(drive) / source.name
         if not source.is_file():
             raise ResultError(f"{source} is not there. Copy it back, or {ADD_AGAIN}")
         if path.exists():
@@ -139,10 +134,9 @@ def link_tables(store: Store, drive: str) -> None:
 
 def check_removable(store: Store, drives: Sequence[str]) -> None:
     """Raises ResultError where this user may not remove a folder of these drives."""
-    for path in [folder for drive in drives for folder in _folders_of(store, drive)]:
-        below = {above for name in regular_files(path) for above in PurePosixPath(name).parents}
-        for folder in [path.parent, path, *(path / above for above in below)]:
-            if not os.access(folder, os.W_OK | os.X_OK):
+    for path in [folder for drive in drives for folder in store.root.glob(f"*/{folder_name(drive)}")]:
+        for folder in [path.parent, *(Path(below) for below, _, _ in os.walk(path))]:
+            if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
                 raise ResultError(
                     f"Cannot remove {', '.join(drives)} from {store}: no permission to change {folder}. The map is as "
                     "it was. Ask the owner of that folder for the permission, or let the owner remove the drive."
@@ -167,10 +161,5 @@ def remove_drives(store: Store, drives: Sequence[str]) -> None:
     for folder in store.staging.glob("gone-*"):  # those of a writer that was killed, too
         shutil.rmtree(folder)
     for drive in drives:
-        for folder in _folders_of(store, drive):
+        for folder in store.root.glob(f"*/{folder_name(drive)}"):  # its cache, too
             shutil.rmtree(folder)
-
-
-def _folders_of(store: Store, drive: str) -> list[Path]:
-    """All that bears the name of a drive, its cache too."""
-    return list(store.root.glob(f"*/{folder_name(drive)}"))

@@ -116,30 +116,27 @@ class Mirror:
         one is gone or damaged, and ResultError."""
         with self._locks[drive]:
             for _ in range(3):
-                if drive not in self.manifests:
+                if (manifest := self.manifests.get(drive)) is None:
                     return
+                place = self.remote / "runs" / folder_name(drive) / manifest["generation"]
                 try:
-                    self._fetch(drive, names)
-                    return
+                    for name in names:
+                        if why := self._fetch_file(place / name, self.run(drive) / name, manifest["files"].get(name)):
+                            raise DamagedDriveError(f"{why}. Copy it back, or {ADD_AGAIN}", drive)
                 except FileNotFoundError:
                     self._reread_manifest(drive)
+                else:
+                    self._fetched.add(drive)
+                    return
             raise ResultError(f"{self.remote}: {drive} is replaced faster than it can be read. Try again later.")
-
-    def _fetch(self, drive: str, names: Iterable[str]) -> None:
-        manifest, place = self.manifests[drive], self.remote / "runs" / folder_name(drive)
-        for name in names:
-            path = place / manifest["generation"] / name
-            if why := self._fetch_file(path, self.run(drive) / name, manifest["files"].get(name)):
-                raise DamagedDriveError(f"{why}. Copy it back, or {ADD_AGAIN}", drive)
-        self._fetched.add(drive)
 
     def damaged_files(self, drive: str, names: Iterable[str]) -> list[str]:
         """A line for each file of a drive that is gone, and for the first of `names` that is damaged: these are
         fetched. Raises UnreachableError."""
-        manifest, place = self.manifests[drive], self.remote / "runs" / folder_name(drive)
+        manifest = self.manifests[drive]
+        place = self.remote / "runs" / folder_name(drive) / manifest["generation"]
         with store_errors(self.remote):
-            there = objects.files_below(place / manifest["generation"])
-        gone = [f"{place / manifest['generation'] / name} is not there." for name in manifest["files"].keys() - there]
+            gone = [f"{place / name} is not there." for name in manifest["files"].keys() - objects.files_below(place)]
         try:
             self.fetch(drive, names)
         except DamagedDriveError as error:
@@ -203,15 +200,13 @@ class Mirror:
             raise ResultError(f"{damage}. Join the drives again: vplog map join {self.remote}")
         if damage:
             self.rest_damage = damage
-            self.rest_manifest = self.rest_manifest or self._rest_without_manifest()
+            if not self.rest_manifest:  # of the copies that joins have by their own names; their hashes are unknown
+                with store_errors(self.remote):
+                    below = {top: objects.files_below(self.remote / top) for top in ("joint", "joins")}
+                left = ["joint.json", *(f"{top}/{name}" for top in below for name in below[top])]
+                self.rest_manifest = {"files": {name: {"sha256": ""} for name in left}}
             (self.local / "joint.json").unlink(missing_ok=True)
             shutil.rmtree(self.local / "joint", ignore_errors=True)
-
-    def _rest_without_manifest(self) -> dict[str, Any]:
-        """A manifest of the copies that joins have by their own names; it has none of their lengths and hashes."""
-        with store_errors(self.remote):
-            below = [f"{top}/{name}" for top in ("joint", "joins") for name in objects.files_below(self.remote / top)]
-        return {"files": {name: {"sha256": ""} for name in ("joint.json", *below)}}
 
     def _fetch_rest(self, names: Collection[str]) -> str:
         """The first damage of it, if any. Raises ResultError."""
@@ -228,13 +223,14 @@ class Mirror:
             except ResultError as error:
                 return str(error).partition(". ")[0]
             self.rest_manifest, place = manifest, self.remote / "rest" / manifest["generation"]
-            wanted = {name for name in manifest["files"] if self._is_of_a_drive(name) and (name in names or not names)}
+            known = {folder_name(drive) for drive in self.manifests}  # files of other drives are not wanted
+            parts = {name: PurePosixPath(name).parts for name in manifest["files"] if name in names or not names}
+            wanted = {one for one in parts if {part for part in parts[one] if part.startswith("drive=")} <= known}
             damaged, gone = list[str](), list[str]()
             for name in sorted(wanted):
                 try:
-                    damaged += filter(
-                        None, [self._fetch_file(place / name, self.local / name, manifest["files"][name])]
-                    )
+                    if why := self._fetch_file(place / name, self.local / name, manifest["files"][name]):
+                        damaged.append(why)
                 except FileNotFoundError:
                     gone.append(f"{place / name} is not there")
             if not gone or manifest["generation"] == before:
@@ -243,11 +239,6 @@ class Mirror:
             for name in wanted:
                 (self.local / name).unlink(missing_ok=True)
         raise ResultError(f"{self.remote}/rest is replaced faster than it can be read. Try again later.")
-
-    def _is_of_a_drive(self, name: str) -> bool:
-        """Whether the drive whose partition a file is in, if it is in one, is in the map."""
-        known = {folder_name(drive) for drive in self.manifests}
-        return all(part in known for part in PurePosixPath(name).parts if part.startswith("drive="))
 
     def _fetch_file(self, place: RemotePath, target: Path, about: dict[str, Any] | None) -> str:
         """Fetch an object, if the manifest names it and it is not here yet; what is wrong with it, if anything. Raises
