@@ -248,6 +248,7 @@ def test_a_damaged_right_image_costs_its_depth_alone_and_is_counted(tmp_path: Pa
     whole, damaged, _ = list(log.frames(log.stamps()))
     assert isinstance(damaged, RecordedFrame)
     assert damaged.right is not None
+    assert isinstance(damaged.right.data, bytes | memoryview)
     damaged = replace(damaged, right=replace(damaged.right, data=damaged.right.data[:-1000]))
     assert whole.decode().right is not None
     frame = damaged.decode()

@@ -74,8 +74,12 @@ class ReferencesState:
     def __init__(self, settings: Any, references: list[Reference]) -> None:
         self.settings, self.references = settings, references
 
-    @cached_property
+    @property
     def hash(self) -> str:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> str:
         return references_hash(self.references, self.settings)
 
     def save(self, folder: Path) -> None:
