@@ -5,9 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.linalg import solveh_banded
-from scipy.sparse import diags_array
 
 from vplog.data import RECEIVER_SIGMA_M, Odometry
 from vplog.geometry import se3
@@ -99,6 +96,8 @@ def odometry_of_fixes(gps: Gps) -> Odometry | None:
 
     Positions are smoothed, headings the directions of their motion, level. The covariance is that of an increment.
     """
+    from scipy.interpolate import CubicSpline
+
     local = local_enu(gps)
     variance = local.covariance[:, range(3), range(3)]
     known = np.isfinite(variance) & (variance > 0)
@@ -148,6 +147,9 @@ class _Smooth(NamedTuple):
 def _smoothed(at_s: Floats, places: Floats, variance: Floats) -> _Smooth:
     """The (T, A) places that balance distance to the fixes and acceleration (Whittaker 1923; Eilers 2003), by the
     window of least generalised cross-validation (Craven and Wahba 1979)."""
+    from scipy.linalg import solveh_banded
+    from scipy.sparse import diags_array
+
     count, steps = len(at_s), np.diff(at_s)
     weight, period = 1.0 / variance.mean(1), float(np.median(steps))
     middle = (steps[1:] + steps[:-1]) / 2

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
-from scipy.optimize import isotonic_regression
 
 from vplog.data import Bools, Closures, Floats, Ints, Verdict
 from vplog.features.mirror import mirrored
@@ -85,6 +84,8 @@ def wrong_poses(candidates: Ints, certain: Ints, wrong: Bools) -> Floats:
     """
     if not len(certain):
         return np.zeros(len(candidates))
+    from scipy.optimize import isotonic_regression
+
     order = np.lexsort((~wrong, certain))
     share = isotonic_regression(wrong[order].astype(np.float64), increasing=False).x
     return np.interp(candidates, [0, *certain[order]], [1.0, *share])

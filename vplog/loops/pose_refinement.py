@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from vplog.data import Bools, Floats
 from vplog.geometry import se3
@@ -60,6 +59,8 @@ def agreement(match_from_query: Floats, matches: Matches) -> tuple[Floats, Float
 
 def fit(match_from_query: Floats, matches: Matches) -> tuple[Floats, Floats, float]:
     """Gauss-Newton over all matches: the pose, its Hessian (6, 6), the residual variance over its expectation."""
+    from scipy.linalg import cho_factor, cho_solve
+
     hessian, excess = np.eye(6), 1.0
     freedom = max(2.0 * len(matches.points) + np.isfinite(matches.rho).sum() - 6.0, 1.0)
     for _ in range(_STEPS):

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from vplog.data import Bools, Camera, Closures, Float32s, Floats, Ints, Structure
 from vplog.features.matching import MatchSettings, match_features
@@ -67,6 +65,9 @@ def tracks(
 
     A track that has two features of one image joins two points, and is left out.
     """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     start = np.concatenate([[0], np.cumsum(counts)])
     ends = [(start[a] + rows[0], start[b] + rows[1]) for (a, b), rows in zip(pairs, found, strict=True)]
     first, second = (np.concatenate([np.empty(0, np.int64), *(end[i] for end in ends)]) for i in (0, 1))
@@ -158,6 +159,8 @@ def _step(error: Floats, jacobian: Floats, track: Ints, count: int) -> Floats:
 
 def _sums(values: Floats, track: Ints, count: int) -> Floats:
     """Sum of the values (O, ...) of each of `count` tracks."""
+    from scipy.sparse import coo_matrix
+
     flat = values.reshape(len(values), -1)
     summed = coo_matrix((np.ones(len(track)), (track, np.arange(len(track)))), shape=(count, len(track))).tocsr() @ flat
     return summed.reshape(count, *values.shape[1:])

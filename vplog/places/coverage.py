@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
-from scipy.sparse import csr_array
 
 from vplog.data import Bytes, Features, Float32s, Ints, Keyframes
 from vplog.places.library import Library, Words, WordSettings, hnsw, l1_distance
 from vplog.places.reference_choice import LEAST_SIZE, PAPER_SIZE, LibrarySettings, evenly
 
 if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
     from vplog.execution.execution import Execution
 
 STRONGEST = 200
@@ -96,6 +97,8 @@ def _candidates(size: int | None) -> int:
 def explanations(descriptors: Sequence[Bytes], candidates: Ints, execution: Execution) -> csr_array:
     """(F, C) float32: the share of the features (M, 128) of each frame that each candidate, a row of `descriptors`,
     explains. Columns rise within a row, and no frame explains itself."""
+    from scipy.sparse import csr_array
+
     owners = np.repeat(np.arange(len(candidates)), [len(descriptors[row]) for row in candidates])
     pool = np.concatenate([descriptors[row] for row in candidates])
     number = np.full(len(descriptors), -1)
@@ -140,6 +143,8 @@ def _worth(found: csr_array) -> csr_array:
     Relative to the frame's best, so that a bare wall counts as much as a facade; capped, so that the frames of one
     place share a reference.
     """
+    from scipy.sparse import csr_array
+
     frame = found.tocoo().row
     best = np.zeros(len(found.indptr) - 1)
     np.maximum.at(best, frame, found.data)

@@ -15,7 +15,6 @@ import numba
 import numpy as np
 import pyarrow as pa
 from pydantic import Field
-from scipy.spatial.distance import cdist
 
 from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ints, Ranking, Reference, SharedReferences
 from vplog.places.bobb import BobbSettings, BobbState
@@ -173,6 +172,8 @@ def _centres(values: Floats, words: int, rng: np.random.Generator) -> Floats:
 
 def _nearest(values: Floats, centres: Floats) -> Ints:
     """(F,) the word of each value: whole numbers, whose squared distances are exact in any order of the sum."""
+    from scipy.spatial.distance import cdist
+
     return cdist(values, centres, "sqeuclidean").argmin(axis=1)
 
 

@@ -11,7 +11,6 @@ the more queries have one, the more cautious the probabilities are.
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import isotonic_regression
 
 from vplog.data import Float32s, Floats, Ints
 
@@ -71,6 +70,8 @@ def conformal_p(found: Floats | Ints, null: Floats | Ints) -> Floats:
 def null_probabilities(found: Floats, null: Floats) -> Floats:
     """(N,) local false discovery rate by a null sample (K,), falling with the score: the ratio of densities by isotonic
     regression on both samples, the share of nulls by Storey 2002, eq. 6, at one half."""
+    from scipy.optimize import isotonic_regression
+
     share = min(1.0, (1.0 + (conformal_p(found, null) > 0.5).sum()) / (0.5 * len(found)))
     null = np.append(null, np.inf)  # one more above all: no score is certain for free
     pool, of_null = np.concatenate([found, null]), np.repeat([0.0, 1.0], [len(found), len(null)])
