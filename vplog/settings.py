@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import reprlib
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from functools import cache, partial
 from inspect import cleandoc, getsource
 from itertools import pairwise
@@ -26,13 +27,13 @@ _A_FILE = "`vplog config` prints a pipeline file."
 
 
 def _describe(schema: dict[str, Any], settings: type[BaseModel]) -> None:
-    """Adds the sentences below the fields to their JSON schema: pydantic would read each source file at each start."""
-    for one in reversed(settings.__mro__[: settings.__mro__.index(BaseModel)]):
-        for field, below in pairwise(ast.walk(ast.parse(dedent(getsource(one))))):
-            match field, below:
-                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(sentence))):
-                    if name in settings.model_fields:
-                        schema["properties"][name]["description"] = cleandoc(sentence)
+    """Adds the sentences below the fields to their JSON schema; pydantic would read every source at each start."""
+    for one in settings.__mro__[-3::-1]:  # from Settings on
+        with suppress(OSError):  # without a source, as in a shell, there are none
+            for field, below in pairwise(ast.walk(ast.parse(dedent(getsource(one))))):
+                match field, below:
+                    case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(sentence))):
+                        schema["properties"].get(name, {})["description"] = cleandoc(sentence)
 
 
 class Settings(BaseModel):

@@ -37,7 +37,7 @@ def code_of(*modules: str) -> dict[str, str]:
     digest = hashlib.sha256()
     for name in sorted(files):
         digest.update(f"{name} {hashlib.sha256(files[name].read_bytes()).hexdigest()}\n".encode())
-    versions = {name: _version(name) for name in sorted(packages)}
+    versions = {name: version(name) for name in sorted(packages)}
     return {"code": digest.hexdigest(), "python": platform.python_version(), "machine": platform.machine(), **versions}
 
 
@@ -75,17 +75,15 @@ def _file(module: str, package: Path) -> Path | None:
 
 @cache
 def _imports(path: Path, _changed_ns: int) -> list[str]:
-    """Full names of all that a file imports when it runs, wherever in it. Stages share most of their files.
-
-    By its lines, as the syntax trees of all files take a second; an example in a docstring counts, too.
-    """
+    """Full names of all that a file imports when it runs, by its lines: syntax trees of all files take a second."""
     text = re.sub(" as \\w+| *#.*", "", _TYPE_CHECKING.sub("", path.read_text(encoding="utf-8")))
     found = ((module, re.findall(r"[\w.]+", names)) for module, names in _IMPORT.findall(text))
     return [f"{module}.{name}" if module else name for module, names in found for name in names]
 
 
 @cache
-def _version(package: str) -> str:
+def version(package: str) -> str:
+    """Of an installed package by the name that it is imported by or published as; `none` where there is none."""
     try:
         return metadata.version(_PUBLISHED_AS.get(package, package))
     except metadata.PackageNotFoundError:

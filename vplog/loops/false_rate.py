@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 from pydantic import Field
 
 from vplog.data import Bools, Closures, Floats, Ints, Verdict
@@ -84,10 +85,8 @@ def wrong_poses(candidates: Ints, certain: Ints, wrong: Bools) -> Floats:
     """
     if not len(certain):
         return np.zeros(len(candidates))
-    from scipy.optimize import isotonic_regression
-
     order = np.lexsort((~wrong, certain))
-    share = isotonic_regression(wrong[order].astype(np.float64), increasing=False).x
+    share = scipy.optimize.isotonic_regression(wrong[order].astype(np.float64), increasing=False).x
     return np.interp(candidates, [0, *certain[order]], [1.0, *share])
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+import scipy
 
 from vplog.data import Bools, Floats
 from vplog.geometry import se3
@@ -59,8 +60,6 @@ def agreement(match_from_query: Floats, matches: Matches) -> tuple[Floats, Float
 
 def fit(match_from_query: Floats, matches: Matches) -> tuple[Floats, Floats, float]:
     """Gauss-Newton over all matches: the pose, its Hessian (6, 6), the residual variance over its expectation."""
-    from scipy.linalg import cho_factor, cho_solve
-
     hessian, excess = np.eye(6), 1.0
     freedom = max(2.0 * len(matches.points) + np.isfinite(matches.rho).sum() - 6.0, 1.0)
     for _ in range(_STEPS):
@@ -70,7 +69,7 @@ def fit(match_from_query: Floats, matches: Matches) -> tuple[Floats, Floats, flo
         )  # fmt: skip
         excess = cost / freedom
         try:
-            step = -np.asarray(cho_solve(cho_factor(hessian, check_finite=False), gradient), np.float64)
+            step = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(hessian, check_finite=False), gradient)
         except np.linalg.LinAlgError:  # no one pose is best
             break
         match_from_query = match_from_query @ se3.exp(step)

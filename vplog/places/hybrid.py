@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import numba
 import numpy as np
 import pyarrow as pa
+import scipy
 from pydantic import Field
 
 from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ints, Ranking, Reference, SharedReferences
@@ -172,9 +173,7 @@ def _centres(values: Floats, words: int, rng: np.random.Generator) -> Floats:
 
 def _nearest(values: Floats, centres: Floats) -> Ints:
     """(F,) the word of each value: whole numbers, whose squared distances are exact in any order of the sum."""
-    from scipy.spatial.distance import cdist
-
-    return cdist(values, centres, "sqeuclidean").argmin(axis=1)
+    return scipy.spatial.distance.cdist(values, centres, "sqeuclidean").argmin(axis=1)
 
 
 def _sum_by_word(values: Floats, word: Ints, words: int) -> Floats:

@@ -11,6 +11,7 @@ the more queries have one, the more cautious the probabilities are.
 from __future__ import annotations
 
 import numpy as np
+import scipy
 
 from vplog.data import Float32s, Floats, Ints
 
@@ -70,13 +71,11 @@ def conformal_p(found: Floats | Ints, null: Floats | Ints) -> Floats:
 def null_probabilities(found: Floats, null: Floats) -> Floats:
     """(N,) local false discovery rate by a null sample (K,), falling with the score: the ratio of densities by isotonic
     regression on both samples, the share of nulls by Storey 2002, eq. 6, at one half."""
-    from scipy.optimize import isotonic_regression
-
     share = min(1.0, (1.0 + (conformal_p(found, null) > 0.5).sum()) / (0.5 * len(found)))
     null = np.append(null, np.inf)  # one more above all: no score is certain for free
     pool, of_null = np.concatenate([found, null]), np.repeat([0.0, 1.0], [len(found), len(null)])
     order = np.lexsort((of_null, pool))
     fitted = np.empty(len(pool))
-    fitted[order] = isotonic_regression(of_null[order], increasing=False).x
+    fitted[order] = scipy.optimize.isotonic_regression(of_null[order], increasing=False).x
     odds = fitted[: len(found)] / np.maximum(1.0 - fitted[: len(found)], 1e-9)
     return np.minimum(1.0, share * odds * len(found) / len(null))
