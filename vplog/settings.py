@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import ast
 import reprlib
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from functools import cache, partial
+from inspect import cleandoc, getsource
+from itertools import pairwise
 from operator import eq
 from pathlib import Path
+from textwrap import dedent
 from typing import Any, ClassVar, Self
 
 import yaml
@@ -21,10 +26,20 @@ _A_SETTING = "`vplog config` prints every setting."
 _A_FILE = "`vplog config` prints a pipeline file."
 
 
+def _describe(schema: dict[str, Any], settings: type[BaseModel]) -> None:
+    """Adds the sentences below the fields to their JSON schema; pydantic would read every source at each start."""
+    for one in settings.__mro__[-3::-1]:  # from Settings on
+        with suppress(OSError):  # without a source, as in a shell, there are none
+            for field, below in pairwise(ast.walk(ast.parse(dedent(getsource(one))))):
+                match field, below:
+                    case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(sentence))):
+                        schema["properties"].get(name, {})["description"] = cleandoc(sentence)
+
+
 class Settings(BaseModel):
     """Base of every settings object: frozen, no unknown names, one sentence below each field."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, json_schema_extra=_describe)
     LOCATIONS: ClassVar[frozenset[str]] = frozenset()
     """Names of those that say where a file is: not they, but its content decides results."""
 

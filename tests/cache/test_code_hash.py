@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from typing import TYPE_CHECKING
 
 from vplog.cache import code_hash
@@ -63,3 +65,19 @@ print(*[name for name in sys.modules if name.split(".")[0] == "vplog"])
     assert loaded <= files.keys()
     assert {"cv2", "numpy", "mcap"} <= packages
     assert "gtsam" not in packages
+
+
+def test_every_import_of_the_package_is_found() -> None:
+    """By its syntax tree; an example in a docstring, which counts too, names the package itself."""
+    for file in code_hash._PACKAGE.rglob("*.py"):
+        found = Counter(code_hash._imports(file, file.stat().st_mtime_ns))
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        for block in ast.walk(tree):
+            if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING":
+                block.body = []
+        nodes = list(ast.walk(tree))
+        expected = Counter(
+            f"{node.module}.{alias.name}" for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names
+        ) + Counter(alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names)
+        assert expected <= found, file
+        assert all(name.startswith("vplog") for name in found - expected), file

@@ -25,7 +25,7 @@ from vplog.run import run_folder
 from vplog.run.provenance import head
 from vplog.run.reference_library import build_library
 from vplog.run.run_folder import CacheOptions, staged_run
-from vplog.sessions.joint_run import _names
+from vplog.storage.folders import numbered
 from vplog.verbs.export import export
 
 if TYPE_CHECKING:
@@ -400,7 +400,10 @@ def test_a_library_of_another_log_is_not_replaced_without_force(verb: Verb, driv
 
 
 def test_a_drive_may_be_called_library() -> None:
-    assert _names(["library", "a", "a", "library"]) == ["library-2", "a", "a-2", "library-3"]
+    names: list[str] = []
+    for name in ("library", "a", "a", "library"):
+        names.append(numbered(name, name, {"library", *names}))
+    assert names == ["library-2", "a", "a-2", "library-3"]
 
 
 def started(*told: object) -> subprocess.Popen[str]:

@@ -5,9 +5,9 @@ Found from the imports themselves, so that no list can forget one.
 
 from __future__ import annotations
 
-import ast
 import hashlib
 import platform
+import re
 import sys
 from functools import cache
 from importlib import metadata
@@ -17,6 +17,8 @@ from pathlib import Path
 _PACKAGE = Path(__file__).parents[1]
 _PUBLISHED_AS = {"cv2": "opencv-python-headless", "faiss": "faiss-cpu", "yaml": "PyYAML", "google": "protobuf"}
 """Packages whose name on PyPI is not the one they are imported by; a search for others takes half a second."""
+_TYPE_CHECKING = re.compile(r"^( *)if TYPE_CHECKING:\n(?:\1 +.*\n|\n)*", re.MULTILINE)
+_IMPORT = re.compile(r"^ *(?:from (\w[\w.]*) )?import ([\w.]+(?:, [\w.]+)*$|\([\w\s,]*\))", re.MULTILINE)
 
 
 @cache
@@ -35,7 +37,7 @@ def code_of(*modules: str) -> dict[str, str]:
     digest = hashlib.sha256()
     for name in sorted(files):
         digest.update(f"{name} {hashlib.sha256(files[name].read_bytes()).hexdigest()}\n".encode())
-    versions = {name: _version(name) for name in sorted(packages)}
+    versions = {name: version(name) for name in sorted(packages)}
     return {"code": digest.hexdigest(), "python": platform.python_version(), "machine": platform.machine(), **versions}
 
 
@@ -49,47 +51,39 @@ def imported(modules: tuple[str, ...]) -> tuple[dict[str, Path], set[str]]:
         if module in followed:
             continue
         followed.add(module)
-        path = _file(module)
+        path = _file(module, _PACKAGE)
         if path is None:
             raise ValueError(f"{module} is not a module of vplog")
         parents = accumulate(module.split(".")[:-1], "{}.{}".format)
-        files |= {parent: file for parent in parents if (file := _file(parent)) is not None}
+        files |= {parent: file for parent in parents if (file := _file(parent, _PACKAGE)) is not None}
         files[module] = path
         for name in _imports(path, path.stat().st_mtime_ns):
             top = name.partition(".")[0]
             if top == "vplog":
-                waiting.append(name if _file(name) is not None else name.rpartition(".")[0])
+                waiting.append(name if _file(name, _PACKAGE) is not None else name.rpartition(".")[0])
             elif top not in sys.stdlib_module_names:
                 packages.add(top)
     return files, packages
 
 
-def _file(module: str) -> Path | None:
+@cache
+def _file(module: str, package: Path) -> Path | None:
     """The file of a module or package of vplog; None where there is none of that name."""
-    at = _PACKAGE.joinpath(*module.split(".")[1:])
+    at = package.joinpath(*module.split(".")[1:])
     return next((file for file in (at / "__init__.py", at.with_suffix(".py")) if file.is_file()), None)
 
 
 @cache
 def _imports(path: Path, _changed_ns: int) -> list[str]:
-    """Full names of all that a file imports when it runs, wherever in it. Stages share most of their files."""
-    found: list[str] = []
-    waiting: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
-    while waiting:
-        match waiting.pop():
-            case ast.If(test=ast.Name(id="TYPE_CHECKING"), orelse=other):
-                waiting += other
-            case ast.Import(names=names):
-                found += [alias.name for alias in names]
-            case ast.ImportFrom(module=module, names=names, level=0):
-                found += [f"{module}.{alias.name}" for alias in names]
-            case node:
-                below = ast.iter_child_nodes(node)
-                waiting += [one for one in below if isinstance(one, ast.stmt | ast.excepthandler | ast.match_case)]
-    return found
+    """Full names of all that a file imports when it runs, by its lines: syntax trees of all files take a second."""
+    text = re.sub(" as \\w+| *#.*", "", _TYPE_CHECKING.sub("", path.read_text(encoding="utf-8")))
+    found = ((module, re.findall(r"[\w.]+", names)) for module, names in _IMPORT.findall(text))
+    return [f"{module}.{name}" if module else name for module, names in found for name in names]
 
 
-def _version(package: str) -> str:
+@cache
+def version(package: str) -> str:
+    """Of an installed package by the name that it is imported by or published as; `none` where there is none."""
     try:
         return metadata.version(_PUBLISHED_AS.get(package, package))
     except metadata.PackageNotFoundError:

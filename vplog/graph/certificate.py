@@ -41,7 +41,7 @@ more than ten times the memory."""
 GAP = 1e-6
 """Share of the chi-square that another solution may gain at most for this one to be called the optimum."""
 _ROUNDING = 1e-13
-"""Eigenvalues up to this share of the largest entry of S are rounding."""
+"""Eigenvalues up to this share of the largest entry of S, and gains in chi-square up to this, are rounding."""
 _STEPS = 60
 """Newton steps after which a descent ends; from a solution it takes 3-12."""
 _CONVERGED = 1e-7
@@ -283,14 +283,14 @@ def descend(problem: Problem, start: Floats, tolerance: float = _CONVERGED) -> t
                 continue
             moved = _moved(point, step.reshape(len(point) - 1, -1), problem.d)
             gain = cost - problem.cost(moved)
-            if promised > 0 and (gain >= 0 or promised <= tolerance * cost):
+            if promised > 0 and (gain >= 0 or promised <= max(tolerance * cost, _ROUNDING)):
                 break
             damping = max(_DAMPING, damping * _DAMPING_CHANGE)
         else:
             break
         if gain >= 0:
             point, cost = moved, cost - gain
-        if promised <= tolerance * cost:
+        if promised <= max(tolerance * cost, _ROUNDING):
             break
         damping = damping / _DAMPING_CHANGE if damping > _DAMPING else 0.0
     return point, cost

@@ -5,9 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.linalg import solveh_banded
-from scipy.sparse import diags_array
+import scipy
 
 from vplog.data import RECEIVER_SIGMA_M, Odometry
 from vplog.geometry import se3
@@ -96,7 +94,7 @@ def odometry_of_fixes(gps: Gps) -> Odometry | None:
     fixed_s, at_ns = (local.stamp_ns - local.stamp_ns[0]) / 1e9, _between(local.stamp_ns)
     at_s = (at_ns - local.stamp_ns[0]) / 1e9
     level, height = (_smoothed(fixed_s, local.enu_m[:, axes], variance[:, axes]) for axes in ([0, 1], [2]))
-    curve = CubicSpline(fixed_s, np.concatenate([level.places, height.places], axis=1))
+    curve = scipy.interpolate.CubicSpline(fixed_s, np.concatenate([level.places, height.places], axis=1))
     places, velocity = curve(at_s), curve(at_s, 1)
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
     slow = _SLOW * float(np.quantile(speed, 0.9))
@@ -134,19 +132,19 @@ def _smoothed(at_s: Floats, places: Floats, variance: Floats) -> _Smooth:
     count, steps = len(at_s), np.diff(at_s)
     weight, period = 1.0 / variance.mean(1), float(np.median(steps))
     middle = (steps[1:] + steps[:-1]) / 2
-    bend = diags_array(
+    bend = scipy.sparse.diags_array(
         [1 / (steps[:-1] * middle), -(1 / steps[:-1] + 1 / steps[1:]) / middle, 1 / (steps[1:] * middle)],
         offsets=[0, 1, 2], shape=(count - 2, count),  # pyright: ignore[reportArgumentType]
     )  # fmt: skip
-    energy = (bend.T @ diags_array(middle) @ bend).tocsr()
+    energy = (bend.T @ scipy.sparse.diags_array(middle) @ bend).tocsr()
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (count, _PROBES))
-    found: list[tuple[float, _Smooth]] = []
+    found, right = list[tuple[float, _Smooth]](), weight[:, None] * np.concatenate([places, signs], axis=1)
     for window_s in period * np.geomspace(*_WINDOWS):
         bands = float(np.median(weight)) * window_s**4 / period * np.stack(
             [np.append(energy.diagonal(k), np.zeros(k)) for k in range(3)]
         )  # fmt: skip
         bands[0] += weight
-        solved = solveh_banded(bands, weight[:, None] * np.concatenate([places, signs], axis=1), lower=True)
+        solved = scipy.linalg.solveh_banded(bands, right, lower=True)
         trace = float((signs * solved[:, places.shape[1] :]).sum()) / _PROBES
         free = max(count - trace, 1e-9)
         smooth = solved[:, : places.shape[1]]

@@ -12,8 +12,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 from pydantic import Field
-from scipy.optimize import isotonic_regression
 
 from vplog.data import Bools, Closures, Floats, Ints, Verdict
 from vplog.features.sift import mirrored
@@ -86,7 +86,7 @@ def wrong_poses(candidates: Ints, certain: Ints, wrong: Bools) -> Floats:
     if not len(certain):
         return np.zeros(len(candidates))
     order = np.lexsort((~wrong, certain))
-    share = isotonic_regression(wrong[order].astype(np.float64), increasing=False).x
+    share = scipy.optimize.isotonic_regression(wrong[order].astype(np.float64), increasing=False).x
     return np.interp(candidates, [0, *certain[order]], [1.0, *share])
 
 

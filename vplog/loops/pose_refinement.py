@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+import scipy
 
 from vplog.data import Bools, Floats
 from vplog.geometry import se3
@@ -69,7 +69,7 @@ def fit(match_from_query: Floats, matches: Matches) -> tuple[Floats, Floats, flo
         )  # fmt: skip
         excess = cost / freedom
         try:
-            step = -np.asarray(cho_solve(cho_factor(hessian, check_finite=False), gradient), np.float64)
+            step = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(hessian, check_finite=False), gradient)
         except np.linalg.LinAlgError:  # no one pose is best
             break
         match_from_query = match_from_query @ se3.exp(step)

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from vplog.data import Bools, Camera, Closures, Float32s, Floats, Ints, Structure
 from vplog.features.matching import MatchSettings, match_features
@@ -70,8 +69,8 @@ def tracks(
     start = np.concatenate([[0], np.cumsum(counts)])
     ends = [(start[a] + rows[0], start[b] + rows[1]) for (a, b), rows in zip(pairs, found, strict=True)]
     first, second = (np.concatenate([np.empty(0, np.int64), *(end[i] for end in ends)]) for i in (0, 1))
-    graph = coo_matrix((np.ones(len(first), bool), (first, second)), shape=(start[-1], start[-1]))
-    label = connected_components(graph, directed=False)[1]
+    graph = scipy.sparse.coo_matrix((np.ones(len(first), bool), (first, second)), shape=(start[-1], start[-1]))
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     node = np.unique(np.concatenate([first, second]))
     image = np.searchsorted(start, node, side="right") - 1
     _, number, size = np.unique(label[node] * len(counts) + image, return_inverse=True, return_counts=True)
@@ -159,5 +158,6 @@ def _step(error: Floats, jacobian: Floats, track: Ints, count: int) -> Floats:
 def _sums(values: Floats, track: Ints, count: int) -> Floats:
     """Sum of the values (O, ...) of each of `count` tracks."""
     flat = values.reshape(len(values), -1)
-    summed = coo_matrix((np.ones(len(track)), (track, np.arange(len(track)))), shape=(count, len(track))).tocsr() @ flat
+    ones = np.ones(len(track)), (track, np.arange(len(track)))
+    summed = scipy.sparse.coo_matrix(ones, shape=(count, len(track))).tocsr() @ flat
     return summed.reshape(count, *values.shape[1:])

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
-from scipy.sparse import csr_array
+import scipy
 
 from vplog.data import Bytes, Features, Float32s, Ints, Keyframes
 from vplog.places.library import Library, Words, WordSettings, hnsw, l1_distance
@@ -93,7 +93,7 @@ def _candidates(size: int | None) -> int:
     return max(_LEAST_CANDIDATES, _CANDIDATES_A_REFERENCE * (size or 0))
 
 
-def explanations(descriptors: Sequence[Bytes], candidates: Ints, execution: Execution) -> csr_array:
+def explanations(descriptors: Sequence[Bytes], candidates: Ints, execution: Execution) -> scipy.sparse.csr_array:
     """(F, C) float32: the share of the features (M, 128) of each frame that each candidate, a row of `descriptors`,
     explains. Columns rise within a row, and no frame explains itself."""
     owners = np.repeat(np.arange(len(candidates)), [len(descriptors[row]) for row in candidates])
@@ -102,7 +102,7 @@ def explanations(descriptors: Sequence[Bytes], candidates: Ints, execution: Exec
     number[candidates] = np.arange(len(candidates))
     shape = len(descriptors), len(candidates)
     if len(pool) == 0:
-        return csr_array(shape, dtype=np.float32)
+        return scipy.sparse.csr_array(shape, dtype=np.float32)
     settings = WordSettings()
     index = hnsw(pool.astype(np.float32), settings.hnsw_links, settings.hnsw_ef_construction, settings.hnsw_ef_search)
 
@@ -118,16 +118,16 @@ def explanations(descriptors: Sequence[Bytes], candidates: Ints, execution: Exec
 
     candidate, share = zip(*execution.map(explained_by, range(len(descriptors))), strict=True)
     start = np.concatenate([[0], np.cumsum([len(one) for one in candidate])])
-    return csr_array((np.concatenate(share), np.concatenate(candidate), start), shape=shape)
+    return scipy.sparse.csr_array((np.concatenate(share), np.concatenate(candidate), start), shape=shape)
 
 
-def greedy_cover(found: csr_array, size: int) -> Ints:
+def greedy_cover(found: scipy.sparse.csr_array, size: int) -> Ints:
     """At most `size` candidates, the one that adds most first; fewer where none adds anything.
 
     Maximises the sum over the frames of the worth of their best reference, see `_worth`. Ties go to the first.
     """
     worth = _worth(found)
-    columns: Any = worth.tocsc()
+    columns = scipy.sparse.csc_array(worth)
     best, chosen = np.zeros(worth.shape[0]), list[int]()
     gain = np.bincount(worth.indices, worth.data, worth.shape[1])
     while len(chosen) < size and gain[c := int(np.argmax(gain))] > 1e-9:  # what is left is rounding
@@ -142,7 +142,7 @@ def greedy_cover(found: csr_array, size: int) -> Ints:
     return np.array(chosen, np.int64)
 
 
-def _worth(found: csr_array) -> csr_array:
+def _worth(found: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
     """0..1, of each candidate to each frame: 1 where it explains half as much as the frame's best candidate does.
 
     Relative to the frame's best, so that a bare wall counts as much as a facade; capped, so that the frames of one
@@ -152,10 +152,10 @@ def _worth(found: csr_array) -> csr_array:
     best = np.zeros(len(found.indptr) - 1)
     np.maximum.at(best, frame, found.data)
     worth = np.minimum(found.data / (_ENOUGH * best[frame]), 1.0)
-    return csr_array((worth, found.indices, found.indptr), shape=found.shape)
+    return scipy.sparse.csr_array((worth, found.indices, found.indptr), shape=found.shape)
 
 
-def _needed_count(found: csr_array, chosen: Ints, least_gain: float) -> int:
+def _needed_count(found: scipy.sparse.csr_array, chosen: Ints, least_gain: float) -> int:
     """Number of the chosen that are needed: the last of them still adds `least_gain` of what is explained."""
     total = np.maximum.accumulate(_worth(found).toarray()[:, chosen], axis=1).sum(axis=0)
     poor = np.flatnonzero(np.diff(total, prepend=0.0) < least_gain * total)

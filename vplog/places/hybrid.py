@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Literal
 import numba
 import numpy as np
 import pyarrow as pa
+import scipy
 from pydantic import Field
-from scipy.spatial.distance import cdist
 
 from vplog.data import Bytes, Features, Float32s, Floats, Ints, Ranking, Reference
 from vplog.places.bobb import BobbSettings, BobbState
@@ -173,7 +173,7 @@ def _centres(values: Floats, words: int, rng: np.random.Generator) -> Floats:
 
 def _nearest(values: Floats, centres: Floats) -> Ints:
     """(F,) the word of each value: whole numbers, whose squared distances are exact in any order of the sum."""
-    return cdist(values, centres, "sqeuclidean").argmin(axis=1)
+    return scipy.spatial.distance.cdist(values, centres, "sqeuclidean").argmin(axis=1)
 
 
 def _sum_by_word(values: Floats, word: Ints, words: int) -> Floats:

@@ -11,7 +11,7 @@ the more queries have one, the more cautious the probabilities are.
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import isotonic_regression
+import scipy
 
 from vplog.data import Float32s, Floats, Ints
 
@@ -76,6 +76,6 @@ def null_probabilities(found: Floats, null: Floats) -> Floats:
     pool, of_null = np.concatenate([found, null]), np.repeat([0.0, 1.0], [len(found), len(null)])
     order = np.lexsort((of_null, pool))
     fitted = np.empty(len(pool))
-    fitted[order] = isotonic_regression(of_null[order], increasing=False).x
+    fitted[order] = scipy.optimize.isotonic_regression(of_null[order], increasing=False).x
     odds = fitted[: len(found)] / np.maximum(1.0 - fitted[: len(found)], 1e-9)
     return np.minimum(1.0, share * odds * len(found) / len(null))

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 from pydantic import model_validator
 
@@ -171,10 +170,10 @@ class _Stamped:
                 table = read_table(path, file, names)
             self._stamp_ns = table["stamp_ns"].cast(pa.int64()).to_numpy()
             vectors = table["vector"].combine_chunks()
-            lengths = np.unique(pc.call_function("list_value_length", [vectors]).to_numpy(zero_copy_only=False))
+            lengths = np.unique(vectors.value_lengths().to_numpy(zero_copy_only=False))
             self._drives = np.array(table["drive"].to_pylist()) if "drive" in names else None
             values = vectors.flatten().cast(pa.float32())
-        except (OSError, KeyError, ValueError, pa.ArrowException) as error:
+        except (OSError, KeyError, ValueError, AttributeError, pa.ArrowException) as error:
             why = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
             raise LibraryError(f"{path} is not a table of vectors: {why}. Its columns are {_COLUMNS}.") from None
         if len(lengths) != 1 or not 1 <= lengths[0] <= MAX_DIMENSIONS or vectors.null_count + values.null_count:

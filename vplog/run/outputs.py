@@ -12,7 +12,6 @@ from vplog.cache.steps import Steps, step
 from vplog.data import Camera, Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Reference, Solution, Verdict
 from vplog.geometry import tum
 from vplog.graph import consistency
-from vplog.graph.certificate import certify
 from vplog.graph.refine import about_odometry
 from vplog.results import g2o, mcap, run_record, tables
 from vplog.run import provenance
@@ -121,6 +120,8 @@ def finish(folder: Path, run: Run, record: dict[str, Any], steps: Steps) -> Run:
 
 def _results_record(run: Run) -> dict[str, Any]:
     """Fields of run.json about the results."""
+    from vplog.graph.certificate import certify
+
     solution, refined, verdicts = run.solution, run.solved.refined, run.closures.verdict
     constrained = set(run.graph.kind) - {EdgeKind.ODOMETRY} or run.solved.refined.fixes
     return {

@@ -6,11 +6,11 @@ import hashlib
 import platform
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog import logs
+from vplog.cache.code_hash import version
 from vplog.cache.input_hashes import bytes_of, files_of, stat_signature
 from vplog.errors import LogError, ResultError
 from vplog.results import run_record
@@ -110,11 +110,4 @@ def head(
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that results depend on."""
     packages = ("numpy", "scipy", "opencv-python-headless", "faiss-cpu", "gtsam", "numba", "pyarrow", "mcap", "rosbags")
-    return {"python": platform.python_version(), **{name: _version(name) for name in packages}}
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "unknown"
+    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
