@@ -80,7 +80,7 @@ class VectorsState(VectorState):
     arrow_type: pa.FixedSizeListType
 
     @cached_property
-    def hash(self) -> str:
+    def _hash(self) -> str:
         content = self.settings.model or self._content
         about = f"{references_hash(self.references, self.settings)} {content} {self.tables[0].dimensions}"
         return hashlib.sha256(about.encode()).hexdigest()
