@@ -141,9 +141,12 @@ def _searched(graph: PoseGraph, gnc: GncSettings, loops: Ints, chain: OdometryCh
     for one in of_families:
         found += _attempted(lambda one=one: _tested(graph, gnc, one.weight, one.poses, one.sigmas))
     found += of_families
-    grown = _attempted(lambda: [_grown(graph, sigmas, chain)])
+    best = _likeliest(found)
+    if all((one.weight[loops] == 0).mean() <= _ALIKE for one in best):  # next to all agree
+        return found + [_improved(graph, one) for one in best]
     whole = [loops[one] for one in families if one.sum() >= _LEAST_FAMILY]
-    found += [_improved(graph, one, whole) for one in [*_likeliest(found), *grown]]
+    grown = _attempted(lambda: [_grown(graph, sigmas, chain)])
+    found += [_improved(graph, one, whole) for one in [*best, *grown]]
     for one in _likeliest(found):
         found += _attempted(lambda one=one: _tested(graph, gnc, one.weight, one.poses, one.sigmas))
     return found
