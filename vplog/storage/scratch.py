@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from glob import escape
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -157,8 +157,10 @@ def put_in_place(part: Path, path: Path) -> None:
 
 def sync_all(path: Path) -> None:
     """Have a file, or a folder with all that is in it, on the disk. Raises OSError."""
-    for one in [*path.rglob("*"), path]:
-        sync(one)
+    names = list(regular_files(path))
+    below = {*names, *(str(above) for name in names for above in PurePosixPath(name).parents), "."}
+    for name in sorted(below):
+        sync(path / name)
 
 
 def sync(path: Path) -> None:

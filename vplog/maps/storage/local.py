@@ -8,13 +8,13 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.storage.damage import complete_record
 from vplog.maps.storage.layout import ADD_AGAIN, TABLES, drive_record, folder_name, sha256_of
-from vplog.storage.folders import check_regular
+from vplog.storage.folders import check_regular, regular_files
 from vplog.storage.scratch import made_folder, replacing, sync, sync_all
 
 if TYPE_CHECKING:
@@ -135,8 +135,9 @@ def link_tables(store: Store, drive: str) -> None:
 def check_removable(store: Store, drives: Sequence[str]) -> None:
     """Raises ResultError where this user may not remove a folder of these drives."""
     for path in [folder for drive in drives for folder in store.root.glob(f"*/{folder_name(drive)}")]:
-        for folder in [path.parent, *(Path(below) for below, _, _ in os.walk(path))]:
-            if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
+        below = {above for name in regular_files(path) for above in PurePosixPath(name).parents}
+        for folder in [path.parent, path, *(path / above for above in below)]:
+            if not os.access(folder, os.W_OK | os.X_OK):
                 raise ResultError(
                     f"Cannot remove {', '.join(drives)} from {store}: no permission to change {folder}. The map is as "
                     "it was. Ask the owner of that folder for the permission, or let the owner remove the drive."
