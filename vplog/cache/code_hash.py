@@ -83,7 +83,7 @@ def _imports(path: Path, _changed_ns: int) -> list[str]:
 
 @cache
 def version(package: str) -> str:
-    """Of an installed package by the name that it is imported by or published as; `none` where there is none."""
+    """Version of an installed package by its import or published name; `none` where there is none."""
     try:
         return metadata.version(_PUBLISHED_AS.get(package, package))
     except metadata.PackageNotFoundError:
