@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 _PIECES = 64
 """A run takes no more than this share of the work: 16 threads have four each, and few fronts are above them all."""
-_LEAST_RUN = 1e5
-"""Work of a run below which threads are not worth their start: some milliseconds."""
+_LEAST_RUN = 1e6
+"""Work of a run below which threads are not worth their start: some ten milliseconds."""
 
 
 @dataclass(frozen=True, eq=False)
