@@ -104,14 +104,14 @@ def test_odometry_without_metres_finds_the_frame_of_the_truth(kind: str, scale: 
     assert (found.right | found.wrong)[found.known].mean() > 0.9
 
 
-@pytest.mark.parametrize("offset_s", [-2.0, 0.1, 0.5])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_truth_of_another_clock_is_known_as_such(kind: str, offset_s: float) -> None:
+def test_a_truth_of_another_clock_is_known_as_such(kind: str) -> None:
     drive = draw(kind, 4)
     for truth in (drive.truth.world_from_body, drive.truth.world_from_body @ drive.camera):
-        late = Trajectory(drive.truth.stamp_ns + round(offset_s * 1e9), truth)
-        found = body_truth(late, drive.odometry, drive.camera).offset_s
-        assert found == pytest.approx(-offset_s, abs=0.03)
+        for offset_s in (-2.0, 0.1, 0.5):
+            late = Trajectory(drive.truth.stamp_ns + round(offset_s * 1e9), truth)
+            found = body_truth(late, drive.odometry, drive.camera).offset_s
+            assert found == pytest.approx(-offset_s, abs=0.03), offset_s
         assert body_truth(Trajectory(drive.truth.stamp_ns, truth), drive.odometry, drive.camera).offset_s == 0.0
 
 

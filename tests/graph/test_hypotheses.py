@@ -40,7 +40,7 @@ def with_family(drive: Drive, rows: np.ndarray, shift_m: float) -> tuple[Drive, 
     return replace(drive, graph=replace(drive.graph, a_from_b=measured)), false
 
 
-@pytest.mark.parametrize(("odometry", "closures"), [(0.2, 0.3), (0.2, 4.0), (1.0, 1.0), (8.0, 0.3), (8.0, 4.0)])
+@pytest.mark.parametrize(("odometry", "closures"), [(0.2, 0.3), (0.2, 4.0), (8.0, 0.3), (8.0, 4.0)])
 def test_claimed_sigmas_decide_nothing(odometry: float, closures: float) -> None:
     drive = claiming(ring(120, loops=40, false=20, seed=2), odometry, closures)
     loops = is_loop(drive.graph)
@@ -73,7 +73,7 @@ def test_tails_are_told_from_noise_and_from_residuals_below_it() -> None:
     assert abs(log_tails(0.01 * tailed, 6)) < 2.0
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_family_of_false_closures_that_agree_with_each_other_is_left_out(seed: int) -> None:
     drive = ring(160, loops=60, seed=seed)
     loops = np.flatnonzero(is_loop(drive.graph))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from functools import reduce
+from functools import cache, reduce
 from operator import xor
 from typing import TYPE_CHECKING, Any
 
@@ -202,14 +202,22 @@ def test_sentences_give_way_to_fixes_with_a_covariance(tmp_path: Path) -> None:
     assert gps_of(tmp_path, both, gps="/nmea").covariance[0, 0, 0] == pytest.approx(0.04**2)
 
 
-def decoded(text: str) -> Any:
+SENTENCE = "nmea_msgs/msg/Sentence"
+
+
+@cache
+def sentence_store() -> Any:
     store = get_typestore(Stores.ROS2_JAZZY)
-    name = "nmea_msgs/msg/Sentence"
-    store.register(get_types_from_msg("std_msgs/Header header\nstring sentence\n", name))
+    store.register(get_types_from_msg("std_msgs/Header header\nstring sentence\n", SENTENCE))
+    return store
+
+
+def decoded(text: str) -> Any:
+    store = sentence_store()
     stamp = store.types["builtin_interfaces/msg/Time"](sec=1, nanosec=0)
     header = store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="gps")
-    data = store.serialize_cdr(store.types[name](header=header, sentence=text), name)
-    return decode(Channel("/nmea", name, "cdr"), bytes(data))
+    data = store.serialize_cdr(store.types[SENTENCE](header=header, sentence=text), SENTENCE)
+    return decode(Channel("/nmea", SENTENCE, "cdr"), bytes(data))
 
 
 def test_no_damage_of_a_sentence_is_a_place_elsewhere() -> None:
