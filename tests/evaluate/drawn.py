@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,12 +43,8 @@ class Drawn:
     """body_from_camera."""
 
 
-@cache
 def draw(kind: str, seed: int) -> Drawn:
-    """Half of the closures are right: within 3 sigma of what they claim. The others are wrong as closures are.
-
-    Tests leave it as it is.
-    """
+    """Half of the closures are right: within 3 sigma of what they claim. The others are wrong as closures are."""
     rng = np.random.default_rng(seed)
     poses = _laps(kind, rng)
     stamps = START_NS + PERIOD_NS * np.arange(len(poses))

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
+    from vplog.demo.record import Drive
+
     Verb = Callable[..., Said]
 
 SECRET = "5eCr3tS1gnature"  # noqa: S105 (opens nothing)
@@ -51,8 +53,11 @@ class SignedHandler(RangeHandler):
 
 
 @pytest.fixture
-def server(tiny_drives: list[Path], tmp_path: Path) -> Iterator[str]:
-    folder = shutil.copytree(tiny_drives[0], tmp_path / "served")
+def server(drive: Drive, tmp_path: Path) -> Iterator[str]:
+    folder = tmp_path / "served"
+    folder.mkdir()
+    shutil.copy(drive.log, folder / "drive.mcap")
+    shutil.copy(drive.truth, folder / "truth.tum")
     SignedHandler.asked = []
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(SignedHandler, directory=str(folder)))
     thread = Thread(target=server.serve_forever, daemon=True)
