@@ -29,7 +29,7 @@ LAYERS = (
     {"cache", "testing"},
     {"run"},
     {"pipeline"},
-    {"sessions", "benchmark", "verbs"},
+    {"benchmark", "verbs"},
     {"maps"},
     {"batch", "localize"},
     {"api"},

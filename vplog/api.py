@@ -67,9 +67,9 @@ def run(
     threads: None for one a core; results do not depend on it.
     progress: called with a stage, items done and items in all, from any thread.
     """
+    from vplog.maps.joining.joint_run import run_joint
     from vplog.pipeline import run as run_drive
     from vplog.run.run_folder import CacheOptions
-    from vplog.sessions.joint_run import run_joint
     from vplog.storage.remote_path import RemotePath, local_copy, local_output, located
 
     place, execution = located(out), Execution(threads or available(), progress)
