@@ -31,7 +31,7 @@ LAYERS = (
     {"pipeline"},
     {"benchmark", "verbs"},
     {"maps"},
-    {"batch", "localize"},
+    {"batch"},
     {"api"},
     {"cli"},
     {"__main__"},
