@@ -23,9 +23,9 @@ PACKAGE = Path(vplog.__file__).parent
 LAYERS = (
     {"errors", "data", "version"},
     {"settings", "execution", "storage"},
-    {"stages", "geometry", "networks"},
-    {"features", "places"},
-    {"logs", "loops", "graph", "results", "evaluate", "demo"},
+    {"stages", "geometry"},
+    {"features"},
+    {"places", "logs", "loops", "graph", "results", "evaluate", "demo"},
     {"cache", "testing"},
     {"run"},
     {"pipeline"},
