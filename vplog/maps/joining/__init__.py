@@ -1,1 +1,1 @@
-"""Drives that share places in one pose graph, for joint runs and for maps: pairs, closures between them, the solve."""
+"""Drives that share places in one pose graph, of a joint run and of a map."""
