@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -328,10 +329,12 @@ class PoseGraph:
     """3, or 2 for a planar graph: all poses and edges then are turns about z and shifts along x and y, and only rows
     and columns 2, 3, 4 of `information` (yaw, x, y) are used, the others being zero."""
 
-    @property
+    @cached_property
     def odometry(self) -> Bools:
         """(E,) whether each edge is odometry, not a closure."""
-        return np.array([kind == EdgeKind.ODOMETRY for kind in self.kind], bool)
+        which = np.array([kind == EdgeKind.ODOMETRY for kind in self.kind], bool)
+        which.flags.writeable = False  # it serves all who ask
+        return which
 
 
 @dataclass(frozen=True, eq=False)

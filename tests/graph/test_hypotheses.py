@@ -96,7 +96,7 @@ def test_a_family_that_a_loose_odometry_agrees_with_is_left_out() -> None:
 
 def test_a_set_grown_from_the_surest_runs_is_of_true_closures() -> None:
     drive = ring(160, loops=40, false=20, seed=3)
-    weight = hypotheses._grown(drive.graph, Sigmas(), OdometryChain.of(drive.graph)).weight
+    weight = hypotheses._grown(Factors.of(drive.graph), Sigmas(), OdometryChain.of(drive.graph)).weight
     assert weight[drive.false].sum() <= 1  # that lands where it may be true; the evidence judges what has grown
     assert weight[is_loop(drive.graph) & ~drive.false].sum() >= 38
 
@@ -104,8 +104,8 @@ def test_a_set_grown_from_the_surest_runs_is_of_true_closures() -> None:
 def test_a_family_is_rejected_whole_though_its_members_support_each_other() -> None:
     drive, false = with_family(ring(160, loops=60, seed=1), np.arange(159, 219, 3), 3.0)
     chain = OdometryChain.of(drive.graph)
-    mixed = hypotheses._refit(drive.graph, np.ones(len(false)), chain.poses, Sigmas())
-    weight = hypotheses._improved(drive.graph, mixed, [np.flatnonzero(false)]).weight
+    mixed = hypotheses._refit(Factors.of(drive.graph), np.ones(len(false)), chain.poses, Sigmas())
+    weight = hypotheses._improved(Factors.of(drive.graph), mixed, [np.flatnonzero(false)]).weight
     assert not (weight[false] > 0).any()
     assert weight[~false].all()
 

@@ -15,7 +15,6 @@ from vplog.geometry import se3
 from vplog.graph.factors import Factors
 from vplog.graph.least_squares import Objective, Positions, minimised
 from vplog.graph.marginals import SharedScale, pose_covariances
-from vplog.graph.sparse import linear
 
 WORLDS = 200
 
@@ -44,10 +43,8 @@ def test_mean_nees_over_many_worlds_is_within_its_interval(shared: tuple[float, 
     assert low < total / (6 * WORLDS) < high
 
 
-@pytest.mark.parametrize("large", [False, True])
-def test_covariances_are_those_of_gtsam(large: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By its Bayes tree and by our supernodes; edges of no weight are left out."""
-    monkeypatch.setattr(linear, "LARGE_POSES", 2 if large else 10**9)
+def test_covariances_are_those_of_gtsam() -> None:
+    """Edges of no weight are left out."""
     drive = ring(60, 12, seed=3)
     weight = np.ones(len(drive.graph.a))
     weight[-5:] = 0.0

@@ -157,12 +157,13 @@ def _possible(likes: Floats) -> Floats:
     return np.where(np.abs(likes) > most, 0.0, likes)
 
 
-def informed(graph: PoseGraph) -> Floats:
+def informed(graph: PoseGraph, edges: Ints | Bools | slice = slice(None)) -> Floats:
     """The information of the axes that the graph uses: (E, 6, 6), or (E, 3, 3) of yaw, x, y for a planar one."""
+    information = graph.information[edges]
     if graph.dimension == 3:
-        return graph.information
+        return information
     axes = AXES[graph.dimension]
-    return graph.information[:, axes][:, :, axes]
+    return information[:, axes][:, :, axes]
 
 
 def _check_poses(poses: Floats, name: str, dimension: int) -> None:

@@ -71,7 +71,7 @@ class OdometryChain:
     def of(cls, graph: PoseGraph) -> OdometryChain:
         poses, leads = odometry_chain(graph)
         axes = AXES[graph.dimension]
-        step = np.linalg.inv(informed(graph)[leads])
+        step = np.linalg.inv(informed(graph, leads))
         # noise is in the frame of an edge's b: moved to the later pose where that is a
         back = np.flatnonzero((leads >= 0) & (graph.a[leads] > graph.b[leads]))
         if len(back):
@@ -87,7 +87,7 @@ class OdometryChain:
     def distance(self, loops: Ints, graph: PoseGraph) -> Floats:
         """(K,) sigma of the edges `loops` to the odometry, the noise of both together; NaN where it does not lead."""
         a, b = graph.a[loops], graph.b[loops]
-        covariance = self.covariance(a, b) + np.linalg.inv(informed(graph)[loops])
+        covariance = self.covariance(a, b) + np.linalg.inv(informed(graph, loops))
         error = se3.log(se3.between(graph.a_from_b[loops], se3.between(self.poses[a], self.poses[b])))
         error = error[:, self.axes]
         chi2 = se3.mahalanobis2(error, covariance)

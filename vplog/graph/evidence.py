@@ -92,7 +92,7 @@ def _log_true(factors: Factors, weight: Floats, poses: Floats, true: Ints, room:
     held = (1 + loose) * d * -2.0 * math.log(GAUGE_SIGMA)
     joined = int(factors.piece.max()) - loose  # pieces of odometry whose place only closures tell
     determinant = Objective(factors, weight).information(poses).log_determinant() - held
-    known = np.linalg.slogdet(informed(graph)[weight > 0])[1].sum()
+    known = np.linalg.slogdet(informed(graph, weight > 0))[1].sum()
     chi2 = weight * residual_sigma(graph, poses) ** 2
     gaussian = 0.5 * (known - determinant - chi2.sum()) - 0.5 * _LOG_2PI * d * (len(true) - joined) - joined * room
     return float(gaussian) + log_tails(chi2[true], d)
@@ -125,7 +125,7 @@ def log_room(graph: PoseGraph, places: Floats) -> float:
     axes = np.array(AXES[graph.dimension])
     if len(loops) <= 2 * len(axes):
         return box
-    spread = np.cov(se3.log(forward(graph, loops)[2])[:, axes].T) + np.linalg.inv(informed(graph)[loops]).mean(0)
+    spread = np.cov(se3.log(forward(graph, loops)[2])[:, axes].T) + np.linalg.inv(informed(graph, loops)).mean(0)
     spread += np.diag(_of_a_view(places[:, :3, 3])[axes] ** 2)
     of_views = 0.5 * (len(axes) * (_LOG_2PI + 1.0) + float(np.linalg.slogdet(spread)[1]))  # entropy of a Gaussian
     variance = np.array([np.diag(spread)[axes < 3].mean(), np.diag(spread)[axes >= 3].mean()])
@@ -254,7 +254,7 @@ def forward(graph: PoseGraph, edges: Ints) -> tuple[Ints, Ints, Floats, Floats]:
     """The edges from their earlier pose a to their later one b: a, b, a_from_b and covariance in the frame of b."""
     axes = AXES[graph.dimension]
     back = (graph.a[edges] > graph.b[edges])[:, None, None]
-    noise = np.linalg.inv(informed(graph)[edges])
+    noise = np.linalg.inv(informed(graph, edges))
     Ad = se3.adjoint(graph.a_from_b[edges])[:, axes][:, :, axes]
     return (
         np.minimum(graph.a[edges], graph.b[edges]).astype(np.int64),

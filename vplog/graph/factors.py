@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 _ALIKE = 0.99
 """Share of a shape's edges that are still there for it to serve: a new one costs as much as a few steps."""
+_SHAPES = 4
+"""Shapes that are kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +40,7 @@ class Factors:
             if not (on & ~edges).any() and on.sum() >= _ALIKE * edges.sum():
                 return shape
         shape = Elimination.of(len(self.graph.world_from_body), self.graph.a[on], self.graph.b[on])
-        self.eliminations[:] = [*self.eliminations[-1:], (on, shape)]
+        self.eliminations[:] = [*self.eliminations[1 - _SHAPES :], (on, shape)]
         return shape
 
     def loose(self, weight: Floats) -> Ints:

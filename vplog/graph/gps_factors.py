@@ -333,4 +333,4 @@ def _log_determinant(objective: Objective, poses: Floats) -> float:
     if not graph.odometry[on].all():
         return objective.information(poses).log_determinant()
     held = 1 + len(objective.factors.loose(objective.weight))
-    return float(np.linalg.slogdet(informed(graph)[on])[1].sum()) - 2.0 * held * 6.0 * float(np.log(GAUGE_SIGMA))
+    return float(np.linalg.slogdet(informed(graph, on))[1].sum()) - 2.0 * held * 6.0 * float(np.log(GAUGE_SIGMA))

@@ -79,18 +79,19 @@ def best_hypothesis(
     Raises GraphError where the graph cannot be solved.
     """
     graph, loops = bounded(graph), np.flatnonzero(is_loop(graph))
+    claimed = Factors.of(graph)
     none = np.where(is_loop(graph), 0.0, 1.0)
     chain = OdometryChain.of(graph)
     found: list[Hypothesis] = []
     if isinstance(optimiser, GncSettings):
-        found = _searched(graph, optimiser, loops, chain)
+        found = _searched(claimed, optimiser, loops, chain)
     else:
         solution = optimiser(graph)
         kept = np.where(solution.weight > 0.5, 1.0, 0.0)
-        found.append(_refit(graph, kept, solution.world_from_body, Sigmas()))
+        found.append(_refit(claimed, kept, solution.world_from_body, Sigmas()))
     likeliest = [one.sigmas for one in _likeliest(found)]
     for sigmas in dict.fromkeys([Sigmas(), *likeliest]):  # others would be of what false closures happen to share
-        alone = _judged(graph, none, chain.poses, sigmas)
+        alone = _judged(claimed, none, chain.poses, sigmas)
         margin = _VERY_STRONG if isinstance(optimiser, GncSettings) else 0.0
         found.append(replace(alone, log_evidence=alone.log_evidence + margin))
     if cost is None:
@@ -104,28 +105,29 @@ def best_hypothesis(
             continue
         judged.append(one)
         try:
-            left = one.log_evidence - cost(Factors.of(claimed_times(graph, one.sigmas)), one.weight, one.poses)
+            left = one.log_evidence - cost(_times(claimed, one.sigmas), one.weight, one.poses)
         except GraphError:  # nearly singular
             continue
         best, most = (one, left) if left > most else (best, most)
     return best
 
 
-def _searched(graph: PoseGraph, gnc: GncSettings, loops: Ints, chain: OdometryChain) -> list[Hypothesis]:
+def _searched(claimed: Factors, gnc: GncSettings, loops: Ints, chain: OdometryChain) -> list[Hypothesis]:
     """Hypotheses by graduated non-convexity from sets of closures that may be true, and from families of them."""
+    graph = claimed.graph
     likely_modes = modes(graph, loops, chain)
     soft = DcsSettings()(graph).weight[loops] > 0.5  # which starts from all of them, and throws none out
     found: list[Hypothesis] = []
     tried: list[Bools] = []
     for sigmas, likely in [(Sigmas(), np.ones(len(loops), bool)), *likely_modes, (Sigmas(), soft)]:
         if _is_new(likely, tried):
-            found += _from_start(graph, gnc, sigmas, likely)
+            found += _from_start(claimed, gnc, sigmas, likely)
             tried += [one.weight[loops] > 0 for one in found[-2:]]
     best = max(found, key=lambda one: one.log_evidence, default=None)
     if best is not None and best.weight.all() and max(best.sigmas) <= _AS_CLAIMED:  # all agree, from every start
         if not best.sigmas.differ(Sigmas(), math.log(_AS_CLAIMED)):
             return found
-        found.append(_improved(graph, best))
+        found.append(_improved(claimed, best))
         if found[-1].weight.all():  # and better than claimed, without any of them likelier to be false
             return found
     of_families = []
@@ -136,19 +138,19 @@ def _searched(graph: PoseGraph, gnc: GncSettings, loops: Ints, chain: OdometryCh
         if _is_new(likely, tried):
             weight = np.ones(len(graph.a))
             weight[loops] = likely
-            of_families += _attempted(lambda weight=weight: [_refit(graph, weight, chain.poses, Sigmas())])
+            of_families += _attempted(lambda weight=weight: [_refit(claimed, weight, chain.poses, Sigmas())])
     of_families = sorted(of_families, key=lambda one: -one.log_evidence)[:_FAMILIES]
     for one in of_families:
-        found += _attempted(lambda one=one: _tested(graph, gnc, one.weight, one.poses, one.sigmas))
+        found += _attempted(lambda one=one: _tested(claimed, gnc, one.weight, one.poses, one.sigmas))
     found += of_families
     best = _likeliest(found)
     if all((one.weight[loops] == 0).mean() <= _ALIKE for one in best):  # next to all agree
-        return found + [_improved(graph, one) for one in best]
+        return found + [_improved(claimed, one) for one in best]
     whole = [loops[one] for one in families if one.sum() >= _LEAST_FAMILY]
-    grown = _attempted(lambda: [_grown(graph, sigmas, chain)])
-    found += [_improved(graph, one, whole) for one in [*best, *grown]]
+    grown = _attempted(lambda: [_grown(claimed, sigmas, chain)])
+    found += [_improved(claimed, one, whole) for one in [*best, *grown]]
     for one in _likeliest(found):
-        found += _attempted(lambda one=one: _tested(graph, gnc, one.weight, one.poses, one.sigmas))
+        found += _attempted(lambda one=one: _tested(claimed, gnc, one.weight, one.poses, one.sigmas))
     return found
 
 
@@ -157,10 +159,10 @@ def _likeliest(found: list[Hypothesis]) -> list[Hypothesis]:
     return sorted(found, key=lambda one: -one.log_evidence)[:1]
 
 
-def _grown(graph: PoseGraph, sigmas: Sigmas, chain: OdometryChain) -> Hypothesis:
+def _grown(claimed: Factors, sigmas: Sigmas, chain: OdometryChain) -> Hypothesis:
     """The closures that are accepted run by run, always those of the best odds by the graph of the ones before: what
     is near in odometry tells how far the rest has drifted. It ends where chance brings the next as near."""
-    factors = Factors.of(claimed_times(graph, sigmas))
+    graph, factors = claimed.graph, _times(claimed, sigmas)
     weight, poses = np.where(is_loop(graph), 0.0, 1.0), chain.poses
     left = list(runs(graph, np.flatnonzero(is_loop(graph))))
     room, at_once = log_room(factors.graph, poses), -(-len(left) // _GROWTH)
@@ -176,7 +178,7 @@ def _grown(graph: PoseGraph, sigmas: Sigmas, chain: OdometryChain) -> Hypothesis
         weight[np.concatenate([left[at] for at in best])] = 1.0
         left = [run for at, run in enumerate(left) if at not in best]
         poses = descend(factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
-    return _refit(graph, weight, poses, sigmas)
+    return _refit(claimed, weight, poses, sigmas)
 
 
 def _is_new(likely: Bools, tried: list[Bools]) -> bool:
@@ -207,35 +209,35 @@ def _families(graph: PoseGraph, loops: Ints, sigmas: Sigmas) -> list[Bools]:
     return found
 
 
-def _improved(graph: PoseGraph, best: Hypothesis, families: Sequence[Ints] = ()) -> Hypothesis:
+def _improved(claimed: Factors, best: Hypothesis, families: Sequence[Ints] = ()) -> Hypothesis:
     """The hypothesis after flips of runs of closures, each the best of some, as long as they make it likelier.
 
     Tried are the rejected runs that fit best, the accepted ones that fit worst, and `families` rejected as a whole:
     their members support each other.
     """
-    loops = is_loop(graph)
+    loops = is_loop(claimed.graph)
     for _ in range(_MOST_FLIPS):
-        misfit = residual_sigma(claimed_times(graph, best.sigmas), best.poses)
+        misfit = residual_sigma(claimed_times(claimed.graph, best.sigmas), best.poses)
         flips: list[Ints] = []
         for accepted, sign in ((False, 1.0), (True, -1.0)):
             edges = np.flatnonzero(loops & ((best.weight > 0) == accepted))
-            flips += sorted(runs(graph, edges), key=lambda run: sign * float(misfit[run].mean()))[:_FLIPS]
+            flips += sorted(runs(claimed.graph, edges), key=lambda run: sign * float(misfit[run].mean()))[:_FLIPS]
         flips += [accepted for family in families if len(accepted := family[best.weight[family] > 0])]
-        tried = [one for run in flips for one in _flipped(graph, best, run)]
+        tried = [one for run in flips for one in _flipped(claimed, best, run)]
         better = max(tried, key=lambda one: one.log_evidence, default=best)
         if better.log_evidence <= best.log_evidence:
             break
-        again = _refit(graph, better.weight, better.poses, better.sigmas)
+        again = _refit(claimed, better.weight, better.poses, better.sigmas)
         best = max(again, better, key=lambda one: one.log_evidence)
     return best
 
 
-def _flipped(graph: PoseGraph, best: Hypothesis, run: Ints) -> list[Hypothesis]:
+def _flipped(claimed: Factors, best: Hypothesis, run: Ints) -> list[Hypothesis]:
     weight = np.array(best.weight)
     weight[run] = 1.0 - weight[run]
-    if not weight[is_loop(graph)].any():
+    if not weight[is_loop(claimed.graph)].any():
         return []
-    return _attempted(lambda: [_judged(graph, weight, best.poses, best.sigmas)])
+    return _attempted(lambda: [_judged(claimed, weight, best.poses, best.sigmas)])
 
 
 def bounded(graph: PoseGraph) -> PoseGraph:
@@ -243,27 +245,27 @@ def bounded(graph: PoseGraph) -> PoseGraph:
     loops = np.flatnonzero(~graph.odometry)
     if not len(loops):
         return graph
-    axes = np.diagonal(informed(graph)[loops], axis1=1, axis2=2)
+    axes = np.diagonal(informed(graph, loops), axis1=1, axis2=2)
     excess = (axes / (np.median(axes, axis=0) * _MOST_INFORMATION)).max(1)
     information = graph.information.copy()
     information[loops] /= np.maximum(excess, 1.0)[:, None, None]
     return replace(graph, information=information)
 
 
-def _from_start(graph: PoseGraph, gnc: GncSettings, sigmas: Sigmas, likely: Bools) -> list[Hypothesis]:
+def _from_start(claimed: Factors, gnc: GncSettings, sigmas: Sigmas, likely: Bools) -> list[Hypothesis]:
     """Graduated non-convexity over the `likely` closures (K,), then estimates of the sigmas and tests by them."""
 
     def solve() -> list[Hypothesis]:
-        weight, poses = gnc.annealed(Factors.of(claimed_times(graph, sigmas)), likely)
+        weight, poses = gnc.annealed(_times(claimed, sigmas), likely)
         if not weight.all():
-            return _tested(graph, gnc, weight, poses, sigmas)
-        all_true = _refit(graph, weight, poses, sigmas)  # noise first, by which least squares finds its way
-        return [all_true, *_tested(graph, gnc, weight, all_true.poses, all_true.sigmas)]
+            return _tested(claimed, gnc, weight, poses, sigmas)
+        all_true = _refit(claimed, weight, poses, sigmas)  # noise first, by which least squares finds its way
+        return [all_true, *_tested(claimed, gnc, weight, all_true.poses, all_true.sigmas)]
 
     return _attempted(solve)
 
 
-def _tested(graph: PoseGraph, gnc: GncSettings, weight: Floats, poses: Floats, sigmas: Sigmas) -> list[Hypothesis]:
+def _tested(claimed: Factors, gnc: GncSettings, weight: Floats, poses: Floats, sigmas: Sigmas) -> list[Hypothesis]:
     """Estimates of the sigmas and tests of all closures by them, in turns.
 
     The last test lets pass what chance would hardly bring so near, and a stricter one what the noise explains; they are
@@ -272,24 +274,24 @@ def _tested(graph: PoseGraph, gnc: GncSettings, weight: Floats, poses: Floats, s
     found: list[Hypothesis] = []
     for strict in (False, True):
         for _ in range(_ROUNDS):
-            weight, poses = gnc.tested(Factors.of(claimed_times(graph, sigmas)), weight, poses, strict)
+            weight, poses = gnc.tested(_times(claimed, sigmas), weight, poses, strict)
             before = sigmas
-            poses, sigmas = _estimated(graph, weight, poses, sigmas)
+            poses, sigmas = _estimated(claimed, weight, poses, sigmas)
             if not sigmas.differ(before, _STEADY):
                 break
         if not found or (weight != found[0].weight).any():
-            found.append(_judged(graph, weight, poses, sigmas))
+            found.append(_judged(claimed, weight, poses, sigmas))
     return found
 
 
-def _refit(graph: PoseGraph, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
-    return _judged(graph, weight, *_estimated(graph, weight, poses, sigmas))
+def _refit(claimed: Factors, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
+    return _judged(claimed, weight, *_estimated(claimed, weight, poses, sigmas))
 
 
-def _estimated(graph: PoseGraph, weight: Floats, poses: Floats, sigmas: Sigmas) -> tuple[Floats, Sigmas]:
+def _estimated(claimed: Factors, weight: Floats, poses: Floats, sigmas: Sigmas) -> tuple[Floats, Sigmas]:
     """Least squares of the weighted edges and the sigmas that they imply, in turns."""
     for _ in range(_ROUNDS):
-        factors = Factors.of(claimed_times(graph, sigmas))
+        factors = _times(claimed, sigmas)
         poses = descend(factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
         before, sigmas = sigmas, estimate(Objective(factors, weight), poses, sigmas)
         if not sigmas.differ(before, _STEADY / 4.0):
@@ -297,9 +299,14 @@ def _estimated(graph: PoseGraph, weight: Floats, poses: Floats, sigmas: Sigmas) 
     return poses, sigmas
 
 
-def _judged(graph: PoseGraph, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
-    factors = Factors.of(claimed_times(graph, sigmas))
-    if (weight[~graph.odometry] > 0).any():
+def _judged(claimed: Factors, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
+    factors = _times(claimed, sigmas)
+    if (weight[~claimed.graph.odometry] > 0).any():
         poses = descend(factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
     found = log_evidence(factors, weight, poses, OdometryChain.of(factors.graph)) + sigmas.log_prior()
     return Hypothesis(weight, poses, sigmas, found)
+
+
+def _times(claimed: Factors, sigmas: Sigmas) -> Factors:
+    """The factors with their sigmas multiplied; the shapes of eliminations serve all of them."""
+    return replace(claimed, graph=claimed_times(claimed.graph, sigmas))

@@ -11,8 +11,8 @@ from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.consistency import is_loop, odometry_chain, residual_sigma
 from vplog.graph.least_squares import anchored
+from vplog.graph.sparse.cholesky import Cholesky
 from vplog.graph.sparse.frontal import Blocks
-from vplog.graph.sparse.linear import factorised
 
 if TYPE_CHECKING:
     from vplog.data import Floats, PoseGraph
@@ -52,7 +52,7 @@ def _chordal(factors: Factors, weight: Floats) -> Floats:
     right[0] = firmness.max() * _HELD * held
     between = -firmness[:, None, None] * graph.a_from_b[:, :3, :3]
     matrix = Blocks(diagonal, graph.a, graph.b, between)
-    columns = factorised(matrix, lambda: factors.elimination(weight > 0)).solve(right)
+    columns = Cholesky.of(factors.elimination(weight > 0), matrix).solve(right)
     left, _, turned = np.linalg.svd(np.swapaxes(columns, 1, 2))
     left[:, :, 2] *= np.linalg.det(left @ turned)[:, None]  # the nearest rotations
     rotation = left @ turned
@@ -74,7 +74,7 @@ def _potentials(factors: Factors, weight: Floats, firmness: Floats, difference: 
     np.subtract.at(right, graph.a, firmness[:, None] * difference)
     right[0] = 0.0
     matrix = Blocks(diagonal[:, None, None], graph.a, graph.b, -firmness[:, None, None])
-    return factorised(matrix, lambda: factors.elimination(weight > 0)).solve(right[:, None, :])[:, 0]
+    return Cholesky.of(factors.elimination(weight > 0), matrix).solve(right[:, None, :])[:, 0]
 
 
 def _ends(graph: PoseGraph, firmness: Floats) -> Floats:

@@ -11,14 +11,13 @@ from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.normal_equations import edge_costs, normal_equations
 from vplog.graph.sparse.cholesky import OPEN
-from vplog.graph.sparse.linear import factorised
+from vplog.graph.sparse.linear import Supernodes
 from vplog.graph.sparse.workers import Workers
 
 if TYPE_CHECKING:
     from vplog.data import Floats, Ints
     from vplog.graph.factors import Factors
     from vplog.graph.sparse.frontal import Blocks
-    from vplog.graph.sparse.linear import BayesTree, Supernodes
 
 GAUGE_SIGMA = 1e-6
 """rad and m; holds pose 0 where it is, so that the rest has one best place. What it lets through is undone after."""
@@ -132,16 +131,16 @@ class Objective:
     def _measured(self) -> list[Positions]:
         return [one for one in (self.positions, self.verticals) if one is not None]
 
-    def factorised(self, matrix: Blocks, damping: float) -> Supernodes | BayesTree:
+    def factorised(self, matrix: Blocks, damping: float) -> Supernodes:
         """Pose 0 is held, and the first pose of each part that no edge of positive weight joins to it."""
         diagonal, axes = matrix.diagonal.copy(), np.arange(matrix.diagonal.shape[1])
         held = np.concatenate([[0], self.factors.loose(self.weight)]).astype(np.int64)
         diagonal[:, axes, axes] += damping
         sigma = GAUGE_SIGMA if self.positions is None else _FREE_SIGMA
         diagonal[held[:, None], axes, axes] += 1.0 / sigma**2
-        return factorised(matrix._replace(diagonal=diagonal), lambda: self.factors.elimination(self.weight > 0))
+        return Supernodes.of(self.factors.elimination(self.weight > 0), matrix._replace(diagonal=diagonal))
 
-    def information(self, poses: Floats) -> Supernodes | BayesTree:
+    def information(self, poses: Floats) -> Supernodes:
         """The information matrix at `poses` (N, 4, 4). Raises GraphError where these are not determined."""
         return self.factorised(self.linearised(se3.between(poses[:1], poses))[0], 0.0)
 

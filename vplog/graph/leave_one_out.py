@@ -21,7 +21,7 @@ from vplog.graph.marginals import edge_covariances, joint_covariance
 if TYPE_CHECKING:
     from vplog.data import Floats, Int32s, Ints, PoseGraph
     from vplog.graph.factors import Factors
-    from vplog.graph.sparse.linear import BayesTree, Supernodes
+    from vplog.graph.sparse.linear import Supernodes
 
 _ALONE = 1e-9
 """Least redundancy of a closure, so that no quotient is infinite."""
@@ -53,7 +53,7 @@ def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Ten
     axes = AXES[graph.dimension]
     error, Jr_inv = _errors(graph, poses, loops)
     covariance = Jr_inv @ edge_covariances(Objective(factors, weight), poses, loops) @ np.swapaxes(Jr_inv, 1, 2)
-    information = informed(graph)[loops] * weight[loops, None, None]
+    information = informed(graph, loops) * weight[loops, None, None]
     root = np.swapaxes(np.linalg.cholesky(information), 1, 2)
     # leverage: 1 where nothing else constrains the ends of the closure
     leverage, turn = np.linalg.eigh(root @ covariance @ np.swapaxes(root, 1, 2))
@@ -68,11 +68,11 @@ def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Ten
     )
 
 
-def cost_together(factors: Factors, weight: Floats, poses: Floats, tree: Supernodes | BayesTree, loops: Ints) -> float:
+def cost_together(factors: Factors, weight: Floats, poses: Floats, tree: Supernodes, loops: Ints) -> float:
     """By how much chi-square falls without all of a few closures, to first order; `tree` of Objective.information()."""
     size = len(AXES[factors.graph.dimension])
     error, Jr_inv = _errors(factors.graph, poses, loops)
-    information = informed(factors.graph)[loops] * weight[loops, None, None]
+    information = informed(factors.graph, loops) * weight[loops, None, None]
     root = np.swapaxes(np.linalg.cholesky(information), 1, 2)
     whiten = np.zeros((len(loops) * size, len(loops) * size))
     for row, matrix in enumerate(root @ Jr_inv):
@@ -91,7 +91,7 @@ def distance(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> tu
     barely[loops] = 1e-9
     error, Jr_inv = _errors(graph, poses, loops)
     covariance = Jr_inv @ edge_covariances(Objective(factors, barely), poses, loops) @ np.swapaxes(Jr_inv, 1, 2)
-    covariance = covariance + np.linalg.inv(informed(graph)[loops])
+    covariance = covariance + np.linalg.inv(informed(graph, loops))
     error = error[:, axes]
     return se3.mahalanobis2(error, covariance), 0.5 * np.linalg.slogdet(covariance)[1]
 
@@ -120,7 +120,7 @@ def groups(graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) ->
     """
     chain = chain or OdometryChain.of(graph)
     own: Floats = np.asarray(
-        np.median(np.diagonal(np.linalg.inv(informed(graph)[loops]), axis1=1, axis2=2), axis=0), np.float64
+        np.median(np.diagonal(np.linalg.inv(informed(graph, loops)), axis1=1, axis2=2), axis=0), np.float64
     )
     accumulated_noise = chain.accumulated_noise(own)
     first, second = np.minimum(graph.a[loops], graph.b[loops]), np.maximum(graph.a[loops], graph.b[loops])

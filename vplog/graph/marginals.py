@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from vplog.data import Bools, Floats, Ints
     from vplog.graph.factors import Factors
     from vplog.graph.least_squares import Objective
-    from vplog.graph.sparse.linear import BayesTree, Supernodes
+    from vplog.graph.sparse.linear import Supernodes
 
 _STEP = 1e-4
 """Step of a scale for differences: far above rounding, and errors of edges are linear in it."""
@@ -99,7 +99,7 @@ def positions_redundancy(objective: Objective, poses: Floats) -> float:
     return 3.0 * float(used.sum()) - float(np.einsum("fij,fji->", positions.Omega[used], spread))
 
 
-def joint_covariance(factors: Factors, information: Supernodes | BayesTree, poses: Floats, edges: Ints) -> Floats:
+def joint_covariance(factors: Factors, information: Supernodes, poses: Floats, edges: Ints) -> Floats:
     """Covariance (K d, K d) of a_from_b of a few edges together, each in the frame of its b."""
     graph = factors.graph
     axes = AXES[graph.dimension]

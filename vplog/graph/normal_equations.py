@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     Terms = Callable[[Ints, int, int, "_Edges", Floats, "_Sums"], None]
 
 
-_LEAST_SHARE = 1024
+_LEAST_SHARE = 4096
 """Poses or edges that a thread takes at least, half a millisecond."""
 _BY_THREAD = 4
 """Shares for each thread, so that none waits long for another that was held up."""

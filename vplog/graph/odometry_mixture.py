@@ -68,7 +68,7 @@ class _Mixture:
         a, b = graph.a[loops], graph.b[loops]
         error = se3.log(se3.between(graph.a_from_b[loops], se3.between(chain.poses[a], chain.poses[b])))[:, axes]
         # with both covariances diagonal, a scale costs one division: whiten by the closure's, turn to the chain's axes
-        root = np.swapaxes(np.linalg.cholesky(informed(graph)[loops]), 1, 2)
+        root = np.swapaxes(np.linalg.cholesky(informed(graph, loops)), 1, 2)
         spread, turn = np.linalg.eigh(root @ chain.covariance(a, b) @ np.swapaxes(root, 1, 2))
         self._spread = np.maximum(spread, 0.0)
         self._error2 = (np.swapaxes(turn, 1, 2) @ (root @ error[:, :, None]))[:, :, 0] ** 2

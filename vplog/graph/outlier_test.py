@@ -128,7 +128,7 @@ class OutlierTest:
     def predicted(self, state: State, rejected: Ints) -> Ints:
         """Rejected closures that the solved graph predicts."""
         graph = self.factors.graph
-        own = -0.5 * np.linalg.slogdet(informed(graph)[rejected])[1]
+        own = -0.5 * np.linalg.slogdet(informed(graph, rejected))[1]
         # an upper bound of the residual of what is within the limit, whatever the prediction's noise adds to its own
         near = residual_sigma(graph, state.poses, rejected) ** 2 <= _FURTHEST * self.limit(own)
         rejected = rejected[near]

@@ -120,7 +120,7 @@ def _most_factors(graph: PoseGraph) -> list[float]:
     edges = np.flatnonzero(graph.odometry)
     axes = np.array(AXES[graph.dimension])
     motion = se3.log(graph.a_from_b[edges])[:, axes]
-    covariance = np.asarray(np.linalg.inv(informed(graph)[edges]), np.float64)
+    covariance = np.asarray(np.linalg.inv(informed(graph, edges)), np.float64)
     found = []
     for part in (axes < 3, axes >= 3):
         chi2 = se3.mahalanobis2(motion[:, part], covariance[:, part][:, :, part])
@@ -143,7 +143,7 @@ def _of_parts(objective: Objective, poses: Floats, kinds: list[Bools]) -> list[t
     graph = objective.factors.graph
     axes = np.array(AXES[graph.dimension])
     edges = np.flatnonzero(np.logical_or.reduce(kinds))
-    claimed = np.linalg.inv(informed(graph)[edges])
+    claimed = np.linalg.inv(informed(graph, edges))
     error = se3.log(se3.between(graph.a_from_b[edges], se3.between(poses[graph.a[edges]], poses[graph.b[edges]])))
     chi2, trusted = np.zeros((2, len(edges))), np.zeros((2, len(edges)))
     try:

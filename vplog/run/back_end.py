@@ -142,7 +142,7 @@ def _confirmed(closures: Closures, poses: Floats) -> list[str]:
 
 def by_odometry(graph: PoseGraph, closures: Closures, rows: Ints) -> NDArray[np.bool_]:
     """(E,) edges whose metres are the odometry's: its own, and closures (ledger `rows`) with its scale."""
-    result = graph.odometry
+    result = graph.odometry.copy()
     result[~result] = [closures.scale[row] == "odometry" for row in rows.tolist()]
     return result
 

@@ -1,4 +1,4 @@
-"""Both linear solvers do what dense matrices do, and which of them is taken decides nothing."""
+"""The sparse solver does what dense matrices do, with any number of threads."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from pydantic import TypeAdapter
 
-from tests.benchmarks.graphs import city, spoiled
+from tests.benchmarks.graphs import city
 from tests.benchmarks.large_graphs import drives
 from tests.graph.drive import ring
 from tests.graph.gtsam_graph import as_values, weighted
@@ -21,16 +20,12 @@ from vplog.graph import normal_equations as normal
 from vplog.graph.consistency import is_loop, residual_sigma
 from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
-from vplog.graph.least_squares import Objective, descend
-from vplog.graph.leave_one_out import cost_together, tension
-from vplog.graph.lm import LmSettings
-from vplog.graph.marginals import edge_covariances
+from vplog.graph.least_squares import descend
 from vplog.graph.normal_equations import normal_equations
-from vplog.graph.solve import OptimiserSettings
-from vplog.graph.sparse import dense_front, frontal_inversion, linear
+from vplog.graph.sparse import dense_front, frontal_inversion, subtrees
 from vplog.graph.sparse.cholesky import Cholesky
 from vplog.graph.sparse.frontal import Blocks
-from vplog.graph.sparse.linear import BayesTree, Supernodes
+from vplog.graph.sparse.linear import Supernodes
 from vplog.graph.sparse.selected_inversion import inverse_blocks, joint_inverse
 from vplog.graph.sparse.symbolic import Elimination
 
@@ -41,6 +36,12 @@ GRAPHS = {"planar": city(400, seed=1), "spatial": ring(80, loops=10).graph, "dri
 EXACT = {2: 1e-4, 3: 1e-7}
 """GTSAM loses digits of a planar edge's derivative where its residual turns by less than a milliradian."""
 each_graph = pytest.mark.parametrize("graph", GRAPHS.values(), ids=GRAPHS)
+
+
+@pytest.fixture(autouse=True)
+def many_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Graphs of this size are worked on in several runs, as large ones."""
+    monkeypatch.setattr(subtrees, "_LEAST_RUN", 0.0)
 
 
 def random_matrix(nodes: int, chords: int, size: int, seed: int) -> tuple[Blocks, np.ndarray]:
@@ -76,7 +77,8 @@ def test_solutions_and_inverses_are_those_of_the_dense_matrix(nodes: int, chords
     random = np.random.default_rng(seed)
     shape = Elimination.of(nodes, matrix.a, matrix.b)
     assert sorted(shape.place.tolist()) == list(range(nodes))
-    factor = Cholesky.of(shape, matrix)
+    factor = Supernodes.of(shape, matrix)
+    assert factor.log_determinant() == pytest.approx(np.linalg.slogdet(whole)[1])
     right = random.normal(size=(nodes, size, 2))
     np.testing.assert_allclose(whole @ factor.solve(right).reshape(-1, 2), right.reshape(-1, 2), atol=1e-9)
     inverse = np.linalg.inv(whole).reshape(nodes, size, nodes, size).transpose(0, 2, 1, 3)
@@ -190,79 +192,7 @@ def test_normal_equations_are_those_of_gtsam(graph: PoseGraph) -> None:
     np.testing.assert_allclose(gradient[1:], -right[1:], rtol=0, atol=EXACT[graph.dimension] * np.abs(gradient).max())
 
 
-@pytest.mark.parametrize(("nodes", "chords", "size", "columns"), [(40, 30, 1, 3), (60, 40, 3, 2), (30, 20, 6, 1)])
-def test_both_linear_solvers_agree(nodes: int, chords: int, size: int, columns: int) -> None:
-    matrix, _ = random_matrix(nodes, chords, size, 0)
-    random = np.random.default_rng(1)
-    ours, gtsams = Supernodes.of(Elimination.of(nodes, matrix.a, matrix.b), matrix), BayesTree(matrix)
-    right = random.normal(size=(nodes, size, columns))
-    np.testing.assert_allclose(gtsams.solve(right), ours.solve(right), rtol=1e-7, atol=1e-9)
-    for one, other in zip(
-        gtsams.inverse_blocks(matrix.a, matrix.b), ours.inverse_blocks(matrix.a, matrix.b), strict=True
-    ):
-        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)
-    few = np.sort(random.permutation(nodes)[:4])
-    np.testing.assert_allclose(gtsams.joint_inverse(few), ours.joint_inverse(few), rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.parametrize("wrong", [-1.0, np.nan])
-def test_gtsam_refuses_what_is_not_positive_definite(wrong: float) -> None:
-    matrix, _ = random_matrix(30, 5, 3, 0)
-    diagonal = matrix.diagonal.copy()
-    diagonal[17] *= wrong
-    tree = BayesTree(matrix._replace(diagonal=diagonal))
-    with pytest.raises(GraphError, match="does not constrain"):
-        tree.solve(np.ones((30, 3, 1)))
-    with pytest.raises(GraphError, match="does not constrain"):
-        tree.inverse_blocks(matrix.a, matrix.b)
-
-
-@pytest.mark.parametrize("kind", ["lm", "gnc", "pcm", "dcs", "cauchy", "geman_mcclure"])
-@pytest.mark.parametrize("share", [0.0, 0.3])
-@each_graph
-def test_the_linear_solver_decides_nothing(
-    graph: PoseGraph, share: float, kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The same graph just below and just above the size from which supernodes are taken."""
-    graph, _ = spoiled(graph, share, 0)
-    method = TypeAdapter(OptimiserSettings).validate_python({"kind": kind})
-    monkeypatch.setattr(linear, "LARGE_POSES", len(graph.world_from_body) + 1)
-    below = method(graph)
-    monkeypatch.setattr(linear, "LARGE_POSES", len(graph.world_from_body))
-    above = method(graph)
-    assert above.iterations == below.iterations
-    assert above.reason == below.reason
-    np.testing.assert_allclose(above.weight, below.weight, atol=1e-6)
-    np.testing.assert_array_equal(above.weight > 0.5, below.weight > 0.5)
-    assert above.error_after == pytest.approx(below.error_after, rel=1e-6)
-    np.testing.assert_allclose(above.world_from_body, below.world_from_body, atol=1e-4)
-    assert method(graph).world_from_body.tobytes() == above.world_from_body.tobytes()
-
-
-@each_graph
-def test_the_linear_solver_changes_no_covariance(graph: PoseGraph, monkeypatch: pytest.MonkeyPatch) -> None:
-    poses, loops = LmSettings()(graph).world_from_body, np.flatnonzero(is_loop(graph))
-    factors, weight = Factors.of(graph), np.ones(len(graph.a))
-    objective = Objective(factors, weight)
-
-    def found() -> tuple[np.ndarray, float, np.ndarray]:
-        together = cost_together(factors, weight, poses, objective.information(poses), loops[:3])
-        return (
-            edge_covariances(objective, poses, loops),
-            together,
-            tension(factors, weight, poses, loops).cost,
-        )
-
-    covariance, together, cost = found()
-    monkeypatch.setattr(linear, "LARGE_POSES", 10)
-    ours, our_together, our_cost = found()
-    np.testing.assert_allclose(ours, covariance, rtol=1e-5, atol=1e-7 * np.abs(covariance).max())
-    assert our_together == pytest.approx(together, rel=1e-5)
-    np.testing.assert_allclose(our_cost, cost, rtol=1e-4, atol=1e-6)
-
-
-def test_drives_that_only_closures_join_are_solved_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(linear, "LARGE_POSES", 10)
+def test_drives_that_only_closures_join_are_solved_together() -> None:
     graph = GRAPHS["drives"]
     solution = GncSettings()(graph)
     assert solution.weight[is_loop(graph)].mean() > 0.9

@@ -205,5 +205,6 @@ def eliminate_run(
             handed = stack[used : used + below[node] ** 2].reshape(below[node], below[node])
             used += below[node] ** 2
             for i in range(below[node]):
-                handed[i, i:] = front[eliminated + i, eliminated + i :]
+                for j in range(i, below[node]):
+                    handed[i, j] = front[eliminated + i, eliminated + j]
     return True, stack[:used].copy(), waiting[:count].copy()

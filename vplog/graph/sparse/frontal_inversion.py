@@ -168,7 +168,8 @@ def invert_run(
             most = max(most, (first[node + 1] - first[node]) * size + below[node])
     room = np.empty(most * most)
     stack = np.empty(_most_waiting(low, end, len(given), needed, parent, tree))
-    stack[: len(given)] = given
+    for i in range(len(given)):
+        stack[i] = given[i]
     used = len(given)
     for node in range(end - 1, low - 1, -1):
         if not needed[node]:
@@ -179,7 +180,8 @@ def invert_run(
         if parent[node] >= 0:
             used -= left * left
             for i in range(left):
-                front[wide + i, wide:] = stack[used + i * left : used + (i + 1) * left]
+                for j in range(left):
+                    front[wide + i, wide + j] = stack[used + i * left + j]
         invert_front(front, values[begin[node] : begin[node + 1]].reshape(wide, length))
         store_blocks(node, front, form, size, wanted)
         for at in range(child[node], child[node + 1]):

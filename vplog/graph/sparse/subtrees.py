@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 _PIECES = 64
 """A run takes no more than this share of the work: 16 threads have four each, and few fronts are above them all."""
+_LEAST_RUN = 1e6
+"""Work of a run below which threads are not worth their start: some ten milliseconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +38,7 @@ class Subtrees:
         parent, wide, below = shape.parent, np.diff(shape.first), np.diff(shape.start)
         work = wide * (wide + below).astype(float) ** 2
         total = _with_those_below(parent, work)
-        limit = work.sum() / _PIECES
+        limit = max(float(work.sum()) / _PIECES, _LEAST_RUN)
         high = total > limit
         runs, load = _runs(parent, total, high, limit)
         runs = runs[np.argsort(-load, kind="stable")]

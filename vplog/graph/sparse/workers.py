@@ -19,7 +19,7 @@ class Workers:
 
     def __enter__(self) -> Workers:
         self.count = allowed()
-        self._pool = ThreadPoolExecutor(self.count) if self.count > 1 else None
+        self._pool: ThreadPoolExecutor | None = None
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -28,8 +28,9 @@ class Workers:
 
     def each(self, work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Results of `work` for each tuple of arguments, begun and returned in their order."""
-        if self._pool is None or len(tasks) < 2:
+        if self.count == 1 or len(tasks) < 2:
             return [work(*task) for task in tasks]
+        self._pool = self._pool or ThreadPoolExecutor(self.count)
         return [future.result() for future in [self._pool.submit(work, *task) for task in tasks]]
 
     def ranges(self, low: int, high: int, at_least: int, by_thread: int = 1) -> list[tuple[int, int]]:
