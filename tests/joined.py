@@ -9,8 +9,8 @@ from mcap.writer import Writer
 
 from vplog.demo import SMALL, make_drive
 from vplog.execution.execution import Execution
+from vplog.maps.joining.joint_run import run_joint
 from vplog.pipeline import load_pipeline
-from vplog.sessions.joint_run import run_joint
 
 if TYPE_CHECKING:
     from collections.abc import Callable

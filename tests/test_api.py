@@ -92,7 +92,7 @@ def test_errors_are_one_tree_and_all_of_it_is_public() -> None:
     assert {name for name in vplog.__all__ if name.endswith("Error")} == set(tree)
 
 
-@pytest.mark.parametrize("name", ["run", "evaluate", "batch", "localize"])
+@pytest.mark.parametrize("name", ["run", "evaluate", "batch"])
 def test_a_folder_of_the_same_name_leaves_the_function(name: str) -> None:
     __import__(f"vplog.{name}")
     assert inspect.isfunction(getattr(vplog, name))

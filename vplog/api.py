@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from vplog.benchmark.compare import Comparison
     from vplog.data import Camera
     from vplog.execution.process_pool import OwnProcesses
-    from vplog.localize.localize import LocalizedPicture
     from vplog.logs import TopicChoice
+    from vplog.maps.localization.localize import LocalizedPicture
     from vplog.pipeline import Pipeline
     from vplog.stages import Log
 
@@ -67,9 +67,9 @@ def run(
     threads: None for one a core; results do not depend on it.
     progress: called with a stage, items done and items in all, from any thread.
     """
+    from vplog.maps.joining.joint_run import run_joint
     from vplog.pipeline import run as run_drive
     from vplog.run.run_folder import CacheOptions
-    from vplog.sessions.joint_run import run_joint
     from vplog.storage.remote_path import RemotePath, local_copy, local_output, located
 
     place, execution = located(out), Execution(threads or available(), progress)
@@ -241,7 +241,7 @@ def localize(
     out: FILE.parquet for the records, or FILE.tum for the poses.
     top: places that a picture is verified against.
     """
-    from vplog.localize.verb import localize_paths
+    from vplog.maps.localization.verb import localize_paths
     from vplog.storage.remote_path import located
 
     threads = threads or available()
@@ -477,8 +477,8 @@ class Map:
 
 def _localizer(owner: object, root: Path) -> Callable[..., LocalizedPicture]:
     """`localize_image` of a run or map that is open as long as `owner` lives."""
-    from vplog.localize.localize import localize_image
-    from vplog.localize.places import opened
+    from vplog.maps.localization.localize import localize_image
+    from vplog.maps.localization.places import opened
 
     with ExitStack() as stack:
         places = stack.enter_context(opened(root, Execution()))

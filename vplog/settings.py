@@ -12,15 +12,18 @@ from itertools import pairwise
 from operator import eq
 from pathlib import Path
 from textwrap import dedent
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 
 from vplog.errors import SettingsError, nearest, nearest_path
 
 _NOT_YAML = (yaml.YAMLError, ValueError, RecursionError)
 """Errors of the parser: a date like 2024-13-45 or too long a number is a ValueError, deep nesting ends the stack."""
+
+FileName = Annotated[str, AfterValidator(lambda name: str(Path(name).absolute()) if name else "")]
+"""A file as an absolute path; empty where none is given."""
 
 _A_SETTING = "`vplog config` prints every setting."
 _A_FILE = "`vplog config` prints a pipeline file."

@@ -26,8 +26,8 @@ from vplog.errors import TruthError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.geometry.tum import read_tum
-from vplog.localize.localize import localize_frame
-from vplog.localize.places import opened
+from vplog.maps.localization.localize import localize_frame
+from vplog.maps.localization.places import opened
 from vplog.pipeline import load_pipeline
 from vplog.pipeline import run as run_drive
 

@@ -52,7 +52,7 @@ BLANK = replace(nothing(), thumbnail=np.full((THUMBNAIL_SIDE, THUMBNAIL_SIDE), 7
 
 
 ELSEWHERE = ("onnx", "plugin", "vectors")
-"""Kinds that need a file or a package, tested in tests/networks."""
+"""Kinds that need a file or a package, tested in test_network_places.py and test_plugin.py."""
 
 
 def contract(name: str) -> type[RecogniserContract]:

@@ -15,7 +15,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-import vplog
 from vplog import api
 from vplog.cli import parser, printing
 from vplog.cli.benchmark import add_studies
@@ -27,6 +26,7 @@ from vplog.errors import LogError, VplogError, plural, was_interrupted
 from vplog.execution.cores import available, limited
 from vplog.execution.execution import Execution
 from vplog.storage.urls import without_secrets
+from vplog.version import __version__
 
 if TYPE_CHECKING:
     from vplog.logs import TopicChoice
@@ -289,8 +289,9 @@ def demo(arguments: argparse.Namespace) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    root = Parser(prog="vplog", description=(vplog.__doc__ or "").splitlines()[0])
-    root.add_argument("-V", "--version", action="version", version=f"vplog {vplog.__version__}")
+    about = "From a recorded drive to an optimised trajectory, with loop closures found by bag of bounding boxes."
+    root = Parser(prog="vplog", description=about)
+    root.add_argument("-V", "--version", action="version", version=f"vplog {__version__}")
     common = argparse.ArgumentParser(add_help=False)
     flag(common, "--json", "print one JSON object")
     flag(common, "--debug", "show the traceback of an error")

@@ -1,0 +1,1 @@
+"""Figures against ground truth: of trajectories, closures and retrieved places."""

@@ -1,1 +1,1 @@
-"""Local features of images: how they are found, and where they wait for verification."""
+"""Features of images, by SIFT or by networks that users bring, and where they wait for verification."""

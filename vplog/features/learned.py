@@ -15,8 +15,8 @@ from pydantic import Field
 
 from vplog.data import Bytes, Features, Float32s
 from vplog.errors import LibraryError
+from vplog.features.onnx_model import NetworkInput, NetworkSettings
 from vplog.features.sift import depth_at, thumbnail_of_image
-from vplog.networks.onnx_model import NetworkInput, NetworkSettings
 
 _LENGTH = np.float32(512)
 """Length of a descriptor, as of SIFT's by OpenCV, for which thresholds are meant."""

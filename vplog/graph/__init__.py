@@ -1,0 +1,1 @@
+"""The pose graph: factors and their noise, robust optimisation, covariances, and a certificate of the solution."""

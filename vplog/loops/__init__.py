@@ -1,0 +1,1 @@
+"""Loop closures: candidates, their geometric verification, and poses against landmarks with covariance."""

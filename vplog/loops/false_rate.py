@@ -19,7 +19,6 @@ from vplog.data import Bools, Closures, Floats, Ints, Verdict
 from vplog.features.sift import mirrored
 from vplog.loops.propose import Proposals
 from vplog.loops.verify import verify_between
-from vplog.places.match_probability import conformal_p
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -47,6 +46,12 @@ class FalseRateSettings(Settings):
     certain_pairs: int = Field(default=200, ge=0, le=100_000)
     """Pairs of neighbouring keyframes, most, whose verified poses are held against the odometry between them: how many
     are wrong at so many inliers, with depth or stereo; 0 takes every pose of a right place for right."""
+
+
+def conformal_p(found: Floats | Ints, null: Floats | Ints) -> Floats:
+    """(N,) share of the null sample (K,) that does as well, itself counted (Vovk et al. 2005, section 2.2)."""
+    higher = len(null) - np.searchsorted(np.sort(null), found, "left")
+    return np.asarray((1.0 + higher) / (1.0 + len(null)), np.float64)
 
 
 def evidence(closures: Closures) -> Ints:

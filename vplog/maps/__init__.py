@@ -1,1 +1,1 @@
-"""Maps of many drives: storage, search, joining, merging, export and removal."""
+"""Maps of many drives: storage, search, localisation, joining, merging, export and removal."""

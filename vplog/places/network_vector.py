@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vplog.data import Bytes, Features, Frame, Reference
 from vplog.errors import LibraryError
-from vplog.networks.onnx_model import NetworkSettings
+from vplog.features.onnx_model import NetworkSettings
 from vplog.places.dense import VectorState, unit
 from vplog.places.library_files import RelearnedSettings, keep_references
 

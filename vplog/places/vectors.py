@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from pydantic import model_validator
 
 from vplog.data import Features, Float32s, Ints, Reference
 from vplog.errors import LibraryError
 from vplog.places.dense import VectorIndex, VectorState, nearness, products
 from vplog.places.library_files import RelearnedSettings, keep_references, references_hash
 from vplog.places.network_vector import MAX_DIMENSIONS
+from vplog.settings import FileName
 from vplog.storage.parquet_limits import open_table, read_table
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class VectorsSettings(RelearnedSettings):
 
     kind: Literal["vectors"] = "vectors"
     """Name of the recogniser."""
-    file: str = ""
+    file: FileName = ""
     """A .npy file of (F, D) vectors; one of a pair `queries_descriptors.npy`, `database_descriptors.npy`, or their
     folder; or a .parquet file with stamp_ns, vector and, of several drives, drive."""
     model: str = ""
@@ -51,12 +51,6 @@ class VectorsSettings(RelearnedSettings):
     order: Literal["names", "frames"] = "names"
     """Rows of a .npy file: by the paths of the images as text, 10.jpg before 2.jpg, where the log is a folder of
     images; or the frames as vplog counts them."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _absolute(cls, tree: Any) -> Any:
-        named = isinstance(tree, dict) and isinstance(tree.get("file"), str) and tree["file"]
-        return {**tree, "file": str(Path(tree["file"]).absolute())} if named else tree
 
     def learn(self, references: Iterable[Reference], execution: Execution) -> VectorsState:
         """Nothing to learn. Raises LibraryError where there is no reference, or no file of vectors."""

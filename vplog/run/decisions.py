@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from pydantic import model_validator
 
 from vplog.cache.codecs import closures_codec
 from vplog.cache.steps import step
@@ -20,7 +19,7 @@ from vplog.loops.propose import Proposals
 from vplog.loops.verify import verify_between
 from vplog.run.keyframes import row_of
 from vplog.run.verification import DriveFeatures, calibrated, for_verification, merged
-from vplog.settings import Settings
+from vplog.settings import FileName, Settings
 
 if TYPE_CHECKING:
     from vplog.cache.steps import Steps
@@ -44,14 +43,8 @@ class DecisionSettings(Settings):
 
     LOCATIONS: ClassVar = frozenset({"file"})
 
-    file: str = ""
+    file: FileName = ""
     """A CSV of pairs of keyframes to accept, reject or add: `vplog run --decisions`; report.html writes one."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _absolute(cls, tree: Any) -> Any:
-        named = isinstance(tree, dict) and isinstance(tree.get("file"), str) and tree["file"]
-        return {**tree, "file": str(Path(tree["file"]).absolute())} if named else tree
 
     def check_single_drive(self) -> None:
         """Raises SettingsError: for a computation of several drives, whose keyframes no row or stamp names alone."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -25,7 +24,7 @@ from vplog.results.run_record import CACHE
 from vplog.run.feature_extraction import Extraction, stored_features
 from vplog.run.provenance import reopened
 from vplog.run.reextraction import ReextractedFeatures
-from vplog.storage.json_records import canonical_json
+from vplog.storage.json_records import key_of
 from vplog.storage.scratch import scratch
 
 if TYPE_CHECKING:
@@ -69,7 +68,7 @@ def landmark_key(folder: Path, record: dict[str, Any], settings: DriveSettings) 
         "features": settings.features.identity(), "stereo": settings.stereo.model_dump(mode="json"),
         "verify": settings.verify.model_dump(mode="json"), **code_of(__name__, type(settings.features).__module__),
     }  # fmt: skip
-    return hashlib.sha256(canonical_json(made_from).encode()).hexdigest()
+    return key_of(made_from)
 
 
 def write_drive_landmarks(path: Path, drive: Drive, key: str, execution: Execution) -> None:

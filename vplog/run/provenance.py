@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,7 +13,7 @@ from vplog.cache.code_hash import version
 from vplog.cache.input_hashes import bytes_of, files_of, stat_signature
 from vplog.errors import LogError, ResultError
 from vplog.results import run_record
-from vplog.storage.json_records import canonical_json
+from vplog.storage.json_records import key_of
 from vplog.storage.remote_path import local_copy, located, original, reason
 from vplog.version import __version__
 
@@ -62,8 +61,7 @@ def reopened(
 
 def stat_of(files: Sequence[Path]) -> dict[str, Any]:
     """Length of the files of a log, and a sha256 over their paths, lengths and times: unchanged means the same log."""
-    look = canonical_json(stat_signature(files)).encode()
-    return {"bytes": bytes_of(files), "sha256": hashlib.sha256(look).hexdigest()}
+    return {"bytes": bytes_of(files), "sha256": key_of(stat_signature(files))}
 
 
 def library_of(library: Path | None) -> str:

@@ -25,6 +25,7 @@ from vplog.maps.joining import candidate_drives as candidates
 from vplog.maps.joining import components as component_folders
 from vplog.maps.joining import drive_pairs
 from vplog.maps.joining import join as map_join
+from vplog.maps.joining.inter_session import Candidates, candidates_among, likely_drives, proposed_in, with_proposals
 from vplog.maps.joining.join import read_drives
 from vplog.maps.joining.joint_record import components_in
 from vplog.maps.merge import merge_maps
@@ -32,7 +33,6 @@ from vplog.maps.storage import map_store
 from vplog.pipeline import load_pipeline
 from vplog.results import run_record, tables
 from vplog.results.run_record import read_run_json
-from vplog.sessions.inter_session import Candidates, candidates_among, likely_drives, proposed_in, with_proposals
 
 if TYPE_CHECKING:
     from collections.abc import Callable

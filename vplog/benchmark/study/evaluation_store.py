@@ -5,7 +5,6 @@ Results are stored under a hash of all their inputs, so an interrupted study res
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import permutations
@@ -21,7 +20,7 @@ from vplog.execution.execution import Execution
 from vplog.places.library_files import references_hash
 from vplog.places.reference_choice import LibrarySettings, choose
 from vplog.results.run_record import read_run_json, write_run_json
-from vplog.storage.json_records import canonical_json
+from vplog.storage.json_records import key_of
 
 if TYPE_CHECKING:
     from vplog.benchmark.feature_cache import FeatureFolder
@@ -173,7 +172,7 @@ class Bench:
             "map": self.hashes[evaluation.map],
             "truth": self.truth[evaluation.query, evaluation.map].about,
         }
-        return hashlib.sha256(canonical_json(about).encode()).hexdigest()
+        return key_of(about)
 
     def _stored(self) -> dict[str, dict[str, Any]]:
         if self._done is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import re
 import shutil
@@ -34,7 +33,7 @@ from vplog.execution.execution import Execution, logged_warnings
 from vplog.results.run_record import is_ours, read_run_json, write_run_json
 from vplog.results.staging import check_contents, staged
 from vplog.storage.folders import check_regular
-from vplog.storage.json_records import canonical_json, plain
+from vplog.storage.json_records import key_of, plain
 from vplog.storage.urls import shown
 from vplog.version import __version__
 
@@ -84,7 +83,7 @@ def study(
             known[query, other] = open_truth(of_pair, opened[query], opened[other])
             warnings += check_truth(known[query, other], opened[query], opened[other], min_gap)
             protocols.append(_protocol(known[query, other], (names[query], names[other]), min_gap))
-        hashes = [_hash(hash_inputs(path)) for path in drives]
+        hashes = [key_of(hash_inputs(path)) for path in drives]
         _check_same_drives(out, hashes)
         common = {
             "features": pipeline.features.model_dump(mode="json"),
@@ -112,7 +111,7 @@ def study(
             "seeds": options.seeds,
             "methods": {name: settings.model_dump(mode="json") for name, settings in recognisers.items()},
         }
-        inputs = _hash({**account, "pipeline": pipeline.model_dump(mode="json"), "code": code_of(__name__)})
+        inputs = key_of({**account, "pipeline": pipeline.model_dump(mode="json"), "code": code_of(__name__)})
         work = out / _WORK
         done, files = {}, dict[str, Path]()
         for folder in (out, work):
@@ -284,10 +283,6 @@ def _covered(known: dict[tuple[int, int], Any], opened: Sequence[Any]) -> list[n
     return frames
 
 
-def _hash(tree: Any) -> str:
-    return hashlib.sha256(canonical_json(tree).encode()).hexdigest()
-
-
 def _shown(truth: TruthChoice) -> dict[str, Any]:
     """The choice as it is stored."""
     return {**asdict(truth), "source": shown(truth.source)}
@@ -296,4 +291,4 @@ def _shown(truth: TruthChoice) -> dict[str, Any]:
 def _truth_hash(truth: TruthChoice) -> str:
     """Hash of the choice, and of the files it names."""
     files = [Path(file) for file in {truth.source, *truth.source.split(",")} if Path(file).is_file()]
-    return _hash([_shown(truth), [hash_inputs(file) for file in sorted(files)]])
+    return key_of([_shown(truth), [hash_inputs(file) for file in sorted(files)]])

@@ -1,1 +1,1 @@
-"""Drives of a map that share places, in one pose graph."""
+"""Drives that share places in one pose graph, of a joint run and of a map."""

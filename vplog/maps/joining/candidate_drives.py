@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog.execution.execution import Execution
+from vplog.maps.joining.inter_session import Candidates, candidates_among
 from vplog.maps.search.exact import best_places
 from vplog.maps.search.index import read_column, update_index
 from vplog.maps.search.sequences import PLACES_A_VIEW, drive_credits
 from vplog.maps.storage.damage import reading_drive
-from vplog.sessions.inter_session import Candidates, candidates_among
 from vplog.stages import CodedState, PlaceState
 
 if TYPE_CHECKING:

@@ -25,11 +25,11 @@ from vplog.data import Closures, Odometry
 from vplog.errors import NewerError, ResultError, VplogError
 from vplog.graph.build import parts
 from vplog.graph.refine import Refined, about_odometry
+from vplog.maps.joining.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
 from vplog.maps.joining.joint_record import read_joint, write_joint
 from vplog.maps.storage.damage import DamagedDriveError, damaged_table, reading_drive
 from vplog.maps.storage.layout import folder_name
 from vplog.results import g2o, run_record, tables
-from vplog.sessions.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
 from vplog.storage.json_records import key_of
 from vplog.storage.scratch import put_in_place
 

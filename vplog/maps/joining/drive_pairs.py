@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any
 from vplog.cache.code_hash import code_of
 from vplog.data import SharedReferences
 from vplog.errors import ResultError
+from vplog.maps.joining.inter_session import closures_between, with_shared
 from vplog.maps.joining.members import CameraTrust, Member, camera_trust, keep_features, opened_drive
 from vplog.maps.storage.damage import damaged_table
 from vplog.maps.storage.layout import folder_name, quoted
 from vplog.results import run_record, tables
-from vplog.sessions.inter_session import closures_between, with_shared
 from vplog.storage.json_records import key_of
 from vplog.storage.scratch import replacing
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
 
-_CODE = ("vplog.sessions.inter_session", "vplog.features.extraction", "vplog.features.sift", "vplog.results.tables")
+_CODE = ("vplog.maps.joining.inter_session", "vplog.features.extraction", "vplog.features.sift", "vplog.results.tables")
 """Modules that a ledger depends on, with all that they import. Versions of packages do not count: what they change is
 less than another search of all drives is worth, and drive.json has them."""
 DRIVE_FILES = ("camera.json", "features.parquet")

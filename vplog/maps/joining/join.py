@@ -25,6 +25,7 @@ from vplog.execution.timing import StageTimer
 from vplog.maps.joining import drive_pairs
 from vplog.maps.joining.candidate_drives import candidates_of, places_of
 from vplog.maps.joining.components import Drives, PairLedger, solve_groups
+from vplog.maps.joining.inter_session import DrivePair, likely_pairs
 from vplog.maps.joining.members import CameraTrust, Member, member_of, why_not_joined
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import damaged_table
@@ -32,7 +33,6 @@ from vplog.maps.storage.layout import PICTURES
 from vplog.maps.storage.map_store import Store, reading, writing
 from vplog.pipeline import Pipeline
 from vplog.results import tables
-from vplog.sessions.inter_session import DrivePair, likely_pairs
 
 if TYPE_CHECKING:
     from vplog.maps.joining.drive_pairs import PairTask

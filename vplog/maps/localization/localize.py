@@ -25,7 +25,7 @@ from vplog.stages import EncodedFrame, FrameState, Log, StoredState
 from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
-    from vplog.localize.places import Places
+    from vplog.maps.localization.places import Places
 
 TOP = 10
 """Places that a picture is verified against."""

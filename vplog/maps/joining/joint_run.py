@@ -17,6 +17,8 @@ from vplog.execution.execution import Execution
 from vplog.execution.timing import StageTimer
 from vplog.geometry import tum
 from vplog.loops.verify import Drive, calibration_share, drive_of, no_closures
+from vplog.maps.joining.inter_session import candidates_among, closures_between, likely_pairs, with_shared
+from vplog.maps.joining.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
 from vplog.pipeline import Pipeline, Run
 from vplog.pipeline import run as run_alone
 from vplog.results import g2o, run_record, tables
@@ -25,13 +27,11 @@ from vplog.run import provenance
 from vplog.run.odometry import is_visual
 from vplog.run.reference_library import build_library, check_library
 from vplog.run.run_folder import CacheOptions, staged_run
-from vplog.sessions.inter_session import candidates_among, closures_between, likely_pairs, with_shared
-from vplog.sessions.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
 from vplog.storage.folders import numbered
 
 if TYPE_CHECKING:
     from vplog.graph.joint import Joined
-    from vplog.sessions.joint_graph import Ledgers
+    from vplog.maps.joining.joint_graph import Ledgers
     from vplog.stages import PlaceState
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from vplog.data import Keyframes, Odometry
 from vplog.geometry import se3
-from vplog.localize.trajectory import join_by_odometry
+from vplog.maps.localization.trajectory import join_by_odometry
 from vplog.pipeline import Pipeline
 
 STEP = se3.exp(np.array([0.0, 0.0, 0.02, 1.0, 0.0, 0.0]))

@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 
 from vplog.data import Float32s, Floats, Ints
+from vplog.loops.false_rate import conformal_p
 
 _LEAST = 20
 """Queries, at least, from which rates can be learned: one more or less then changes them by 5 %."""
@@ -60,12 +61,6 @@ def best_places(row: Float32s, extent: int) -> Floats:
         found[place] = score[at]
         score[max(at - extent, 0) : at + extent + 1] = -np.inf
     return found
-
-
-def conformal_p(found: Floats | Ints, null: Floats | Ints) -> Floats:
-    """(N,) share of the null sample (K,) that does as well, itself counted (Vovk et al. 2005, section 2.2)."""
-    higher = len(null) - np.searchsorted(np.sort(null), found, "left")
-    return np.asarray((1.0 + higher) / (1.0 + len(null)), np.float64)
 
 
 def null_probabilities(found: Floats, null: Floats) -> Floats:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from tests.networks.small import LOCAL_YAML, corners
+from tests.features.small_networks import LOCAL_YAML, corners
 from tests.places.pictures import texture
 from vplog.data import Reference, Verdict
 from vplog.errors import LibraryError, VplogError

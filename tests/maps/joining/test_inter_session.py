@@ -13,7 +13,7 @@ from vplog.data import Closures, Verdict
 from vplog.execution.execution import Execution
 from vplog.graph.joint import JoinSettings
 from vplog.loops.propose import Proposals
-from vplog.sessions import inter_session
+from vplog.maps.joining import inter_session
 
 if TYPE_CHECKING:
     import pytest

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from tests.networks.small import SIZE, YAML, block_means, block_means_of
+from tests.features.small_networks import SIZE, YAML, block_means, block_means_of
 from tests.places.pictures import reference
 from vplog import logs
 from vplog.benchmark.compare import CompareOptions, compare
@@ -19,8 +19,8 @@ from vplog.benchmark.recogniser_specs import read_method
 from vplog.errors import LibraryError, SettingsError, VplogError
 from vplog.evaluate.place_truth import TruthChoice
 from vplog.execution.execution import Execution
+from vplog.features import onnx_model
 from vplog.features.sift import SiftSettings
-from vplog.networks import onnx_model
 from vplog.pipeline import Pipeline, pipeline_from
 from vplog.places.network_vector import OnnxSettings
 from vplog.places.vectors import VectorsSettings

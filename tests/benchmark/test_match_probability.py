@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vplog.places.match_probability import best_places, conformal_p, match_probabilities, place_extent
+from vplog.benchmark.match_probability import best_places, match_probabilities, place_extent
+from vplog.loops.false_rate import conformal_p
 
 Q, M = 300, 400
 

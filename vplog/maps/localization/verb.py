@@ -15,9 +15,9 @@ from vplog.data import Keyframes, Trajectory, Verdict
 from vplog.errors import LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3, tum
-from vplog.localize.localize import TOP, LocalizedPicture, localize_log
-from vplog.localize.places import Places, opened
-from vplog.localize.trajectory import join_by_odometry
+from vplog.maps.localization.localize import TOP, LocalizedPicture, localize_log
+from vplog.maps.localization.places import Places, opened
+from vplog.maps.localization.trajectory import join_by_odometry
 from vplog.maps.search.query import select_views
 from vplog.results.tables import TableMetadata, write_localized
 from vplog.storage.scratch import check_file_output

@@ -1,1 +1,0 @@
-"""Several drives in one pose graph."""
