@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.benchmarks.worlds import draw, make
+from tests.benchmarks import back_ends
+from tests.benchmarks.worlds import draw, make, world
 from tests.graph.drive import CLOSURE_SIGMA, ODOMETRY_SIGMA, Drive, position_error, ring
 from vplog.geometry import se3
 from vplog.graph import hypotheses
@@ -199,3 +200,9 @@ def test_odometry_is_no_noisier_than_what_it_measures() -> None:
     claimed = 0.1 * ODOMETRY_SIGMA[[0, 3]]
     assert sigmas.rotation <= 1.001 * motion[0] / claimed[0]
     assert sigmas.translation <= 1.001 * motion[1] / claimed[1]
+
+
+def test_false_closures_of_a_level_robot_are_no_likelier_true_for_being_level() -> None:
+    """55 closures, all an aisle off: that none of them tilts the robot is no sign that they are true."""
+    aisles = world(1795649869)
+    assert not back_ends.vplog_run(aisles).kept.any()

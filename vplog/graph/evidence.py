@@ -38,6 +38,8 @@ _RECENT = 10
 """Last members of a family by which the next one is predicted."""
 _SAMPLE = 200
 """Poses all pairs of which are looked at."""
+_SAMPLE_OF_TILTS = 50
+"""Poses by whose pairs it is seen how far the drive's poses turn against each other."""
 _CONCENTRATIONS = (2.0 ** np.arange(-4, 13)).tolist()
 """Concentrations of the Chinese restaurant process of families: from one family to as many as there are runs."""
 _TAIL = 3.0
@@ -126,7 +128,7 @@ def log_room(graph: PoseGraph, places: Floats) -> float:
     if len(loops) <= 2 * len(axes):
         return box
     spread = np.cov(se3.log(forward(graph, loops)[2])[:, axes].T) + np.linalg.inv(informed(graph, loops)).mean(0)
-    spread += np.diag(_of_a_view(places[:, :3, 3])[axes] ** 2)
+    spread += np.diag(_of_a_view(places)[axes] ** 2)
     of_views = 0.5 * (len(axes) * (_LOG_2PI + 1.0) + float(np.linalg.slogdet(spread)[1]))  # entropy of a Gaussian
     variance = np.array([np.diag(spread)[axes < 3].mean(), np.diag(spread)[axes >= 3].mean()])
     gap = int(np.abs(graph.a[loops].astype(np.int64) - graph.b[loops]).min())
@@ -149,10 +151,15 @@ def _share_near(places: Floats, variance: Floats, gap: int) -> float:
 
 
 def _of_a_view(places: Floats) -> Floats:
-    """Sigmas (6,) of the relative poses, rad and m, from which views of one place are recognised at least."""
-    step = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    """Sigmas (6,) of the relative poses, rad and m, from which views of one place are recognised at least, and which
+    poses (N, 4, 4) of the drive have: a robot on wheels never tilts against itself by what features stand."""
+    step = np.linalg.norm(np.diff(places[:, :3, 3], axis=0), axis=1)
     reach = _BESIDE * float(np.median(step)) if len(step) else 0.0
-    return np.repeat([_VIEW_RAD, max(reach, _VIEW_M)], 3)
+    some = places[:: -(-len(places) // _SAMPLE_OF_TILTS)]
+    one, two = np.triu_indices(len(some), 1)
+    relative = se3.log(se3.between(some[one], some[two]))
+    most = np.sqrt((relative**2).mean(0)) if len(one) else np.full(6, np.inf)
+    return np.minimum(np.repeat([_VIEW_RAD, max(reach, _VIEW_M)], 3), most)
 
 
 def runs(graph: PoseGraph, loops: Ints) -> Iterator[Ints]:
