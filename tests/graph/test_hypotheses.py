@@ -170,11 +170,12 @@ def test_a_pair_of_poses_is_no_surprise_where_most_pairs_see_the_same(room: bool
     """A hand-held camera within a room crosses its own views all the time, a vehicle hardly ever does."""
     random = np.random.default_rng(4)
     positions = random.normal(size=(300, 3)) if room else 2.0 * np.arange(300)[:, None] * [1.0, 0.0, 0.0]
+    poses = se3.pose(se3.so3_exp(random.normal(size=(300, 3))), np.asarray(positions, np.float64))
     graph = ring(300, 60, seed=4).graph
     loops = np.flatnonzero(is_loop(graph))
     measured = graph.a_from_b.copy()
     measured[loops] = se3.exp(random.normal(size=(60, 6)) * np.repeat([0.2, 2.0], 3))
-    found = log_room(replace(graph, a_from_b=measured), se3.pose(np.eye(3), np.asarray(positions, np.float64)))
+    found = log_room(replace(graph, a_from_b=measured), poses)
     reach = 3.0 * np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
     spread = 3.0 * math.log(0.2**2 + 0.2**2) + 3.0 * math.log(4.0 + reach**2)
     of_views = 0.5 * (6.0 * (math.log(2.0 * math.pi) + 1.0) + spread)
