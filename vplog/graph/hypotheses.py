@@ -51,6 +51,8 @@ a true one good: Kass and Raftery, Bayes Factors, 1995, call it very strong. Wha
 of them is used where the odds are even."""
 _FLIPS, _MOST_FLIPS = 4, 10
 """Runs of either kind that are tried at once, and turns."""
+_COMPARED = 4
+"""Likeliest sets that are compared at the same sigmas."""
 _LEAST_FAMILY = 3
 """Closures of a family that is tried as a whole; runs are smaller."""
 _GROWTH = 30
@@ -85,6 +87,7 @@ def best_hypothesis(
     found: list[Hypothesis] = []
     if isinstance(optimiser, GncSettings):
         found = _searched(claimed, optimiser, loops, chain)
+        found += _at_the_sigmas_of_others(claimed, found)
     else:
         solution = optimiser(graph)
         kept = np.where(solution.weight > 0.5, 1.0, 0.0)
@@ -124,16 +127,18 @@ def _searched(claimed: Factors, gnc: GncSettings, loops: Ints, chain: OdometryCh
             found += _from_start(claimed, gnc, sigmas, likely)
             tried += [one.weight[loops] > 0 for one in found[-2:]]
     best = max(found, key=lambda one: one.log_evidence, default=None)
-    if best is not None and best.weight.all() and max(best.sigmas) <= _AS_CLAIMED:  # all agree, from every start
-        if not best.sigmas.differ(Sigmas(), math.log(_AS_CLAIMED)):
-            return found
-        found.append(_improved(claimed, best))
-        if found[-1].weight.all():  # and better than claimed, without any of them likelier to be false
-            return found
-    of_families = []
+    all_agree = best is not None and best.weight.all() and max(best.sigmas) <= _AS_CLAIMED  # from every start
+    if best is not None and all_agree and not best.sigmas.differ(Sigmas(), math.log(_AS_CLAIMED)):
+        return found
     sigmas = likely_modes[0][0]
     starts = [sigmas, Sigmas()] if sigmas.differ(Sigmas(), math.log(_AS_CLAIMED)) else [sigmas]
     families = [one for sigmas in starts for one in _families(graph, loops, sigmas)]
+    whole = [loops[one] for one in families if one.sum() >= _LEAST_FAMILY]
+    if best is not None and all_agree:
+        found.append(_improved(claimed, best, whole))
+        if found[-1].weight.all():  # and better than claimed, without any of them likelier to be false
+            return found
+    of_families = []
     for likely in families:
         if _is_new(likely, tried):
             weight = np.ones(len(graph.a))
@@ -146,12 +151,24 @@ def _searched(claimed: Factors, gnc: GncSettings, loops: Ints, chain: OdometryCh
     best = _likeliest(found)
     if all((one.weight[loops] == 0).mean() <= _ALIKE for one in best):  # next to all agree
         return found + [_improved(claimed, one) for one in best]
-    whole = [loops[one] for one in families if one.sum() >= _LEAST_FAMILY]
     grown = _attempted(lambda: [_grown(claimed, sigmas, chain)])
     found += [_improved(claimed, one, whole) for one in [*best, *grown]]
     for one in _likeliest(found):
         found += _attempted(lambda one=one: _tested(claimed, gnc, one.weight, one.poses, one.sigmas))
     return found
+
+
+def _at_the_sigmas_of_others(claimed: Factors, found: list[Hypothesis]) -> list[Hypothesis]:
+    """The likeliest sets, each with the sigmas of the others: false closures, too, tell of the noise by how well those
+    of a run agree, and sets compare fairly where they share their sigmas."""
+    sets: list[Hypothesis] = []
+    for one in sorted(found, key=lambda one: -one.log_evidence):
+        if len(sets) < _COMPARED and not any((one.weight == other.weight).all() for other in sets):
+            sets.append(one)
+    pairs = [(one, other.sigmas) for one in sets for other in sets if one.sigmas.differ(other.sigmas, _STEADY)]
+    return [
+        two for one, s in pairs for two in _attempted(lambda one=one, s=s: [_judged(claimed, one.weight, one.poses, s)])
+    ]
 
 
 def _likeliest(found: list[Hypothesis]) -> list[Hypothesis]:
