@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from conftest import Said
-
+    from tests.conftest import Said
     from vplog.demo.record import Drive
     from vplog.stages import PlaceState
 
