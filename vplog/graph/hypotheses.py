@@ -127,15 +127,15 @@ def _searched(claimed: Factors, gnc: GncSettings, loops: Ints, chain: OdometryCh
             found += _from_start(claimed, gnc, sigmas, likely)
             tried += [one.weight[loops] > 0 for one in found[-2:]]
     best = max(found, key=lambda one: one.log_evidence, default=None)
-    all_agree = best is not None and best.weight.all() and max(best.sigmas) <= _AS_CLAIMED  # from every start
-    if best is not None and all_agree and not best.sigmas.differ(Sigmas(), math.log(_AS_CLAIMED)):
+    agreed = best if best is not None and best.weight.all() and max(best.sigmas) <= _AS_CLAIMED else None
+    if agreed is not None and not agreed.sigmas.differ(Sigmas(), math.log(_AS_CLAIMED)):
         return found
     sigmas = likely_modes[0][0]
     starts = [sigmas, Sigmas()] if sigmas.differ(Sigmas(), math.log(_AS_CLAIMED)) else [sigmas]
     families = [one for sigmas in starts for one in _families(graph, loops, sigmas)]
     whole = [loops[one] for one in families if one.sum() >= _LEAST_FAMILY]
-    if best is not None and all_agree:
-        found.append(_improved(claimed, best, whole))
+    if agreed is not None:
+        found.append(_improved(claimed, agreed, whole))
         if found[-1].weight.all():  # and better than claimed, without any of them likelier to be false
             return found
     of_families = []

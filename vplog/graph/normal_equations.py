@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 _LEAST_SHARE = 4096
-"""Poses or edges that a thread takes at least, half a millisecond."""
+"""Poses or edges that a thread takes at least, some milliseconds."""
 _BY_THREAD = 4
 """Shares for each thread, so that none waits long for another that was held up."""
 
