@@ -195,6 +195,15 @@ def test_a_damaged_drive_is_computed_again_and_stops_no_other(
     assert any("drive-2 is damaged and left out" in line for line in told["warnings"])
 
 
+def test_the_folder_a_batch_is_called_in_is_not_read(
+    whole: Path, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may be a home with a million files, or one with a name that no record can hold."""
+    (tmp_path / "\udcff").touch()
+    monkeypatch.chdir(tmp_path)
+    assert run_batch(logs, whole, load_pipeline("default", QUICK))["failed"] == 0
+
+
 def test_another_library_or_writer_is_refused(whole: Path, logs: list[Path], tmp_path: Path) -> None:
     pipeline = load_pipeline("default", QUICK)
     before = files(whole)

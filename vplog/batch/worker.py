@@ -97,7 +97,7 @@ class Drive:
 
 def made_by() -> dict[str, Any]:
     """Code and packages of this machine, as drive.json has them: a drive is computed where they are the batch's."""
-    return {"code": layout.code_hash(), "versions": provenance.head(Pipeline(), Path(), 1)["versions"]}
+    return {"code": layout.code_hash(), "versions": provenance.versions()}
 
 
 def compute_drive(task: Task) -> Outcome:
