@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from vplog.data import Bools, Floats, Int32s, Ints, Trajectory
 from vplog.geometry import se3
@@ -164,7 +164,7 @@ def bracketing(stamp_ns: Ints, at_ns: Ints) -> tuple[Ints, Ints, Bools]:
 
 def _near(query: Floats | Ints, match: Floats | Ints, distance_m: float) -> Iterable[Int32s]:
     """For each query the increasing rows of `match` within the distance, one query at a time: not Q x M."""
-    tree = KDTree(match)
+    tree = scipy.spatial.KDTree(match)
     for position in query:
         yield np.array(tree.query_ball_point(position, distance_m, return_sorted=True), np.int32)
 

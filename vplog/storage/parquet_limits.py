@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from vplog.errors import NewerError
@@ -228,6 +227,8 @@ def read_table(path: Path, file: pq.ParquetFile, columns: Collection[str] | None
     texts = [name for name in names if _is_text(schema.field(name).type)]
     if not texts:
         return file.read(columns=names)
+    import pyarrow.compute as pc  # a tenth of a second, which most verbs need not spend
+
     options: dict[str, Any] = {"read_dictionary": texts, "page_checksum_verification": True}
     with pq.ParquetFile(path, metadata=file.metadata, **options) as numbered:
         table = numbered.read(columns=names)
