@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from vplog.demo.record import Drive
 
 # a check of a change must not fail by the luck of the draw: the same inputs each time, and on
-# `HYPOTHESIS_PROFILE=anew` others each time, for those who look for what is not yet known
-settings.register_profile("same", derandomize=True, deadline=None)
+# `HYPOTHESIS_PROFILE=anew` others each time and twice as many, for those who look for what is not yet known
+settings.register_profile("same", derandomize=True, deadline=None, max_examples=50)
 settings.register_profile("anew", print_blob=True, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
