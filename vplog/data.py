@@ -106,6 +106,30 @@ class Gps:
 
 
 @dataclass(frozen=True, eq=False)
+class Lidar:
+    """A lidar whose scans the log holds."""
+
+    name: str
+    """Its topic."""
+    stamp_ns: Ints
+    """(L,) of its scans, increasing."""
+    body_from_lidar: Floats
+    """(4, 4)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One turn of a lidar."""
+
+    stamp_ns: int
+    """As its message has it: of the first point, the last or one between."""
+    points: Floats
+    """(K, 3) m in the lidar's frame, finite."""
+    seconds: Floats | None
+    """(K,) s after `stamp_ns` at which each was measured; None where that is unknown."""
+
+
+@dataclass(frozen=True, eq=False)
 class Keyframes:
     """The frames that become nodes."""
 

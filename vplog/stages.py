@@ -58,6 +58,15 @@ class Log(Protocol):
         """Whether its frames come with depth or with a right image."""
         ...
 
+    def lidar(self) -> data.Lidar | None:
+        """The lidar that may give the odometry; None where there is none, or it is not needed."""
+        ...
+
+    def scans(self, stamp_ns: data.Ints) -> Iterator[data.Scan]:
+        """The lidar's scans with these stamps, in order of time, one at a time; those that do not decode are left out
+        and counted."""
+        ...
+
     def gps(self) -> data.Gps | None: ...
 
     def truth(self) -> data.Trajectory | data.Gps | None:

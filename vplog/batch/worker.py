@@ -142,9 +142,10 @@ def _compute(task: Task, path: Path) -> tuple[dict[str, Any], str, dict[str, Any
 
 
 def _is_pictures(log: Log) -> bool:
-    """Whether a log is a folder of images without odometry, or depth that gives one: these can be found again in a map,
-    and no more than that."""
-    return log.file_names() is not None and log.odometry() is None and not gives_visual(log)
+    """Whether a log is a folder of images without odometry, or depth or scans that give one: these can be found again
+    in a map, and no more than that."""
+    computed = gives_visual(log) or log.lidar() is not None
+    return log.file_names() is not None and log.odometry() is None and not computed
 
 
 def _write_pictures(task: Task, path: Path, log: Log, execution: Execution) -> dict[str, Any]:

@@ -124,6 +124,11 @@ def _fit(camera: Camera, matrix: Floats, calibration: CalibrationMessage, notes:
     return replace(camera, matrix=resized(x, y) @ matrix)
 
 
+def body_of_lidar(tree: FrameTree, lidar: str) -> str:
+    """The body's frame where a lidar in this frame gives the odometry: base_link, else the lidar's own."""
+    return _BODY if _BODY in tree else lidar
+
+
 def body_from_camera(tree: FrameTree, body: str, frame: str, notes: Notes, ahead: bool = False) -> Floats:
     """(4, 4) through the static transforms; without a chain the identity, noted where that is a guess, or, with
     `ahead`, a camera that looks along x. `body` is the odometry's child frame, empty where its type has none; `frame`

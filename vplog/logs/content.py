@@ -36,6 +36,9 @@ class Content:
     """Places of all messages of the images' topic, in the order of the file: a video decodes in that order alone."""
     stream_rows: Ints
     """(F,) which of them the images are."""
+    scan_ns: Ints
+    """(L,) of the lidar's scans, increasing."""
+    scan_places: list[Place]
     companions: dict[str, list[Place | None]]
     """Places of the `depth` and `right` images and of the `mask` of each."""
     calibrations: list[CalibrationMessage]
@@ -105,6 +108,8 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     sources = rank_sources(found, read.images["image"].finish(Notes())[0])
     rates_hz = read.rates_hz()
     chosen = chosen.with_odometry(choose_odometry(sources, chosen, notes))
+    if chosen.odometry in found and found[chosen.odometry].odometry is not None:
+        chosen = replace(chosen, lidar=None)
     sources = [(replace(one, used=source == chosen.odometry), source) for one, source in sources]
     read.poses = {source: track for source, track in read.poses.items() if source == chosen.odometry}
     for (reason, topic), runs in read.lost.items():
@@ -114,6 +119,7 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     if tree.dropped:
         notes.add(f"{plural(tree.dropped, 'static transform')} with NaN or without a rotation left out.")
     stamp_ns, places, rows = read.images["image"].finish(notes)
+    scan_ns, scan_places, _ = read.images["lidar"].finish(notes)
     companions = {}
     for name in ("depth", "right", "mask"):
         other_ns, other_places, _ = read.images[name].finish(notes)
@@ -142,6 +148,7 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     calibrations = read.calibrations(chosen.camera_info, "image", notes)
     right_calibration = next(iter(read.calibrations(chosen.right_info, "right", notes)), None)
     return Content(
-        stamp_ns, places, read.images["image"].stream, rows, companions, calibrations, right_calibration, odometry,
-        frames, gps, tree, read.skew_ms(), chosen, [source for source, _ in sources], rates_hz,
+        stamp_ns, places, read.images["image"].stream, rows, scan_ns, scan_places, companions, calibrations,
+        right_calibration, odometry, frames, gps, tree, read.skew_ms(), chosen, [source for source, _ in sources],
+        rates_hz,
     )  # fmt: skip

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 _HEADER = 12
 """Bytes before the frame_id of a message with a header: encapsulation (CDR) or sequence number (ROS 1), and stamp."""
-PARTS = ("mask", "right", "depth", "image")
-"""Image topics of a selection; what is several of them is the last."""
+PARTS = ("lidar", "mask", "right", "depth", "image")
+"""Topics of images and scans of a selection; what is several of them is the last."""
 PATH = "nav_msgs/Path"
 """The type whose messages hold all poses up to then."""
 _TOGETHER = 1024

@@ -18,6 +18,7 @@ from vplog.logs.frames import ImageReader, RecordedFrame, size_of
 from vplog.logs.masks import masks_of
 from vplog.logs.odometry_sources import PROPERTIES, is_truth
 from vplog.logs.rectification import CHECKED_FRAMES, MOST_ROWS_PX, NoPairError, Side, pair_of, row_error_px
+from vplog.logs.scans import ScanReader
 from vplog.logs.stamps import rows_of
 from vplog.logs.topic_candidates import read_candidates
 from vplog.logs.topic_selection import Candidate, TopicChoice, select, wheel_options
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from vplog.data import Bytes, Camera, Gps, Ints, Odometry
+    from vplog.data import Bytes, Camera, Gps, Ints, Lidar, Odometry, Scan
     from vplog.logs.content import Content
     from vplog.logs.formats.container import Channel, Container, Contents
     from vplog.logs.formats.loss_account import Loss
@@ -113,6 +114,22 @@ class RecordedLog:
     def has_depth(self) -> bool:
         return self._pair is not None or self._depth is not None
 
+    def lidar(self) -> Lidar | None:
+        return None if self._sidecar.odometry is not None else self._scans.lidar(self._selection.image is not None)
+
+    def scans(self, stamp_ns: Ints) -> Iterator[Scan]:
+        """Raises LogError where a stamp is not one of the lidar's."""
+        return self._scans.scans(stamp_ns, self.name)
+
+    @cached_property
+    def _scans(self) -> ScanReader:
+        return ScanReader(self._container, self._content, self._notes)
+
+    @property
+    def _body(self) -> str:
+        """Frame of the body, empty where nothing names it."""
+        return self._content.body or self._scans.body
+
     def gps(self) -> Gps | None:
         return self._content.gps
 
@@ -139,6 +156,8 @@ class RecordedLog:
         wheels = [c.channel for c in self._candidates if c.count]
         given += [f"{needs} make odometry of {one.topic}" for one in wheels if (needs := wheel_options(one))]
         given += ["--odometry visual needs a calibrated camera with depth or a stereo pair"]
+        clouds = [c.channel.topic for c in self._candidates if c.role == "lidar" and c.count]
+        given += [f"--odometry lidar takes it from {clouds[0]}"] if clouds else []
         return "; ".join([*given, "--odometry-file takes poses from a file; `vplog library` needs none"]) + "."
 
     def _check_images(self) -> None:
@@ -211,13 +230,15 @@ class RecordedLog:
         camera = camera_of(image.topic, calibration, size, notes)
         for masks in self._masks:
             masks.check(content.stamp_ns.tolist(), size, notes)
-        named = content.body and frame and content.tree.between(content.body, frame) is not None
+        body = self._body
+        named = body and frame and content.tree.between(body, frame) is not None
+        visual = camera.matrix is not None and self._selection.has_depth
         if known is not None and known.body_from_camera is not None and not named:
             camera = replace(camera, body_from_camera=known.body_from_camera)
-        elif self.odometry() is not None or (camera.matrix is not None and self._selection.has_depth):
-            ahead = self.odometry() is None  # it is visual odometry then
+        elif self.odometry() is not None or content.chosen.lidar is not None or visual:
+            ahead = self.odometry() is None  # it is computed then
             ahead |= any(source.used and source.kind in ("gps", "twist") for source in content.sources)
-            placed = body_from_camera(content.tree, content.body, frame, notes, ahead)
+            placed = body_from_camera(content.tree, body, frame, notes, ahead)
             camera = replace(camera, body_from_camera=placed)
         return camera, frame
 

@@ -13,11 +13,14 @@ other parts the first by these rules does, unless TopicChoice names another:
   those with the image's frame_id: longest namespace in common, then the same frame_id, calibrated, most messages, name;
 - odometry: the source with the highest score once the log is read (`odometry_sources.py`): pose topics, and tf, whose
   chain from its root to the body is taken;
-- gps: sentences of NMEA last, then most messages, then name.
+- gps: sentences of NMEA last, then most messages, then name;
+- lidar: clouds that are another sensor's or were computed by their name last, then most messages, then name. It is read
+  where it is requested as the odometry, or no topic of poses or velocities is there.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -37,9 +40,11 @@ if TYPE_CHECKING:
 
 EVERY_IMAGE = "*"
 """Choice of all images of a folder and of the folders in it, whatever their names and sizes."""
-SOURCES = ("twist", "gps", "truth", "visual")
+SOURCES = ("twist", "gps", "truth", "visual", "lidar")
 """Odometry that no topic is chosen for: velocities added up, positions of fixes, the ground truth of a data set, and
-visual odometry, which a run computes."""
+that of the images and of a lidar, which a run computes."""
+_NO_LIDAR = re.compile(r"depth|camera|stereo|radar|map|cluster|obstacle|segment|ground|filtered", re.IGNORECASE)
+"""Words in the names of clouds of other sensors, and of what was computed from a lidar's."""
 
 
 class TopicChoice(Settings):
@@ -54,7 +59,7 @@ class TopicChoice(Settings):
     camera_info: str | None = None
     """Topic of the camera's calibration; an empty string uses none."""
     odometry: str | None = None
-    """Topic of the odometry, or a source of SOURCES; an empty string uses none."""
+    """Topic of the odometry, or of a lidar that gives it, or a source of SOURCES; an empty string uses none."""
     odometry_file: Path | None = None
     """TUM file of poses beside the log that is the odometry: of the body, or of the camera where the log's static
     transforms have no base_link; its clock is that of the images' stamps."""
@@ -107,7 +112,7 @@ class Candidate:
     """Whether images of its encoding can be decoded to grey."""
 
 
-_PARTS = ("image", "depth", "camera_info", "odometry", "gps", "right", "right_info", "imu", "mask")
+_PARTS = ("image", "depth", "camera_info", "odometry", "gps", "right", "right_info", "imu", "mask", "lidar")
 
 
 @dataclass(frozen=True)
@@ -125,6 +130,8 @@ class Selection:
     imu: Channel | None = None
     """The IMU whose gyroscope turns velocities, where these are the odometry."""
     mask: Channel | None = None
+    lidar: Channel | None = None
+    """The lidar that gives the odometry, where no topic does."""
     sources: tuple[Channel, ...] = ()
     """Topics that may be the odometry; the transforms over time are one source, named by the largest topic."""
     kind: str = ""
@@ -198,15 +205,20 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
             calibration = _calibration(image, usable) if choice.camera_info is None else pick("camera_info")
     mask = pick("mask", "depth", image=image) if choice.mask else None
     asked = choice.odometry if choice.odometry_file is None else ""
-    named = asked in SOURCES and all(c.channel.topic != asked for c in candidates)
-    kind = "" if asked is None else asked if named else "topic"
+    clouds = [c for c in usable if c.role == "lidar"]
+    scanned = [c for c in clouds if c.channel.topic == asked]
+    named = bool(scanned) or (asked in SOURCES and all(c.channel.topic != asked for c in candidates))
+    kind = "lidar" if scanned else "" if asked is None else asked if named else "topic"
     requested = pick("odometry", "tf") if asked and not named else None
     geometry = {c.channel: factors for c in candidates if (factors := _geometry(c, choice))}
     sources = _sources(usable, kind, requested, geometry)
     turned = kind == "twist" or all(short_type(c.channel.type) in (*TWISTS, *GEOMETRY) for c in sources)
     imu = pick("imu") if sources and turned else None
     gps = pick("gps", key=lambda c: short_type(c.channel.type) == NMEA)
-    each = zip(_PARTS, (image, depth, calibration, requested, gps, right, right_info, imu, mask), strict=True)
+    lidar = None
+    if kind == "lidar" or (not kind and all(c.role == "tf" for c in sources)):
+        lidar = min(scanned or clouds, key=lambda c: bool(_NO_LIDAR.search(c.channel.topic)), default=None)
+    each = zip(_PARTS, (image, depth, calibration, requested, gps, right, right_info, imu, mask, lidar), strict=True)
     found = {part: c.channel for part, c in each if c is not None}
     static = tuple(sorted(c.channel for c in candidates if c.role == "tf_static"))
     moving = tuple(c.channel for c in usable if c.role == "tf")

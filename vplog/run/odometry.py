@@ -1,11 +1,11 @@
-"""The odometry of a run: the log's, or where it has none, or visual odometry was requested, that of its images."""
+"""The odometry of a run: the log's, or where it has none, or it is requested, that of its images or of its lidar."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from vplog.errors import LogError
 from vplog.geometry.masking import masked
 from vplog.run.feature_extraction import image_topics
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
+from vplog.run.lidar_odometry import lidar_odometry, range_of
 from vplog.run.visual_odometry.visual import visual_odometry
 
 if TYPE_CHECKING:
@@ -29,6 +30,8 @@ _UNCALIBRATED = (
     "Camera %s is not calibrated, so no closure gets a metric pose: the trajectory is the odometry's. "
     "Record its camera_info, or name it with --camera-info-topic."
 )
+_SAMPLES = 8
+"""Scans over the drive by which the range of the lidar is chosen."""
 _NAMED = 4
 """Breaks that are named."""
 
@@ -54,13 +57,19 @@ def gives_visual(log: Log) -> bool:
     return False
 
 
-def is_visual(log: Log, topics: TopicChoice) -> bool:
-    """Whether the odometry is that of the images. Raises LogError where there is none at all."""
+def source_of(log: Log, topics: TopicChoice) -> Literal["log", "visual", "lidar"]:
+    """What the odometry is of. Raises LogError where there is none at all.
+
+    Unasked, images come before a lidar: they need no transforms to a second sensor and no extra to be installed, so
+    that a log gives one result everywhere; and a cloud may be a depth camera's, which registers worse.
+    """
     odometry = log.odometry()
     if odometry is not None and len(odometry.stamp_ns) > 1:
-        return False
+        return "log"
     if topics.odometry in (None, "visual") and gives_visual(log):
-        return True
+        return "visual"
+    if topics.odometry != "visual" and log.lidar() is not None:
+        return "lidar"
     what = "has no odometry, and a trajectory is built on it"
     if topics.odometry == "visual":
         what = "gives no visual odometry, which needs a calibrated camera with depth images or a stereo pair"
@@ -69,10 +78,11 @@ def is_visual(log: Log, topics: TopicChoice) -> bool:
 
 def odometry_of(log: Log, topics: TopicChoice, steps: Steps) -> Odometry:
     """The odometry of a drive. Raises LogError where there is none."""
-    odometry, visual = log.odometry(), is_visual(log, topics)
-    if visual or odometry is None:
-        return steps(by_images, log, topics.odometry is None, steps.cache.inputs, image_topics(topics))
-    return odometry
+    odometry, source = log.odometry(), source_of(log, topics)
+    if source == "log" and odometry is not None:
+        return odometry
+    compute = by_lidar if source == "lidar" else by_images
+    return steps(compute, log, topics.odometry is None, steps.cache.inputs, image_topics(topics))
 
 
 @step("odometry", lambda *_: json_codec(_from_plain, _plain), lambda log, *_: len(log.stamps()), ("log",))
@@ -87,7 +97,28 @@ def by_images(log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], *
             f"{log.name}: no two of {len(stamp_ns)} frames could be tracked: too few corners with depth, or too little "
             "in common from one frame to the next. --odometry-file takes poses from a file."
         )
-    _log_breaks(odometry, stamp_ns)
+    _log_breaks("Visual odometry", odometry, stamp_ns, "frames")
+    return odometry
+
+
+@step("odometry", lambda *_: json_codec(_from_plain, _plain), lambda log, *_: len(log.lidar().stamp_ns), ("log",))
+def by_lidar(log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], *, execution: Execution) -> Odometry:
+    """The odometry of the lidar, its breaks noted. Raises LogError where no two scans match."""
+    lidar = log.lidar()
+    if lidar is None:
+        raise LogError(f"{log.name} has no lidar. {log.without_odometry()}")
+    if unasked:
+        _log.warning("The log has no odometry, so that of its lidar %s is used (--odometry lidar).", lidar.name)
+    stamp_ns = lidar.stamp_ns
+    range_m = range_of(log.scans(stamp_ns[:: max(len(stamp_ns) // _SAMPLES, 1)]))
+    scans = execution.counted("odometry", log.scans(stamp_ns), len(stamp_ns))
+    odometry = lidar_odometry(scans, range_m, lidar)
+    if odometry is None:
+        raise LogError(
+            f"{log.name}: no two of {len(stamp_ns)} scans of {lidar.name} match: too few points, or too little in "
+            "common from one scan to the next. --odometry-file takes poses from a file."
+        )
+    _log_breaks(f"Odometry of {lidar.name}", odometry, stamp_ns, "scans")
     return odometry
 
 
@@ -104,9 +135,10 @@ def _decoded(log: Log, stamp_ns: np.ndarray, execution: Execution) -> Iterator[F
     return (frame for frame in execution.counted("odometry", frames, len(stamp_ns)) if frame is not None)
 
 
-def _log_breaks(odometry: Odometry, stamp_ns: np.ndarray) -> None:
+def _log_breaks(what: str, odometry: Odometry, stamp_ns: np.ndarray, of: str) -> None:
+    """Warn of lost frames or scans, whose stamps are given, and of breaks."""
     if lost := len(stamp_ns) - len(odometry.stamp_ns):
-        _log.warning("Visual odometry lost its track in %d of %d frames.", lost, len(stamp_ns))
+        _log.warning("%s lost its track in %d of %d %s.", what, lost, len(stamp_ns), of)
     breaks = odometry.breaks
     if breaks is None or not len(breaks):
         return
@@ -114,14 +146,14 @@ def _log_breaks(odometry: Odometry, stamp_ns: np.ndarray) -> None:
     named = ", ".join(f"{second:.1f} s" for second in seconds[:_NAMED].tolist())
     more = f" and {len(breaks) - _NAMED} more" if len(breaks) > _NAMED else ""
     _log.warning(
-        "Visual odometry starts again at %s%s after the first image: the drive has %d pieces, which only "
-        "closures relate to each other.",
-        named, more, len(breaks) + 1,
+        "%s starts again at %s%s after the first of the %s: the drive has %d pieces, which only closures relate to "
+        "each other.",
+        what, named, more, of, len(breaks) + 1,
     )  # fmt: skip
 
 
 _ARRAYS = {"stamp_ns": np.int64, "odom_from_body": np.float64, "covariance": np.float64, "breaks": np.int64}
-"""Fields of visual odometry, and their types."""
+"""Fields of computed odometry, and their types."""
 
 
 def _plain(odometry: Odometry) -> dict[str, Any]:

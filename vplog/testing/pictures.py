@@ -9,7 +9,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from vplog.data import Bytes, Camera, Frame, Gps, Ints, LogInfo, Odometry, Reference, Trajectory
+from vplog.data import Bytes, Camera, Frame, Gps, Ints, Lidar, LogInfo, Odometry, Reference, Scan, Trajectory
 from vplog.features.sift import SiftSettings
 
 WIDTH, HEIGHT = 320, 200
@@ -85,6 +85,12 @@ class Drive:
 
     def has_depth(self) -> bool:
         return False
+
+    def lidar(self) -> Lidar | None:
+        return None
+
+    def scans(self, stamp_ns: Ints) -> Iterator[Scan]:
+        yield from ()
 
     def gps(self) -> Gps | None:
         return None

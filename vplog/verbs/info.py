@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,8 @@ from vplog.logs.stamps import rate_hz
 from vplog.results.html import render
 from vplog.results.previews import jpeg
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
-from vplog.run.odometry import gives_visual
+from vplog.run.lidar_odometry import new_registration
+from vplog.run.odometry import gives_visual, source_of
 from vplog.run.visual_odometry.visual import visual_odometry
 from vplog.storage.json_records import plain
 from vplog.storage.remote_path import address
@@ -61,6 +62,7 @@ _PART_WORDS = {
     "gps": "satellite fixes",
     "imu": "gyroscope, which turns the velocities",
     "mask": "masks of the camera's images",
+    "lidar": "the lidar whose scans give the odometry",
     "tf_static": "static transforms",
     "tf": "transforms",
 }
@@ -110,11 +112,12 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
     camera, odometry, gps = _camera(log, problems), log.odometry(), log.gps()
     stamp_ns = log.stamps() if camera is not None else np.zeros(0, np.int64)
     sampled, decoded = _sampled(log, stamp_ns, problems)
-    visual = camera is not None and gives_visual(log)
-    by_images = visual and odometry is None and topics.odometry in (None, "visual")
+    computed = _computed(log, topics) if camera is not None and odometry is None else ""
     keyframes, missing = None, []
-    if by_images and camera is not None:
+    if computed == "visual" and camera is not None:
         _check_moves(log.name, sampled, camera, problems)
+    elif computed == "lidar":
+        _check_registers(problems)
     else:
         keyframes, missing = _keyframes(log, stamp_ns, odometry, problems)
     warnings = [line for line in dict.fromkeys(found.warnings + log.warnings + missing) if line not in problems]
@@ -124,6 +127,9 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
     if assumed:  # as the names of the images hold no times
         timing["rate_hz"] = None
     for topic, entry in zip(found.topics, named["topics"], strict=True):
+        if topic.part == "lidar" and computed != "lidar":
+            topic = replace(topic, used=False, part="")  # noqa: PLW2901
+            entry.update(used=False, part="")
         entry["why"] = _why(topic, found, topics)
         entry["rate_hz"] = None if assumed else entry["rate_hz"]
     record = {
@@ -133,7 +139,8 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
             "count": len(stamp_ns), **timing, "sampled": decoded, "decoded": len(sampled), "keyframes": keyframes,
         },
         "odometry": _about_odometry(odometry, found, topics),
-        "visual_odometry": "used" if by_images else "possible" if visual else "",
+        "visual_odometry": _use(computed == "visual", camera is not None and gives_visual(log)),
+        "lidar_odometry": _use(computed == "lidar", any(one.role == "lidar" and one.count for one in found.topics)),
         "gps": _about_gps(gps, found),
         "scale": _scale(camera, found),
         "gaps": _gaps(found, stamp_ns, odometry, gps),
@@ -143,6 +150,17 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
         "command": command(path, topics),
     }  # fmt: skip
     return Preflight(record, [(frame.stamp_ns, _small(frame.image)) for frame in sampled])
+
+
+def _computed(log: Log, topics: TopicChoice) -> str:
+    """What a run computes the odometry from, as `source_of`; empty where it cannot."""
+    with suppress(LogError):
+        return source_of(log, topics)
+    return ""
+
+
+def _use(used: bool, possible: bool) -> str:
+    return "used" if used else "possible" if possible else ""
 
 
 def command(path: Path, topics: TopicChoice) -> str:
@@ -228,6 +246,13 @@ def _check_moves(drive: str, frames: list[Frame], camera: Camera, problems: list
         )
 
 
+def _check_registers(problems: list[str]) -> None:
+    try:
+        new_registration(1.0)
+    except LogError as error:
+        problems.append(str(error))
+
+
 def _why(topic: Topic, found: LogInfo, topics: TopicChoice) -> str:
     """Why a topic is used or not, in a sentence."""
     if topic.used:
@@ -254,6 +279,8 @@ def _why(topic: Topic, found: LogInfo, topics: TopicChoice) -> str:
         )
     if topic.role == "imu":
         return "its gyroscope would turn velocities, which are not the odometry"
+    if topic.role == "lidar":
+        return f"its scans are not the odometry; --odometry {topic.name} takes it from them"
     if topic.role in ("tf", "tf_static"):
         return "it adds no transform to those of other topics"
     if topic.role == "depth" and any(other.part == "right" for other in found.topics):
@@ -381,6 +408,11 @@ def preflight_lines(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "drift", PROPERTIES["visual"]
     elif found["visual_odometry"]:
         yield "", f"--odometry visual: {PROPERTIES['visual']}"
+    if found["lidar_odometry"] == "used":
+        yield "odometry", "lidar: the run computes it from the scans"
+        yield "drift", PROPERTIES["lidar"]
+    elif found["lidar_odometry"]:
+        yield "", f"--odometry lidar: {PROPERTIES['lidar']}"
     for source in found["odometry_sources"]:
         if not source["used"]:
             name = source["kind"] if source["kind"] in ("gps", "truth") else source["topic"]

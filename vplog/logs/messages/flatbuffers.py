@@ -28,6 +28,8 @@ _FIELDS = {
         "timestamp frame_id latitude longitude altitude position_covariance position_covariance_type"
     ),
     "foxglove.LocationFixes": "fixes",
+    "foxglove.PointCloud": "timestamp frame_id pose point_stride fields data",
+    "foxglove.PackedElementField": "name offset type",
     "foxglove.FrameTransform": "timestamp parent_frame_id child_frame_id translation rotation",
     "foxglove.FrameTransforms": "transforms",
     "foxglove.Pose": "position orientation",

@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vplog.geometry import se3
 from vplog.logs.messages.flatbuffers import parse_flatbuffer
 from vplog.logs.messages.records import (
     BadMessageError,
     CalibrationMessage,
+    CloudMessage,
     FixesMessage,
     FixMessage,
     ImageMessage,
@@ -35,6 +37,8 @@ if TYPE_CHECKING:
 
 _UNKNOWN_COVARIANCE = 0
 """LocationFix.PositionCovarianceType.UNKNOWN."""
+_NUMBER_TYPES = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "f4", 8: "f8"}
+"""PackedElementField.NumericType."""
 
 
 def decode_foxglove(kind: str, encoding: str, data: Octets) -> Record:
@@ -137,6 +141,16 @@ def _fixes(m: Any) -> Record:
     return FixesMessage(found[0].stamp_ns if found else 0, found)
 
 
+def _cloud(m: Any) -> Record:
+    p, q = m.pose.position, m.pose.orientation
+    turn = np.array([q.x, q.y, q.z, q.w])
+    placed = se3.pose(se3.rotation(turn), np.array([p.x, p.y, p.z])) if turn.any() else None
+    typed = [(one.name, one.offset, "<" + _NUMBER_TYPES[one.type]) for one in m.fields if one.type in _NUMBER_TYPES]
+    count = len(m.data) // m.point_stride if m.point_stride else 0
+    size = m.point_stride, count * m.point_stride
+    return CloudMessage(_stamp(m), m.frame_id, count, 1, *size, typed, m.data, placed)
+
+
 def _matrix(values: Any, shape: tuple[int, int]) -> Floats:
     """Zeros where the field was left out."""
     return np.array(values, np.float64).reshape(shape) if len(values) else np.zeros(shape)
@@ -154,6 +168,7 @@ _READERS: dict[str, Callable[[Any], Record]] = {
     "foxglove.PoseInFrame": lambda m: _placed(m, m.frame_id, "", m.pose.position, m.pose.orientation),
     "foxglove.PosesInFrame": _poses,
     "foxglove.Odometry": _odometry,
+    "foxglove.PointCloud": _cloud,
     "foxglove.LocationFix": _fix,
     "foxglove.LocationFixes": _fixes,
     "foxglove.FrameTransform": lambda m: _transforms([m]),

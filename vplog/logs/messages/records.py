@@ -109,6 +109,26 @@ class FixMessage:
     """Type of the NMEA sentence that it is of."""
 
 
+class CloudMessage(NamedTuple):
+    """Points, as they lie in a message."""
+
+    stamp_ns: int
+    frame: str
+    width: int
+    """Points in a row."""
+    height: int
+    step: int
+    """Bytes of a point."""
+    row_step: int
+    """Bytes of a row, padding included."""
+    fields: list[tuple[str, int, str]]
+    """Name, offset in the point, and numpy's type of each."""
+    data: Octets
+    """A view of the message, where its encoding has the bytes as they are."""
+    frame_from_cloud: Floats | None = None
+    """(4, 4) where the points are not placed in `frame` itself."""
+
+
 class FixesMessage(NamedTuple):
     """Several fixes."""
 
@@ -122,6 +142,7 @@ Record = (
     | PoseMessage
     | PathMessage
     | ImuMessage
+    | CloudMessage
     | FixMessage
     | FixesMessage
     | list[PoseMessage]
@@ -151,6 +172,8 @@ _KINDS = {
     "ackermann_msgs/AckermannDriveStamped": "odometry",
     "sensor_msgs/JointState": "odometry",
     "sensor_msgs/Imu": "imu",
+    "sensor_msgs/PointCloud2": "lidar",
+    "foxglove.PointCloud": "lidar",
     "foxglove.PoseInFrame": "odometry",
     "foxglove.PosesInFrame": "odometry",
     "foxglove.Odometry": "odometry",
@@ -175,7 +198,7 @@ ENCODINGS = {"cdr": "ros", "ros1": "ros", "protobuf": "foxglove", "json": "foxgl
 
 
 def kind_of(channel: Channel) -> str:
-    """`image`, `camera_info`, `odometry`, `gps`, `imu`, `tf`, or `` for what vplog has no use for or cannot decode."""
+    """`image`, `camera_info`, `odometry`, `gps`, `imu`, `lidar`, `tf`, or `` for what vplog has no use for or cannot decode."""
     family = ENCODINGS.get(channel.encoding)
     name = short_type(channel.type)
     if family is None or name.startswith("foxglove.") != (family == "foxglove"):

@@ -19,6 +19,7 @@ from vplog.logs.messages.nmea import fix_of
 from vplog.logs.messages.records import (
     BadMessageError,
     CalibrationMessage,
+    CloudMessage,
     FixMessage,
     ImageMessage,
     ImuMessage,
@@ -45,6 +46,8 @@ _NED = 1
 """VehicleOdometry.POSE_FRAME_NED; 2 is a frame of its own, forward, right and down."""
 _ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])
+_NUMBER_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""sensor_msgs/PointField's datatypes."""
 _ENCAPSULATION = 4
 """Bytes before a message in CDR: plain, big (0) or little (1) endian. Numbers are aligned to their size behind them."""
 
@@ -243,6 +246,20 @@ def _px4(fields: _Fields) -> Record:
     )  # fmt: skip
 
 
+def _cloud(fields: _Fields) -> Record:
+    stamp_ns, frame = fields.header()
+    height, width, count = fields.numbers("3I")
+    found = []
+    for _ in range(count):
+        name, (offset, datatype, _) = fields.text(), (*fields.numbers("IB"), *fields.numbers("I"))
+        found.append((name, offset, _NUMBER_TYPES.get(datatype, "")))
+    (big_endian,), (step, row_step) = fields.numbers("B"), fields.numbers("2I")
+    data, _ = fields.octets(), fields.numbers("B")  # is_dense
+    order = ">" if big_endian else "<"
+    typed = [(name, offset, order + kind) for name, offset, kind in found if kind]
+    return CloudMessage(stamp_ns, frame, width, height, step, row_step, typed, data)
+
+
 def _transforms(fields: _Fields) -> Record:
     return [_pose(fields, "7d", child=True) for _ in range(fields.numbers("I")[0])]
 
@@ -290,6 +307,7 @@ _READERS: dict[str, Callable[[_Fields], Record]] = {
     "px4_msgs/VehicleOdometry": _px4,
     "sensor_msgs/JointState": _wheels,
     "sensor_msgs/Imu": _imu,
+    "sensor_msgs/PointCloud2": _cloud,
     "sensor_msgs/NavSatFix": _fix,
     "gps_common/GPSFix": _gps_fix,
     "gps_msgs/GPSFix": _gps_fix,
