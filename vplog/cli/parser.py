@@ -254,9 +254,8 @@ def topic_options() -> argparse.ArgumentParser:
     topics = argparse.ArgumentParser(add_help=False)
     for role in _ROLES:
         names = "--odometry --odometry-topic" if role == "odometry" else f"--{role}-topic"
-        what = f"use this {role} topic" + (
-            ", or a source: twist, gps, visual, lidar, truth" if role == "odometry" else ""
-        )
+        source = ", or a source: twist, gps, visual, lidar, truth" if role == "odometry" else ""
+        what = f"use this {role} topic{source}"
         option(topics, names, str, "TOPIC", what, dest=f"{role.replace('-', '_')}_topic")
     for name, what in (("wheelbase", "axles"), ("track", "left and right wheels"), ("wheel-radius", "hub and road")):
         option(topics, f"--{name}-m", positive, "M", f"metres between {what}, for odometry of wheels")

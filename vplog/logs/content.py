@@ -108,8 +108,6 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     sources = rank_sources(found, read.images["image"].finish(Notes())[0])
     rates_hz = read.rates_hz()
     chosen = chosen.with_odometry(choose_odometry(sources, chosen, notes))
-    if chosen.odometry in found and found[chosen.odometry].odometry is not None:
-        chosen = replace(chosen, lidar=None)
     sources = [(replace(one, used=source == chosen.odometry), source) for one, source in sources]
     read.poses = {source: track for source, track in read.poses.items() if source == chosen.odometry}
     for (reason, topic), runs in read.lost.items():

@@ -30,11 +30,11 @@ _TRIED = 10
 
 
 class ScanReader:
-    """Reads the scans of the selection's lidar by their place in the container."""
+    """Reads the scans of the selection's lidar by their place in the container; none where the log has odometry."""
 
     def __init__(self, container: Container, content: Content, notes: Notes) -> None:
         self._container, self._content, self._notes = container, content, notes
-        self._channel = content.chosen.lidar
+        self._channel = content.chosen.lidar if content.odometry is None else None
 
     def lidar(self, has_images: bool) -> Lidar | None:
         """The lidar with its scans about the images'; None without any."""

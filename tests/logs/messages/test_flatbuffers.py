@@ -87,6 +87,7 @@ def test_a_drive_in_flatbuffers_is_the_drive(tmp_path: Path) -> None:
 def test_every_type_agrees_with_protobuf() -> None:
     from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
     from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
+    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
     from foxglove_schemas_protobuf.Pose_pb2 import Pose
     from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
     from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -97,7 +98,9 @@ def test_every_type_agrees_with_protobuf() -> None:
     odometry.pose.position.x, odometry.pose.orientation.w, odometry.timestamp.seconds = 3.0, 1.0, 7
     several = FrameTransforms(transforms=[m.message for m in foxglove_messages(Drive())[:2]])
     poses = PosesInFrame(frame_id="odom", poses=[Pose(), odometry.pose])
-    messages = [m.message for m in foxglove_messages(Drive())] + [raw, odometry, several, poses]
+    cloud = PointCloud(frame_id="lidar", pose=odometry.pose, point_stride=4, data=b"01234567")
+    cloud.fields.add(name="x", offset=2, type=4)  # pyright: ignore[reportArgumentType]
+    messages = [m.message for m in foxglove_messages(Drive())] + [raw, odometry, several, poses, cloud]
     for message in messages:
         name = message.DESCRIPTOR.full_name
         by_flat = decode(Channel("/t", name, "flatbuffer"), flat(message))

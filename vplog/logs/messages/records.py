@@ -198,7 +198,8 @@ ENCODINGS = {"cdr": "ros", "ros1": "ros", "protobuf": "foxglove", "json": "foxgl
 
 
 def kind_of(channel: Channel) -> str:
-    """`image`, `camera_info`, `odometry`, `gps`, `imu`, `lidar`, `tf`, or `` for what vplog has no use for or cannot decode."""
+    """`image`, `camera_info`, `odometry`, `gps`, `imu`, `lidar`, `tf`, or `` for what vplog has no use for or cannot
+    decode."""
     family = ENCODINGS.get(channel.encoding)
     name = short_type(channel.type)
     if family is None or name.startswith("foxglove.") != (family == "foxglove"):
