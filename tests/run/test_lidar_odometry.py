@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from tests.logs.drives import Written, store, write_ros2
 from vplog import logs
@@ -140,7 +140,7 @@ def test_the_way_along_a_tunnel_is_unknown() -> None:
     rng = np.random.default_rng(5)
     angle, along = rng.uniform(0, 2 * np.pi, 3000), rng.uniform(-8, 8, 3000)
     points = np.stack([along, 3 * np.cos(angle), 3 * np.sin(angle)], axis=1)
-    found = step_residuals(cKDTree(points), points + rng.normal(0, 0.01, points.shape), np.eye(4), 0.5)
+    found = step_residuals(KDTree(points), points + rng.normal(0, 0.01, points.shape), np.eye(4), 0.5)
     assert found is not None
     sigma = np.sqrt(np.diag(found.covariance))
     assert sigma[3] > 20 * sigma[4:].max()

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from vplog.data import Odometry
 from vplog.errors import LogError
@@ -82,7 +82,7 @@ class _Tracker:
     breaks: list[int] = field(default_factory=list)
     icp: Any = None
     """KISS-ICP's map, thresholds and registration of this piece."""
-    surface: cKDTree | None = None
+    surface: KDTree | None = None
     """Of the last scan's points, in its frame."""
     step: Floats = field(default_factory=lambda: np.eye(4))
     """Motion in a period, as KISS-ICP's last_delta."""
@@ -126,7 +126,7 @@ class _Tracker:
 
     def _append(self, turn: _Scan, end_ns: int, pose: Floats, residuals: _Residuals) -> None:
         self.icp.local_map.update(turn.map_points, pose)
-        self.surface = cKDTree(turn.map_points)
+        self.surface = KDTree(turn.map_points)
         self.stamp_ns.append(end_ns)
         self.pose.append(pose)
         self.covariance.append(residuals.covariance)
@@ -191,7 +191,7 @@ def new_registration(range_m: float) -> Any:
     return KissICP(config)
 
 
-def step_residuals(surface: cKDTree | None, points: Floats, moved: Floats, voxel_m: float) -> _Residuals | None:
+def step_residuals(surface: KDTree | None, points: Floats, moved: Floats, voxel_m: float) -> _Residuals | None:
     """Those of the motion `moved` (4, 4) from the last scan, whose points are `surface`, to one with (K, 3) `points`.
     The noise is that from point to point, as it is minimised; a surface holds what moves off its plane. None where too
     few points have a neighbour."""
@@ -212,7 +212,8 @@ def step_residuals(surface: cKDTree | None, points: Floats, moved: Floats, voxel
     prior = np.linalg.inv(_UNKNOWN)
     off = np.linalg.solve(weighted.T @ jacobian / scale**2 + prior, weighted.T @ off_plane / scale**2)
     variance = max(float((distance[near] ** 2).mean()) / 3, _RANGE_SIGMA_M**2)
-    return _Residuals(np.linalg.inv(jacobian.T @ jacobian / variance + prior), off)
+    noise = np.asarray(np.linalg.inv(jacobian.T @ jacobian / variance + prior), np.float64)
+    return _Residuals(noise, np.asarray(off, np.float64))
 
 
 def _mean_square(off: Floats) -> Floats:
@@ -225,7 +226,7 @@ def _mean_square(off: Floats) -> Floats:
     return mean * (1 + np.eye(6))
 
 
-def _normals(surface: cKDTree, rows: np.ndarray) -> tuple[Floats, np.ndarray]:
+def _normals(surface: KDTree, rows: np.ndarray) -> tuple[Floats, np.ndarray]:
     """(K, 3) normals of the surface at its points `rows`, and (K,) whether it is flat there."""
     _, around = surface.query(surface.data[rows], min(_NEIGHBOURS, surface.n))
     spread = np.asarray(surface.data)[around]

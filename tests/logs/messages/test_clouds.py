@@ -38,7 +38,7 @@ def packed(layout: np.dtype = OUSTER, times: np.ndarray = OFFSETS * 1e9, name: s
 def columns(layout: np.dtype, types: dict[str, int]) -> list[tuple[str, int, int]]:
     """Name, offset and type of each field."""
     assert layout.names is not None and layout.fields is not None
-    return [(name, layout.fields[name][1], types[layout[name].str[1:]]) for name in layout.names]
+    return [(name, layout.fields[name][1], types[layout.fields[name][0].str[1:]]) for name in layout.names]
 
 
 def by_ros(ros: int, cloud: np.ndarray, height: int = 3, padding: int = 8) -> tuple[Channel, bytes]:
