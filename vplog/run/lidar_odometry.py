@@ -198,7 +198,7 @@ def step_residuals(surface: KDTree | None, points: Floats, moved: Floats, voxel_
     if surface is None:
         return _Residuals(_UNKNOWN, np.zeros(6))
     there = se3.transform(moved, points)
-    distance, row = surface.query(there, distance_upper_bound=voxel_m)
+    distance, row = map(np.asarray, surface.query(there, distance_upper_bound=voxel_m))
     near = np.isfinite(distance)
     if near.mean() < _LEAST_SHARE:
         return None

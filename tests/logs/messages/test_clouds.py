@@ -35,9 +35,8 @@ def packed(layout: np.dtype = OUSTER, times: np.ndarray = OFFSETS * 1e9, name: s
     return found
 
 
-def columns(layout: np.dtype, types: dict[str, int]) -> list[tuple[str, int, int]]:
+def columns(layout: Any, types: dict[str, int]) -> list[tuple[str, int, int]]:
     """Name, offset and type of each field."""
-    assert layout.names is not None and layout.fields is not None
     return [(name, layout.fields[name][1], types[layout.fields[name][0].str[1:]]) for name in layout.names]
 
 
