@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from vplog.data import Odometry
 from vplog.errors import LogError
@@ -19,6 +18,8 @@ from vplog.geometry import se3
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
+    from scipy.spatial import KDTree
 
     from vplog.data import Floats, Lidar, Scan
 
@@ -125,6 +126,8 @@ class _Tracker:
         self._append(turn, end_ns, self.pose[-1] if self.pose else np.eye(4), _Residuals(_UNKNOWN, np.zeros(6)))
 
     def _append(self, turn: _Scan, end_ns: int, pose: Floats, residuals: _Residuals) -> None:
+        from scipy.spatial import KDTree  # a quarter of a second that runs without a lidar need not wait
+
         self.icp.local_map.update(turn.map_points, pose)
         self.surface = KDTree(turn.map_points)
         self.stamp_ns.append(end_ns)
