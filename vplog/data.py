@@ -396,11 +396,12 @@ class Topic:
     encoding: str
     count: int
     role: str
-    """`image`, `depth`, `camera_info`, `odometry`, `gps`, `tf_static`, `tf`, or `` where vplog has no use for it."""
+    """`image`, `depth`, `camera_info`, `odometry`, `gps`, `imu`, `lidar`, `tf_static`, `tf`, or `` where vplog has no
+    use for it."""
     used: bool
     part: str = ""
-    """Its use: `image`, `right`, `depth`, `camera_info`, `right_info`, `odometry`, `gps`, `tf_static`, `tf`; empty
-    where it is not used."""
+    """Its use: `image`, `right`, `depth`, `camera_info`, `right_info`, `odometry`, `gps`, `lidar`, `tf_static`,
+    `tf`; empty where it is not used."""
     pixels: str = ""
     """Pixel layout or format of images, by the first message."""
     width: int = 0
