@@ -51,7 +51,7 @@ def serving() -> Iterator[str]:
     from werkzeug.serving import WSGIRequestHandler, make_server
 
     class Quiet(WSGIRequestHandler):
-        def log(self, *_: Any) -> None:
+        def log(self, type: str, message: str, *args: Any) -> None:
             pass
 
     app = as_google(DomainDispatcherApplication(create_backend_app))
