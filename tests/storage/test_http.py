@@ -114,6 +114,20 @@ def test_a_server_that_is_silent_is_given_up(monkeypatch: pytest.MonkeyPatch) ->
             located(url).exists()
 
 
+def test_a_server_that_is_overloaded_is_asked_again_and_not_for_ever() -> None:
+    asked: list[str] = []
+
+    def answer(said: str) -> bytes:
+        asked.append(said)
+        return b"HTTP/1.1 503 Busy\r\nContent-Length: 0\r\n\r\n" if len(asked) in (1, 2, 4, 5, 6, 7) else FOUND
+
+    with saying(answer) as url:
+        assert located(url).stat().st_size == len(DATA)
+        with pytest.raises(OSError, match="answers 503"):
+            located(url).exists()
+    assert len(asked) == 7
+
+
 def test_a_link_that_allows_no_head_is_read() -> None:
     """As links to object stores do that are signed for GET."""
 

@@ -152,7 +152,7 @@ class RemotePath:
             data = next(found.stream(min_chunk_size=stop - start), b"")
         if not data:
             raise OSError(f"the server states a length of {self._length} bytes, and sends none from byte {start} on")
-        return bytes(memoryview(data)[: stop - start])
+        return bytes(data[: stop - start])
 
     def read_bytes(self) -> bytes:
         with self.open() as stream:
