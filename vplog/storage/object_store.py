@@ -131,7 +131,7 @@ def plain_errors() -> Iterator[None]:
 
     try:
         yield
-    except (BaseError, ValueError, NotImplementedError, configparser.Error, FileNotFoundError) as error:
+    except (BaseError, ValueError, RuntimeError, configparser.Error, FileNotFoundError) as error:
         text = str(error)
         if isinstance(error, FileNotFoundError) and error.errno is not None:  # of this machine
             raise
