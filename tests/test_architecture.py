@@ -38,7 +38,8 @@ LAYERS = (
 LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 FILES = sorted(PACKAGE.rglob("*.py"))
 HEAVY = (
-    "cv2", "faiss", "gtsam", "jinja2", "matplotlib", "mcap", "numba", "numpy", "pyarrow", "pydantic", "rich", "rosbags",
+    "cv2", "faiss", "gtsam", "jinja2", "matplotlib", "mcap", "numba", "numpy", "obstore", "pyarrow", "pydantic", "rich",
+    "rosbags",
 )  # fmt: skip
 
 

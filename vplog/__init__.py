@@ -6,7 +6,7 @@
     run.closures.to_pandas()                      # tables are Arrow tables
     vplog.evaluate(run, "truth.tum")["ate_after"]
 
-Files and folders are a str, a Path or a URL: s3://, gs://, and http(s):// to read. What cannot be done raises a
+Files and folders are a str, a Path or a URL: s3://, gs://, az://, http(s):// to read. What cannot be done raises a
 VplogError, whose message says what, where and what next. Where it names an option of the command line, as --min-gap,
 the keyword argument is min_gap; `settings` is --set, and `topics` has what --image-topic and its like choose. No call
 needs an `if __name__ == "__main__"` guard.

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 def serving() -> Iterator[None]:
     """With a bucket named `bucket`, found by all that ask for S3."""
     moto = pytest.importorskip("moto.server", reason="moto speaks S3 on loopback: pip install 'moto[server]'")
-    boto3 = pytest.importorskip("boto3", reason="boto3 asks S3 for conditional writes: pip install boto3")
+    from obstore.store import HTTPStore
+
     started = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     started.start()
     host, port = started.get_host_and_port()
@@ -26,6 +27,6 @@ def serving() -> Iterator[None]:
         patch.setenv("AWS_ACCESS_KEY_ID", "test")
         patch.setenv("AWS_SECRET_ACCESS_KEY", "test")
         patch.setenv("AWS_REGION", "us-east-1")
-        boto3.client("s3", region_name="us-east-1").create_bucket(Bucket="bucket")
+        HTTPStore(f"http://{host}:{port}", client_options={"allow_http": True}).put("bucket", b"")
         yield
     started.stop()

@@ -216,7 +216,7 @@ def _add_workers(sub: argparse.ArgumentParser) -> None:
 
 def _add_batch(sub: argparse.ArgumentParser) -> None:
     option(sub, "logs", place, "LOG", "one drive each", nargs="+")
-    option(sub, "-o --map", place, "MAP", "folder, s3:// or gs:// of the map", required=True)
+    option(sub, "-o --map", place, "MAP", "folder, s3://, gs:// or az:// of the map", required=True)
     _add_workers(sub)
     flag(sub, "--no-join", "do not look for closures between the drives at the end", "join")
     text = "cache results of stages, 0.35 MB a keyframe, so that other settings read no images; local maps only"

@@ -1,7 +1,6 @@
-"""Files by URL: s3:// and gs:// through pyarrow, http(s):// by range requests; read in parts, written when finished.
+"""Files by URL: s3://, gs:// and az:// in parts and written when finished, http(s):// by range requests.
 
-Credentials and endpoints come from where each service's own tools look for them (AWS_ACCESS_KEY_ID, AWS_ENDPOINT_URL,
-GOOGLE_APPLICATION_CREDENTIALS, STORAGE_EMULATOR_HOST, ...).
+Endpoints and credentials are those of object_store.py.
 """
 
 from __future__ import annotations
@@ -14,27 +13,27 @@ import urllib.parse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from email.utils import format_datetime
+from functools import cached_property, partial
 from pathlib import Path, PurePosixPath
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 from vplog.errors import LogError, ResultError, SettingsError
-from vplog.storage.gcs import gcs_endpoint, google_file_system, plain, plain_errors
-from vplog.storage.http import get_range, head
+from vplog.storage.object_store import STORES, opened, plain_errors
 from vplog.storage.scratch import scratch
 from vplog.storage.urls import shown, without_secrets
 
 if TYPE_CHECKING:
-    from pyarrow.fs import FileInfo, FileSystem
+    from obstore import ObjectMeta
+    from obstore.store import ObjectStore
 
-SCHEMES = ("s3", "gs", "http", "https")
+SCHEMES = (*STORES, "http", "https")
+_NO_HEAD = re.compile("answers (403|405|501)")
 _BLOCK_BYTES = 1 << 20
 """Read ahead of small reads: a chunk of a log; a request costs as much as some hundred kB."""
-_TIMEOUT_S = 30.0
-"""Timeout of a server without an answer."""
-_DENIED = re.compile(r"ACCESS_DENIED|AccessDenied|PERMISSION_DENIED|HTTP response code 403")
-"""Errors of pyarrow's clients where this account lacks the permission."""
+_PART_BYTES = 1 << 24
+"""A longer file is uploaded in such parts, of which S3 takes 10 000."""
 
 
 def located(text: str | Path | RemotePath) -> Path:
@@ -58,7 +57,7 @@ def address(path: Path) -> str:
 
 def _checked(url: str, scheme: str) -> str:
     """The URL, if credentials are in the query of http alone. Raises SettingsError, which does not show them."""
-    host, store = re.split("[/?#]", url.split("://", 1)[1], maxsplit=1)[0], scheme in ("s3", "gs")
+    host, store = re.split("[/?#]", url.split("://", 1)[1], maxsplit=1)[0], scheme in STORES
     port = host.rpartition(":")[2]
     if not host:
         whose = "BUCKET/NAME" if store else "SERVER/FILE"
@@ -132,26 +131,32 @@ class RemotePath:
 
     def version(self) -> str:
         """A text that changes with the object, without reading it: its length and time, or the server's tag."""
-        if self._is_http:
-            return f"length {self._length}, {self._head.get('ETag') or self._head.get('Last-Modified') or 'no tag'}"
-        return f"length {self._length}, time {self._info.mtime_ns}"
+        meta = self._there
+        if not self._is_http:
+            return f"length {meta['size']}, time {int(meta['last_modified'].timestamp()) * 10**9}"
+        time = format_datetime(meta["last_modified"], usegmt=True) if meta["last_modified"].timestamp() else "no tag"
+        return f"length {meta['size']}, {meta['e_tag'] or time}"
 
     def open(self, mode: str = "rb") -> BinaryIO:
         """A stream that reads by requests for blocks. Raises OSError."""
         if mode != "rb":
             raise ValueError(f"a remote file is opened with mode rb, not {mode}")
-        if self._is_http:
-            raw: Any = _Ranges(self._length, partial(get_range, self.url, length=self._length))
-        else:
-            system, place = self.place
-            with plain_errors():
-                file = system.open_input_file(place)
-            raw = _Ranges(self._length, lambda start, count: file.read_at(count, start), file.close)
-        return io.BufferedReader(raw, _BLOCK_BYTES)
+        return io.BufferedReader(_Ranges(self._length, self.read_range), _BLOCK_BYTES)
+
+    def read_range(self, start: int, stop: int) -> bytes:
+        """Bytes from `start` to before `stop`, never more, whatever the server sends; a server that knows no ranges
+        gives all of a file. Raises OSError."""
+        whole = stop - start == self._length
+        found = self.ask("get", options={} if whole else {"range": (start, stop)})
+        with plain_errors():
+            data = next(found.stream(min_chunk_size=stop - start), b"")
+        if not data:
+            raise OSError(f"the server states a length of {self._length} bytes, and sends none from byte {start} on")
+        return bytes(data[: stop - start])
 
     def read_bytes(self) -> bytes:
         with self.open() as stream:
-            return stream.read()
+            return b"".join(iter(partial(stream.read, _BLOCK_BYTES), b""))
 
     def read_text(self, encoding: str = "utf-8") -> str:
         return self.read_bytes().decode(encoding)
@@ -162,64 +167,73 @@ class RemotePath:
             yield self / name
 
     def rglob(self, _: str = "*") -> Iterator[RemotePath]:
-        if self._is_http:
-            return
-        from pyarrow.fs import FileSelector
-
-        system, place = self.place
-        with plain_errors():
-            below = system.get_file_info(FileSelector(place, recursive=True))
-        for found in sorted(below, key=lambda one: one.path):
-            yield self / found.path[len(place) + 1 :]
+        """All objects below, in order of names; none of an HTTP server."""
+        for name, meta in () if self._is_http else sorted(objects_below(self).items()):
+            found = self / name
+            found.__dict__["_meta"] = meta  # which need not be asked for again
+            yield found
 
     @property
     def _is_http(self) -> bool:
-        return self.scheme in ("http", "https")
+        return self.scheme not in STORES
 
-    @cached_property
-    def place(self) -> tuple[FileSystem, str]:
-        """The file system of an object store, and the path in it."""
-        place = urllib.parse.unquote(self.url.split("://", 1)[1])
-        if self.scheme == "gs":
-            return google_system(gcs_endpoint(), place.partition("/")[0]), place
-        return file_system(*s3_place()), place
+    @property
+    def place(self) -> tuple[ObjectStore, str]:
+        """The store, and the name in it; of a web server all is in the former."""
+        return self._place()
 
-    @cached_property
-    def _info(self) -> FileInfo:
-        system, place = self.place
+    def _place(self, upload: bool = False) -> tuple[ObjectStore, str]:
+        if self._is_http:
+            return opened(self.scheme, self.url), ""
+        bucket, _, name = urllib.parse.unquote(self.url.split("://", 1)[1]).partition("/")
+        return opened(self.scheme, bucket, upload), name
+
+    @property
+    def prefix_length(self) -> int:
+        """Of the names below in a listing."""
+        return len(f"{self.place[1]}/".lstrip("/"))
+
+    def ask(self, verb: str, *given: Any, upload: bool = False, **options: Any) -> Any:
+        """What the method of this name of obstore's stores answers for this object or prefix. Raises OSError."""
+        store, name = self._place(upload)
         with plain_errors():
-            return system.get_file_info(place)
+            return getattr(store, verb)(name, *given, **options)
 
     @cached_property
-    def _head(self) -> dict[str, str]:
-        return head(self.url)
+    def _meta(self) -> ObjectMeta | None:
+        """None where there is no such object. Links that are signed for GET alone allow no HEAD: then one byte is
+        read."""
+        try:
+            return self.ask("head") if self._is_http or self._place()[1] else None
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            if not _NO_HEAD.search(str(error)):
+                raise
+            return self.ask("get", options={"range": (0, 1)}).meta
 
     @cached_property
     def _kind(self) -> str:
-        if self._is_http:
-            return "file" if self._head else "none"
-        from pyarrow.fs import FileType
+        if self._meta is not None:
+            return "file"
+        return "none" if self._is_http or not names_below(self) else "folder"
 
-        return {FileType.File: "file", FileType.Directory: "folder"}.get(self._info.type, "none")
+    @property
+    def _there(self) -> ObjectMeta:
+        if self._meta is None:
+            raise OSError("the server has no such file")
+        return self._meta
 
     @property
     def _length(self) -> int:
-        if not self._is_http:
-            return int(self._info.size or 0)
-        length = self._head.get("Content-Length", "")
-        if not length.isdigit():
-            raise OSError(f"the server {'does not say how long the file is' if self._head else 'has no such file'}")
-        return int(length)
+        return self._there["size"]
 
 
 class _Ranges(io.RawIOBase):
     """Random access to a remote file; every read is a request for just these bytes."""
 
-    def __init__(
-        self, length: int, fetch: Callable[[int, int], bytes], close: Callable[[], None] = lambda: None
-    ) -> None:
-        """`fetch` gives bytes by their start and count, `close` is called at the end."""
-        self._at, self._length, self._fetch, self._close = 0, length, fetch, close
+    def __init__(self, length: int, fetch: Callable[[int, int], bytes]) -> None:
+        self._at, self._length, self._fetch = 0, length, fetch
 
     def readable(self) -> bool:
         return True
@@ -239,52 +253,35 @@ class _Ranges(io.RawIOBase):
         wanted = min(len(buffer), max(self._length - self._at, 0))
         if wanted == 0:
             return 0
-        with plain_errors():
-            data = self._fetch(self._at, wanted)
+        data = self._fetch(self._at, self._at + wanted)
         buffer[: len(data)] = data
         self._at += len(data)
         return len(data)
 
-    def close(self) -> None:
-        if not self.closed:
-            self._close()
-        super().close()
-
 
 def names_below(path: RemotePath) -> dict[str, bool]:
-    """Names right below a prefix of an object store, and whether each has objects below, by which gs:// alone tells
-    folders. Raises OSError."""
-    from pyarrow.fs import FileSelector, FileType
+    """Names right below a prefix of an object store, and whether each has objects below. Raises OSError."""
+    found, skip = path.ask("list_with_delimiter"), path.prefix_length
+    below = {one["path"][skip:]: False for one in found["objects"]}
+    return below | {name[skip:]: True for name in found["common_prefixes"]}
 
-    system, place = path.place
-    below = dict[str, bool]()
+
+def objects_below(path: RemotePath) -> dict[str, ObjectMeta]:
+    """All objects with this prefix, by their names behind it. Raises OSError."""
+    found = path.ask("list")
     with plain_errors():
-        found = system.get_file_info(FileSelector(place, allow_not_found=True, recursive=path.scheme == "gs"))
-    for one in found:
-        name, _, rest = one.path[len(place) + 1 :].partition("/")
-        below[name] = below.get(name, False) or bool(rest) or one.type == FileType.Directory
-    return below
+        return {one["path"][path.prefix_length :]: one for one in found.collect()}
+
+
+def send(path: RemotePath, source: Path) -> None:
+    """A local file as an object, which appears when all of it is there. Raises OSError."""
+    path.ask("put", source, upload=True, chunk_size=_PART_BYTES, max_concurrency=1)
 
 
 def s3_place() -> tuple[str | None, str | None]:
     """Endpoint and region of S3, by the variables of its own tools; None where they are not set."""
     endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL")
     return endpoint, os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION")
-
-
-google_system = lru_cache(google_file_system)
-"""One for all objects of a bucket."""
-
-
-@lru_cache
-def file_system(endpoint: str | None, region: str | None) -> FileSystem:
-    """One for all objects of a server that speaks S3: it keeps its connections."""
-    from pyarrow import fs
-
-    return fs.S3FileSystem(  # delayed: a small file is one request, not the three of an upload in parts
-        request_timeout=_TIMEOUT_S, connect_timeout=_TIMEOUT_S, allow_delayed_open=True,
-        endpoint_override=endpoint or None, region=region or None,
-    )  # fmt: skip
 
 
 _STANDS_FOR: dict[Path, Path | RemotePath] = {}
@@ -329,7 +326,7 @@ def local_copy(path: Path | RemotePath) -> Iterator[Path]:
 
 
 def _download(path: RemotePath, target: Path) -> None:
-    files = {path: target} if path.is_file() else {f: target / f.relative_to(path) for f in path.rglob() if f.is_file()}
+    files = {path: target} if path.is_file() else {file: target / file.relative_to(path) for file in path.rglob()}
     for file, place in files.items():
         place.parent.mkdir(parents=True, exist_ok=True)
         with file.open() as source, place.open("wb") as sink:
@@ -353,42 +350,32 @@ def local_output(path: Path | RemotePath) -> Iterator[Path]:
         files = [target] if target.is_file() else sorted(file for file in target.rglob("*") if file.is_file())
         files.sort(key=lambda file: file.name == "run.json" and file.parent == target)
         try:
-            system, place = path.place
             for file in files:
-                with (
-                    file.open("rb") as source,
-                    system.open_output_stream(str(PurePosixPath(place) / file.relative_to(target))) as sink,
-                ):
-                    shutil.copyfileobj(source, sink, _BLOCK_BYTES)
+                send(path if file == target else path / file.relative_to(target).as_posix(), file)
         except OSError as error:
             raise ResultError(f"Cannot write {path}: {reason(error)}.") from None
 
 
 def check_writable(path: RemotePath) -> None:
     """Raises SettingsError for what is only read."""
-    if path.scheme not in ("s3", "gs"):
-        raise SettingsError(
-            f"Cannot write to {path}: {path.scheme}:// is for reading. Write to s3://, gs:// or a path."
-        )
+    if path.scheme not in STORES:
+        known = ", ".join(f"{scheme}://" for scheme in STORES)
+        raise SettingsError(f"Cannot write to {path}: {path.scheme}:// is for reading. Write to {known} or a path.")
 
 
 def _check_bucket(path: RemotePath) -> None:
     """Raises ResultError where there is no server, or no such bucket on it; what may be written only writing tells."""
-    from pyarrow.fs import FileType
-
     try:
-        system, place = path.place
-        bucket = place.partition("/")[0]
-        there = system.get_file_info(bucket).type != FileType.NotFound
+        (path if path.place[1] else path / ".vplog").ask("get")
+    except (FileNotFoundError, PermissionError):  # what writes need not have the right to read
+        return
     except OSError as error:
-        if _DENIED.search(str(error)):  # a look at the bucket; what writes need not have the right to that
-            return
-        raise ResultError(f"Cannot write {path}: {reason(error)}.") from None
-    if not there:
-        raise ResultError(f"Cannot write {path}: there is no bucket {bucket}. Make it, or choose another with -o.")
+        bucket = urllib.parse.urlsplit(path.url).netloc
+        why = reason(error).replace("no bucket of this name", f"no bucket {bucket}")
+        raise ResultError(f"Cannot write {path}: {why}. Choose another place with -o.") from None
 
 
 def reason(error: OSError) -> str:
     """Why something failed, in one line."""
-    text = without_secrets(plain(error.strerror or str(error)))
-    return (text.splitlines()[0] if text else type(error).__name__)[:300].rstrip(".")
+    text = without_secrets(error.strerror or str(error))
+    return (text.splitlines()[0] if text else type(error).__name__)[:400].rstrip(".")

@@ -9,14 +9,16 @@ import shutil
 import subprocess
 import sys
 import threading
+from datetime import UTC, datetime, timedelta
 from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import pyarrow.dataset as ds
 import pytest
+from pyarrow import fs
 
 from tests.maps.bucket import serving
-from tests.maps.runs import LIBRARY, PLACES, make_map, put, put_library, seeds
+from tests.maps.runs import LIBRARY, PLACES, make_map, put, seeds
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.info import describe_map
 from vplog.maps.storage import lease_lock, map_store, objects, remote_map, upload
@@ -71,9 +73,10 @@ def test_a_map_is_there_as_it_is_in_a_folder(root: Any, tmp_path: Path) -> None:
             assert a.rows("descriptors", drive) == b.rows("descriptors", drive) == PLACES
             for name in b.sizes(drive).keys() - {"drive.json"}:
                 assert (b.full_run(drive) / name).read_bytes() == (a.run(drive) / name).read_bytes()
+    system = fs.S3FileSystem(endpoint_override=os.environ["AWS_ENDPOINT_URL"])
     for name in map_store.TABLES:
-        system, place = root.place
-        found = ds.dataset(f"{place}/{name}", partitioning="hive", filesystem=system, format="parquet").to_table()
+        place = str(root / name).removeprefix("s3://")
+        found = ds.dataset(place, partitioning="hive", filesystem=system, format="parquet").to_table()
         assert found.equals(ds.dataset(here / name, partitioning="hive", format="parquet").to_table())
     told, known = describe_map(there), describe_map(here)
     assert {**told, "map": "", "bytes": 0, "drives": []} == {**known, "map": "", "bytes": 0, "drives": []}
@@ -295,26 +298,37 @@ def test_two_writers(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     assert same_state(root) == {"one": {1}, "two": {2}}
 
 
-def test_a_store_that_decides_nothing(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The lock is a name that stays; nothing breaks even where two write the same drive at once."""
-    monkeypatch.setattr(lease_lock, "LEASE_S", 36_000.0)  # whose renewal would see that the lock is another's
-    monkeypatch.setattr(lease_lock, "_SETTLE_S", 0.0)
-    monkeypatch.setattr(objects, "has_conditional_writes", lambda _: False)
+def test_a_store_that_decides_nothing_is_only_read(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one that takes no notice of conditions, or is told to make none."""
     make_map(root, {"one": 1})
-    with map_store.writing(root) as store:
-        with pytest.raises(SettingsError, match="Another"), map_store.writing(root):
+
+    def put_anyway(path: Any, data: bytes, _: object) -> dict[str, str]:
+        objects.put(path, data)
+        return {"e_tag": "any"}
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(objects, "put_if", put_anyway)
+        with pytest.raises(SettingsError, match="no conditional writes") as error, map_store.writing(root):
             pass
-        lock = objects.get(root / ".lock")
-        objects.put(root / ".lock", b"{}")
-        with map_store.writing(root) as other:
-            put(store, "one", 2)
-            put(other, "one", 3)
-            put(store, "one", 4)
-            put(other, "two", 5)
-        assert lock is not None
-    assert same_state(root) == {"one": {4}, "two": {5}}
-    with map_store.writing(root) as store:
-        put_library(store)
+    assert "\n" not in str(error.value)
+    monkeypatch.setenv("AWS_CONDITIONAL_PUT", "disabled")
+    with pytest.raises(SettingsError, match="Cannot write"), map_store.writing(root):
+        pass
+    assert same_state(root) == {"one": {1}}
+
+
+def test_a_lock_is_as_old_as_the_store_says(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not as the clock of who asks."""
+    make_map(root, {"one": 1})
+    before = names(root)
+    with map_store.writing(root):
+        monkeypatch.setattr(objects, "server_time", lambda _: datetime.now(UTC) + timedelta(seconds=60))
+        with pytest.raises(SettingsError, match=r"expires within [56]\d s"), map_store.writing(root):
+            pass
+        monkeypatch.undo()
+        with pytest.raises(SettingsError, match="expires within 1"), map_store.writing(root):
+            pass
+    assert names(root) == before
 
 
 KILLED = """

@@ -1,9 +1,7 @@
 """One writer at a time on an object store: a lock object with a lease, which its holder renews.
 
-On S3 the store itself decides who gets it (conditional writes, by boto3), so two can never hold it. Elsewhere, and
-without boto3, a writer writes its name, waits and reads whether it is still there: two that start within a round trip
-of each other are detected by that, but not with certainty. Nothing in a map breaks where two do write: see
-remote_map.py.
+The store itself decides who gets it, by conditional writes, so two can never hold it; a store that has none is refused.
+Ages are by the store's clock alone. Nothing in a map breaks where two do write: see remote_map.py.
 """
 
 from __future__ import annotations
@@ -30,8 +28,6 @@ LEASE_S = 120.0
 enough to wait for after a kill on another machine."""
 RENEWALS = 6
 """Renewals within a lease: five may fail in a row."""
-_SETTLE_S = 2.0
-"""How long a name must stay on a store without conditional writes: some round trips."""
 
 
 @dataclass
@@ -44,8 +40,8 @@ class Lock:
     renewed: int = 0
     lost: str = ""
     """Why it is not held any more."""
-    etag: str | None = None
-    """ETag of the object as it was last written; None where the store has no conditional writes."""
+    version: objects.Version | None = None
+    """Of the object as it was last written."""
     released: threading.Event = field(default_factory=threading.Event)
 
     def check(self) -> None:
@@ -94,19 +90,17 @@ def _started(pid: int) -> str | None:
 
 
 def _acquire(lock: Lock, root: RemotePath) -> None:
-    found = objects.get_with_etag(lock.place)
+    found = objects.get_with_version(lock.place)
     if found is not None:
-        _check_expired(found[0], found[2], root)
+        _check_expired(found, root)
     data = _content(lock)
-    if objects.has_conditional_writes(lock.place):
-        lock.etag = objects.put_if(lock.place, data, None if found is None else found[1]) or _read_back(lock)
-        if not lock.lost and objects.put_if(lock.place, data, None) is not None:
-            lock.etag = None  # it exists, so a store with conditional writes refuses to create it
-    else:
-        objects.put(lock.place, data)
-    if lock.etag is None and not lock.lost:
-        time.sleep(_SETTLE_S)
-        _read_back(lock)
+    lock.version = objects.put_if(lock.place, data, None if found is None else found.version) or _read_back(lock)
+    if not lock.lost and objects.put_if(lock.place, data, None) is not None:  # it exists, so this is to be refused
+        objects.remove(lock.place)
+        raise SettingsError(
+            f"Cannot write to {root}: its store has no conditional writes, by which one writer at a time is sure. "
+            "Write to a folder or another store."
+        )
     if lock.lost:
         raise SettingsError(f"Another vplog process has just begun to write to {root}. Wait for it to end.")
 
@@ -127,34 +121,32 @@ def _holder(found: bytes) -> dict[str, Any]:
 
 def _write(lock: Lock, data: bytes) -> None:
     """Write the lock while it is held. A refusal is read back: it may follow a write whose response was lost."""
-    if lock.etag is not None:
-        lock.etag = objects.put_if(lock.place, data, lock.etag) or _read_back(lock)
-        return
-    _read_back(lock)
-    if not lock.lost:
-        objects.put(lock.place, data)
+    lock.version = objects.put_if(lock.place, data, lock.version) or _read_back(lock)
 
 
-def _read_back(lock: Lock) -> str | None:
-    """Read the lock back: its tag. It is lost where another writer's name is in it."""
-    found = objects.get_with_etag(lock.place)
-    if found is None or _holder(found[0]).get("token") != lock.name["token"]:
+def _read_back(lock: Lock) -> objects.Version | None:
+    """Read the lock back: its version. It is lost where another writer's name is in it."""
+    found = objects.get_with_version(lock.place)
+    if found is None or _holder(found.data).get("token") != lock.name["token"]:
         lock.lost = f"Another writer has taken {lock.place} over."
         return None
-    return found[1] or None
+    return found.version
 
 
-def _check_expired(found: bytes, age_s: float, root: RemotePath) -> None:
+def _check_expired(found: objects.Versioned, root: RemotePath) -> None:
     """Raises SettingsError where the lock is held by a process that may be alive."""
-    holder = _holder(found)
-    if not holder.get("token") or age_s > LEASE_S:
-        return
+    holder = _holder(found.data)
     known, pid = holder.get("started"), holder.get("pid")
+    if not holder.get("token"):
+        return
     if holder.get("host") == _machine() and isinstance(pid, int) and known and _started(pid) != known:
+        return
+    now = objects.server_time(root / f"{NAME}-{secrets.token_hex(8)}")
+    if (left_s := LEASE_S - (now - found.written).total_seconds()) < 0:
         return
     raise SettingsError(
         f"Another vplog process is writing to {root} (process {pid} on {str(holder.get('host')).split(' ')[0]}). "
-        f"Wait for it to end; if it was killed, its lock expires within {LEASE_S - max(age_s, 0.0):.0f} s."
+        f"Wait for it to end; if it was killed, its lock expires within {min(left_s, LEASE_S):.0f} s."
     )
 
 

@@ -30,6 +30,7 @@ from vplog.maps.storage.layout import HASH, TABLES, drive_record, folder_name
 from vplog.maps.storage.remote_map import Mirror
 from vplog.results import run_record
 from vplog.storage.folders import check_regular, regular_files
+from vplog.storage.object_store import STORES
 from vplog.storage.remote_path import RemotePath, check_writable
 from vplog.storage.scratch import put_in_place, scratch
 
@@ -48,8 +49,8 @@ def reading(root: Path, cache: Cache | None = None) -> Iterator[Store]:
         check_regular(root, "map.json")
         yield Store(root)
         return
-    if root.scheme not in ("s3", "gs"):
-        raise ResultError(f"{root} is no map: a web server lists no folders. A map is a folder, s3:// or gs://.")
+    if root.scheme not in STORES:
+        raise ResultError(f"{root} is no map: a web server lists no folders. A map is a folder, s3://, gs:// or az://.")
     try:
         with scratch("map", None if cache is None else cache.open_folders) as folder:
             mirror = Mirror(root, folder, cache=cache)

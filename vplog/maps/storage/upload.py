@@ -131,11 +131,10 @@ def write_json(mirror: Mirror, name: str) -> None:
     """Send map.json or failures.json of the local folder. Of several writers of a first map.json one wins."""
     data, place = (mirror.local / name).read_bytes(), mirror.remote / name
     with store_errors(mirror.remote):
-        if name == "map.json" and objects.has_conditional_writes(place) and objects.get(place) is None:
-            if objects.put_if(place, data, None) is None:
-                raise ResultError(f"Another writer has just made {place}. Run again.")
-            return
-        objects.put(place, data)
+        if name != "map.json" or objects.get(place) is not None:
+            objects.put(place, data)
+        elif objects.put_if(place, data, None) is None:
+            raise ResultError(f"Another writer has just made {place}. Run again.")
 
 
 def put_json(place: RemotePath, record: dict[str, Any]) -> None:
