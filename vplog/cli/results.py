@@ -31,7 +31,7 @@ _seconds = parser.number(
     lambda value: abs(value) <= _MOST_OFFSET_S, f"between -{_MOST_OFFSET_S:g} and {_MOST_OFFSET_S:g}"
 )
 _FOLDERS = ("colmap", "nerfstudio")
-_FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd", *_FOLDERS)
+_FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd", "foxglove-layout", *_FOLDERS)
 """Formats of export.py, here too since that imports numpy."""
 _BINARY = ("geoparquet", "rrd")
 
@@ -89,13 +89,15 @@ def export(arguments: argparse.Namespace) -> None:
     """Write a finished run in the format of another tool."""
     from vplog.verbs.export import export as export_run
 
+    if arguments.truth is not None and arguments.format != "rrd":
+        raise SettingsError(f"--truth is shown in rrd alone, not in {arguments.format}. Leave it out.")
     if arguments.output is parser.STDOUT and arguments.format in _FOLDERS:
         raise SettingsError(f"{arguments.format} is a folder, which stdout does not take. Name one with -o.")
     if arguments.output.is_dir() and arguments.format not in _FOLDERS:
         raise SettingsError(f"{arguments.output} is a folder, and {arguments.format} a file. Name one with -o.")
     with _file_or_stdout(arguments, arguments.format in _BINARY) as path, Progress(arguments) as progress:
         execution = Execution(arguments.threads, progress)
-        found = export_run(arguments.run, arguments.format, path, arguments.log, execution)
+        found = export_run(arguments.run, arguments.format, path, arguments.log, execution, arguments.truth)
     if arguments.json:
         print_json(found)
     elif path == arguments.output:
@@ -163,6 +165,7 @@ def add_results(
     text = "file to write, a folder for colmap and nerfstudio; - writes a file to stdout"
     option(sub, "-o --output", parser.output_or_stdout, "FILE|FOLDER|-", text, required=True)
     option(sub, "--log", place, "LOG", "log of the run, for the pictures of colmap and nerfstudio, where it has moved")
+    option(sub, "--truth", str, "FILE.tum|auto", "truth that rrd shows beside the solution")
     sub = add("optimize", optimize)
     option(sub, "graph", parser.local_file, "GRAPH.g2o")
     option(sub, "-o --output", _graph, "OUT", "the graph at its solved poses, as g2o", required=True)
