@@ -171,7 +171,7 @@ def test_rerun_reads_its_own_with_its_blueprint(verb: Verb, drive: Drive, finish
     printed = rerun(tmp_path, "rrd", "print", str(path))
     chunks = printed.splitlines()
     assert "BlueprintActivationCommand" in printed
-    assert sum("ViewBlueprint:class_identifier" in chunk for chunk in chunks) == 6  # all have something to show
+    assert sum("ViewBlueprint:class_identifier" in chunk for chunk in chunks) == 5  # all have something to show
     keyframes, _ = tables.read_keyframes(finished / "keyframes.parquet")
     accepted = int(tables.read_closures(finished / "closures.parquet").accepted.sum())
     for entity, rows, component in (
@@ -216,7 +216,7 @@ def test_a_foxglove_layout_shows_topics_of_the_run_in_panels_that_lie_in_one_tre
         return leaves(node["first"]) + leaves(node["second"])
 
     assert sorted(leaves(tree["layout"])) == sorted(panels)
-    assert {name.partition("!")[0] for name in panels} == {"3D", "Image", "Plot", "map"}
+    assert {name.partition("!")[0] for name in panels} == {"3D", "Image", "Plot"}
     topics = read_topics(finished / "result.mcap")
     images = [one["imageMode"] for name, one in panels.items() if name.startswith("Image!")]
     assert {one["imageTopic"] for one in images} == {one for one in topics if one.endswith(("/image", "/picture"))}

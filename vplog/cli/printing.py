@@ -268,6 +268,16 @@ def print_explanation(found: dict[str, Any]) -> None:
         print(f"{'picture':10}{found['picture']['file']}")
 
 
+def print_opened(found: dict[str, Any]) -> None:
+    if not found["opened"]:
+        print_line(f"{found['run']}:", f"not opened, as {found['why']}: {found['path']}")
+    elif found["viewer"] == "rerun":
+        print_line(f"{found['run']}:", "opens in rerun, until its window is closed")
+    else:
+        where = "in the browser" if found["viewer"] == "report" else "in Foxglove"
+        print_line(f"{found['run']}:", f"{found['path']} opens {where}")
+
+
 def print_optimised(found: dict[str, Any]) -> None:
     print(
         f"{found['output']}: {found['poses']} poses, {found['edges']} edges; of {found['loops']} closures "

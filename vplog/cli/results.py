@@ -33,6 +33,8 @@ _seconds = parser.number(
 _FOLDERS = ("colmap", "nerfstudio")
 _FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd", "foxglove-layout", *_FOLDERS)
 """Formats of export.py, here too since that imports numpy."""
+_VIEWERS = ("rerun", "report", "foxglove")
+"""Those of open_run.py, here too since that imports numpy."""
 _BINARY = ("geoparquet", "rrd")
 
 
@@ -104,6 +106,18 @@ def export(arguments: argparse.Namespace) -> None:
         print("\n".join(found["written"]))
 
 
+def open_run(arguments: argparse.Namespace) -> None:
+    """Open a finished run in rerun, in Foxglove, or its report in the browser."""
+    from vplog.verbs.open_run import opening
+
+    with opening(arguments.run, arguments.viewer) as opened:
+        found = {"run": arguments.run, "viewer": opened.viewer, "path": opened.path, "opened": opened.start is not None}
+        print_result(arguments, found | {"why": opened.why}, printing.print_opened)
+        sys.stdout.flush()  # the viewer may stay for hours
+        if opened.start is not None and not opened.start():
+            raise ResultError(f"{opened.viewer} did not open {opened.path}. Choose another with --with.")
+
+
 def _truth_options(arguments: argparse.Namespace) -> TruthOptions:
     from vplog.verbs.evaluate_run import TruthOptions
 
@@ -166,6 +180,10 @@ def add_results(
     option(sub, "-o --output", parser.output_or_stdout, "FILE|FOLDER|-", text, required=True)
     option(sub, "--log", place, "LOG", "log of the run, for the pictures of colmap and nerfstudio, where it has moved")
     option(sub, "--truth", str, "FILE.tum|auto", "truth that rrd shows beside the solution")
+    sub = add("open", open_run)
+    option(sub, "run", place, "RUN")
+    text = "viewer (default: rerun where it is installed, else the report in the browser)"
+    sub.add_argument("--with", choices=_VIEWERS, dest="viewer", help=text)
     sub = add("optimize", optimize)
     option(sub, "graph", parser.local_file, "GRAPH.g2o")
     option(sub, "-o --output", _graph, "OUT", "the graph at its solved poses, as g2o", required=True)

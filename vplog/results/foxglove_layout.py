@@ -7,7 +7,7 @@ from typing import Any
 
 from vplog.data import Floats
 from vplog.results.foxglove import MAP
-from vplog.results.mcap import EARTH, FIXES, PICTURES, REFERENCE
+from vplog.results.mcap import PICTURES, REFERENCE
 
 _HIDDEN = ("/graph/rejected",)
 """Topics of the 3D panel that are there, but not shown until they are switched on: they are many lines."""
@@ -16,18 +16,16 @@ _FOV_DEG = 45.0
 
 
 def foxglove_layout(topics: Collection[str], positions_m: Floats) -> dict[str, Any]:
-    """The layout that `Import layout` of Foxglove reads: panels by id and the tree of splits that they lie in.
+    """The layout that Foxglove imports: panels by id, and the tree of splits that they lie in.
 
-    `topics` are those of the file: there is no panel for what it lacks. `positions_m` (N, 3) are to be in view.
+    `topics` are those of the file: there is no panel for what it lacks, nor one that asks servers for tiles of a map.
+    `positions_m` (N, 3) are to be in view.
     """
     panels = {"3D!map": _map(positions_m)}
     images = {one.removesuffix("/image"): one for one in topics if one.startswith("/cam/") and one.endswith("/image")}
     pictures = [*images.items(), *((topic.removesuffix("/image"), topic) for topic in (PICTURES, REFERENCE))]
     panels |= {f"Image!{base.strip('/')}": _image(base, one, topics) for base, one in pictures if one in topics}
     beside = [name for name in panels if name.startswith("Image!")]
-    if EARTH in topics:
-        beside.append("map!earth")
-        panels["map!earth"] = {"layer": "map", "disabledTopics": [], "followTopic": FIXES}
     panels["Plot!residuals"] = _plot("Residual of closures in sigma", _of_accepted("residual_before", "residual_after"))
     panels["Plot!inliers"] = _plot("Inliers of closures", {"inliers": '/loop_closures{verdict=="accepted"}.inliers'})
     upper = _split("row", "3D!map", _stack(beside), 60) if beside else "3D!map"

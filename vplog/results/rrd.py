@@ -81,7 +81,7 @@ def _log(recording: Any, rr: Any, tracks: Tracks, closures: Closures) -> None:
 
 
 def _blueprint(tracks: Tracks, topics: Collection[str]) -> Any:
-    """Map beside the pictures that there are, errors over time below."""
+    """Map beside the pictures that there are, errors over time below; no view that asks servers for tiles of a map."""
     import rerun.blueprint as rrb
 
     pictures: list[Any] = []
@@ -89,8 +89,6 @@ def _blueprint(tracks: Tracks, topics: Collection[str]) -> Any:
         pictures.append(rrb.Spatial2DView(origin=f"{_CAMERA}/image", name="Camera"))
     if tracks.found.pictures:
         pictures.append(rrb.Spatial2DView(origin=_PICTURES, name="Closures"))
-    if tracks.earth is not None:
-        pictures.append(rrb.MapView(origin="earth", name="On earth"))
     space = rrb.Spatial3DView(origin="map", name="Map")
     upper = rrb.Horizontal(space, rrb.Vertical(*pictures), column_shares=[3, 2]) if pictures else space
     plots = [
