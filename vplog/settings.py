@@ -153,6 +153,47 @@ def _allowed(node: dict[str, Any]) -> str:
     return f"{kind}{f' ({limits})' if limits else ''}{items}"
 
 
+def commented_yaml(settings: Settings) -> str:
+    """All settings as YAML, each below its sentences as a comment."""
+    lines: list[str] = []
+    _comment(lines, settings, "")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _comment(lines: list[str], settings: Settings, indent: str) -> None:
+    sentences = {name: one.get("description", "") for name, one in _schema(type(settings))["properties"].items()}
+    for name, value in settings:
+        lines += [f"{indent}# {line}" for line in sentences.get(name, "").splitlines()]
+        if isinstance(value, Settings):
+            lines.append(f"{indent}{name}:")
+            _comment(lines, value, f"{indent}  ")
+        else:
+            text = yaml.safe_dump({name: settings.model_dump(mode="json")[name]}, sort_keys=False)
+            lines += [f"{indent}{line}" for line in text.splitlines()]
+
+
+def explained(settings: Settings, name: str) -> dict[str, Any]:
+    """One setting by its dotted name, as `places.agreement`: value, default, what is allowed, and its sentences; of a
+    group its value and sentences. Raises SettingsError."""
+    *groups, last = name.split(".")
+    schema = _schema(type(settings))
+    group, owner = settings, type(settings)
+    for depth, part in enumerate(groups):
+        group = getattr(group, part, None) if part in type(group).model_fields else None
+        if not isinstance(group, Settings):
+            raise SettingsError(
+                f"{name} is no setting.{_other_names([*groups[:depth], part], [], schema)} {_A_SETTING}"
+            )
+        owner = type(group)
+    if last not in owner.model_fields:
+        near = _other_names([*groups, last], list(owner.model_fields), schema)
+        raise SettingsError(f"{name} is no setting.{near} {_A_SETTING}")
+    node, value = _schema(owner)["properties"][last], group.model_dump(mode="json")[last]
+    found = {"setting": name, "value": value, "default": node.get("default", value)}
+    is_group = isinstance(getattr(group, last), Settings)
+    return found | {"allowed": "" if is_group else _allowed(node), "description": node.get("description", "")}
+
+
 def load_yaml(path: Path, remedy: str = _A_FILE) -> dict[str, Any]:
     """A YAML file as a tree. Raises SettingsError, which ends with the remedy, where it is not one."""
     try:

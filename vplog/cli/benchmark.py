@@ -9,7 +9,8 @@ from functools import partial
 from vplog import api
 from vplog.cli import parser, printing
 from vplog.cli.parser import call, option, place
-from vplog.cli.printing import Progress, print_result
+from vplog.cli.printing import print_result
+from vplog.cli.progress import Progress
 from vplog.execution.execution import Execution
 
 

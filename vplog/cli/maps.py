@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 from vplog import api
 from vplog.cli import parser, printing
 from vplog.cli.parser import call, flag, option, place
-from vplog.cli.printing import Progress, print_result
+from vplog.cli.printing import print_result
+from vplog.cli.progress import Progress
 from vplog.errors import plural
 from vplog.execution.execution import Execution
 
