@@ -176,22 +176,22 @@ def explained(settings: Settings, name: str) -> dict[str, Any]:
     """One setting by its dotted name, as `places.agreement`: value, default, what is allowed, and its sentences; of a
     group its value and sentences. Raises SettingsError."""
     *groups, last = name.split(".")
-    schema = _schema(type(settings))
-    group, owner = settings, type(settings)
-    for depth, part in enumerate(groups):
-        group = getattr(group, part, None) if part in type(group).model_fields else None
-        if not isinstance(group, Settings):
-            raise SettingsError(
-                f"{name} is no setting.{_other_names([*groups[:depth], part], [], schema)} {_A_SETTING}"
-            )
-        owner = type(group)
-    if last not in owner.model_fields:
-        near = _other_names([*groups, last], list(owner.model_fields), schema)
+    schema, group = _schema(type(settings)), settings
+    for part in groups:
+        inner = getattr(group, part, None) if part in type(group).model_fields else None
+        if not isinstance(inner, Settings):
+            known = f" Groups: {', '.join(type(settings).model_fields)}."
+            near = nearest(last, _names(schema), key=_last, cutoff=0.8) or known
+            raise SettingsError(f"{name} is no setting.{near} {_A_SETTING}")
+        group = inner
+    own = _schema(type(group))
+    if last not in type(group).model_fields:
+        near = _other_names([*groups, last], list(type(group).model_fields), schema)
         raise SettingsError(f"{name} is no setting.{near} {_A_SETTING}")
-    node, value = _schema(owner)["properties"][last], group.model_dump(mode="json")[last]
-    found = {"setting": name, "value": value, "default": node.get("default", value)}
-    is_group = isinstance(getattr(group, last), Settings)
-    return found | {"allowed": "" if is_group else _allowed(node), "description": node.get("description", "")}
+    node, value = own["properties"][last], group.model_dump(mode="json")[last]
+    allowed = "" if isinstance(getattr(group, last), Settings) else _allowed(_resolved(node, own))
+    found = {"setting": name, "value": value, "default": node.get("default", value), "allowed": allowed}
+    return found | {"description": node.get("description", "")}
 
 
 def load_yaml(path: Path, remedy: str = _A_FILE) -> dict[str, Any]:

@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """The verbs: each a plain function of its arguments. The only place that prints and exits."""
 
 from __future__ import annotations
@@ -50,7 +51,10 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
         os.environ.setdefault(name, "1")
     sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # noqa: SIM115, PTH123 (of the process)
     words = sys.argv[1:] if argv is None else argv
-    arguments = _parser().parse_args(words)
+    root = _parser()
+    if "_ARGCOMPLETE" in os.environ:  # set by the shell's completion, of the extra `completion`
+        _complete(root)
+    arguments = root.parse_args(words)
     arguments.command = words
     arguments.shown = getattr(arguments, "output", None)  # a verb may write elsewhere first
     try:
@@ -81,6 +85,14 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
         text = " ".join(str(error).split())[:200]
         _fail(arguments, f"Internal error: {type(error).__name__}: {text}. See it with --debug.")
     sys.exit(0)
+
+
+def _complete(root: argparse.ArgumentParser) -> None:
+    """Write the words that may follow those in the environment, and exit; nothing without argcomplete."""
+    with suppress(ImportError):
+        import argcomplete
+
+        argcomplete.autocomplete(root)
 
 
 @contextmanager
@@ -305,12 +317,14 @@ def _parser() -> argparse.ArgumentParser:
     root = Parser(prog="vplog", description=about)
     root.add_argument("-V", "--version", action="version", version=f"vplog {__version__}")
     common = argparse.ArgumentParser(add_help=False)
-    flag(common, "--json", "print one JSON object")
-    flag(common, "--debug", "show the traceback of an error")
+    said = common.add_argument_group("output and errors")
+    flag(said, "--json", "print one JSON object")
+    flag(said, "--debug", "show the traceback of an error")
     topics = parser.topic_options()
     threads = argparse.ArgumentParser(add_help=False)
-    option(threads, "--threads", parser.at_least_one, "N", "threads (default: all cores)", default=available())
-    option(threads, "--events", parser.output_file, "FILE", "write progress as JSON lines, each as it happens")
+    work = threads.add_argument_group("execution")
+    option(work, "--threads", parser.at_least_one, "N", "threads (default: all cores)", default=available())
+    option(work, "--events", parser.output_file, "FILE", "write progress as JSON lines, each as it happens")
     settings = parser.settings_options("default", "default")
     verbs = root.add_subparsers(title="verbs", required=True, metavar="VERB")
 

@@ -126,7 +126,8 @@ def _truth_options(arguments: argparse.Namespace) -> TruthOptions:
     return TruthOptions(**{name: value for name in names if (value := getattr(arguments, name)) is not None})
 
 
-def _add_truth_options(sub: argparse.ArgumentParser) -> None:
+def _add_truth_options(verb: argparse.ArgumentParser) -> None:
+    sub = verb.add_argument_group("places and alignment of the truth")
     option(sub, "--distance-m", parser.positive, "M", "largest distance within one place (default: 6)")
     option(sub, "--heading-deg", parser.positive, "DEG", "largest angle between optical axes (default: 45)")
     sub.add_argument("--align", choices=_ALIGNMENTS, help="alignment of the ATE (default: se3)")

@@ -231,7 +231,8 @@ def _draw_example(
             f"Left: a query and the frame of the map that shows the same place{answered}, with the middles of the "
             "windows. Right: reference images that explain the query, with the votes of all features of the frame at "
             "the left (bright: many) and, in the colour of each window, the box it is found in. The same place: the "
-            "same references, and boxes of one colour in one spot. A frame of the library is explained by itself first.",
+            "same references, and boxes of one colour in one spot. A frame of the library is explained by itself "
+            "first.",
         )
 
 
