@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import threading
 import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from vplog.batch.worker import Drive
 from vplog.cli import progress
 from vplog.cli.progress import Events, Progress
 from vplog.pipeline import STAGES
@@ -84,28 +86,38 @@ def test_the_time_to_the_end_is_learned_from_the_latest_run_beside(tmp_path: Pat
         write_run_json(tmp_path / name / "run.json", {"stages": stages, "finished": True})
         time.sleep(0.01)
     shown = Progress(namespace(tmp_path / "e"), ("a", "b", "c"), tmp_path / "out")
-    shown("a", 0, 1)
-    shown("a", 1, 1)
-    shown._stages["a"].seconds = 10.0
+    shown("a", 0, 2)
+    shown("a", 2, 2)
+    assert [one["event"] for one in told(tmp_path / "e")] == ["stage_started", "progress"]  # its items are done, not it
     shown("b", 0, 1)
+    assert shown._stages["a"].seconds is not None
+    shown._stages["a"].seconds = 10.0
     assert shown._total_eta_s(shown._stages["b"]) == pytest.approx(40 + 20, abs=0.5)
     assert shown._line(shown._stages["b"]) == "stage 2 of 3, b, for 0 s, 60 s to the end"
 
 
-def test_off_a_terminal_a_stage_that_is_silent_has_its_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_drive_of_a_batch_has_its_event_and_its_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Progress(namespace(tmp_path / "e")).print_drive(Drive("a", "a.mcap", "failed", seconds=2.0, error="Damaged."))
+    assert told(tmp_path / "e")[0] | {"time_s": 0} == {
+        "event": "drive_finished", "time_s": 0, "drive": "a", "state": "failed", "seconds": 2.0, "error": "Damaged."
+    }  # fmt: skip
+    assert capsys.readouterr().err == "vplog: a: failed, 2.0 s: Damaged.\n"
+
+
+def test_off_a_terminal_a_stage_that_is_silent_has_its_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lines, said = [], threading.Event()
     monkeypatch.setattr(progress, "LINE_EVERY_S", 0.05)
     monkeypatch.setattr(progress, "_HEARTBEAT_S", 0.05)
+    monkeypatch.setattr(progress, "print_status", lambda text: (lines.append(text), said.set()))
     with Progress(namespace(tmp_path / "e"), ("solve",)) as shown:
         shown("solve", 0, 1)
-        time.sleep(0.4)
+        assert said.wait(60)
         shown("solve", 1, 1)
-    lines = capsys.readouterr().err.splitlines()
-    assert 1 <= len(lines) <= 8
-    assert set(lines) == {"vplog: stage 1 of 1, solve, for 0 s"}
-    assert {one["event"] for one in told(tmp_path / "e")} == {"stage_started", "progress", "stage_finished"}
-    with Progress(namespace(tmp_path / "e", json=True)) as shown:
+    assert lines[0].startswith("stage 1 of 1, solve, for ")
+    events = [one["event"] for one in told(tmp_path / "e")]
+    assert (events[0], events[1], events[-1]) == ("stage_started", "progress", "stage_finished")
+    lines.clear()
+    with Progress(namespace(tmp_path / "f", json=True)) as shown:
         shown("solve", 0, 1)
         time.sleep(0.2)
-    assert not capsys.readouterr().err
+    assert not lines

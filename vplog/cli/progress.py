@@ -124,6 +124,9 @@ class Progress:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._end.set()
         self._bars.stop()
+        if error is None:
+            with self._lock:
+                self._finish_steps()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         with self._lock:
@@ -135,18 +138,29 @@ class Progress:
             self._follow(stage, done, total)
 
     def _follow(self, name: str, done: int, total: int) -> None:
-        stage, now = self._stages.get(name), time.monotonic()
+        stage, step = self._stages.get(name), name in self._known
         if stage is None or (stage.seconds is not None and done < total):
-            stage = self._stages[name] = _Stage(name, total, now)
+            if step:
+                self._finish_steps()
+            stage = self._stages[name] = _Stage(name, total, time.monotonic())
             self._write("stage_started", stage, total=total)
         if stage.seconds is not None:
             return
         stage.done, stage.total = done, total
-        if done >= total:
-            stage.seconds = round(now - stage.began_s, 3)
-            self._write("stage_finished", stage, total=total, seconds=stage.seconds)
-        elif done and now - stage.told_s >= _EVENT_EVERY_S:
+        if done >= total and not step:
+            self._finish(stage)
+        elif done and time.monotonic() - stage.told_s >= _EVENT_EVERY_S:
             self._write_progress(stage)
+
+    def _finish_steps(self) -> None:
+        """The step of a run lasts until the next begins: when all its items are done, there may be more to do."""
+        for stage in self._stages.values():
+            if stage.seconds is None and stage.name in self._known:
+                self._finish(stage)
+
+    def _finish(self, stage: _Stage) -> None:
+        stage.seconds = round(time.monotonic() - stage.began_s, 3)
+        self._write("stage_finished", stage, total=stage.total, seconds=stage.seconds)
 
     def _write(self, event: str, stage: _Stage, **fields: Any) -> None:
         number, of = self._number(stage.name)
@@ -205,7 +219,9 @@ class Progress:
         )
 
     def print_drive(self, drive: Drive) -> None:
-        """A line for each drive of a batch where there are no bars, as in the log of a job of the night."""
+        """An event for each drive of a batch; where there are no bars a line, as in the log of a job of the night."""
+        about = {"state": drive.state, "seconds": drive.seconds, "error": without_secrets(drive.error) or None}
+        self._events.write("drive_finished", drive=drive.drive, **about)
         if self._line_by_line:
             print_status(
                 f"{drive.drive}: {drive.state}, {drive.seconds:.1f} s{f': {drive.error}' if drive.error else ''}"
