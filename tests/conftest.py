@@ -15,7 +15,7 @@ import pytest
 from hypothesis import settings
 
 from tests import durations
-from vplog.cli import main
+from vplog.cli import main, progress
 from vplog.demo import SMALL, make_drive
 from vplog.execution.execution import Execution
 from vplog.execution.process_pool import OwnProcesses
@@ -92,6 +92,14 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Tests keep out of the user's cache."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VPLOG_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_lines() -> Iterator[None]:
+    """A slow machine adds no line a minute to what verbs say on stderr."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(progress, "LINE_EVERY_S", 1e9)
         yield
 
 

@@ -145,6 +145,13 @@ def pipeline_folder() -> Path:
     return inside if inside.is_dir() else package.parent / "pipelines"
 
 
+STAGES = (
+    "read", "extract", "choose", "learn", "cover", "describe", "propose", "verify", "p_false", "decide", "solve",
+    "write", "report",
+)  # fmt: skip
+"""Names of the steps of `run` in order, as run.json and progress have them; `decide` is for decisions alone."""
+
+
 def run(
     path: Path | Sequence[Path],
     out: Path,

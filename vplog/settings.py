@@ -153,6 +153,47 @@ def _allowed(node: dict[str, Any]) -> str:
     return f"{kind}{f' ({limits})' if limits else ''}{items}"
 
 
+def commented_yaml(settings: Settings) -> str:
+    """All settings as YAML, each below its sentences as a comment."""
+    lines: list[str] = []
+    _comment(lines, settings, "")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _comment(lines: list[str], settings: Settings, indent: str) -> None:
+    sentences = {name: one.get("description", "") for name, one in _schema(type(settings))["properties"].items()}
+    for name, value in settings:
+        lines += [f"{indent}# {line}" for line in sentences.get(name, "").splitlines()]
+        if isinstance(value, Settings):
+            lines.append(f"{indent}{name}:")
+            _comment(lines, value, f"{indent}  ")
+        else:
+            text = yaml.safe_dump({name: settings.model_dump(mode="json")[name]}, sort_keys=False)
+            lines += [f"{indent}{line}" for line in text.splitlines()]
+
+
+def explained(settings: Settings, name: str) -> dict[str, Any]:
+    """One setting by its dotted name, as `places.agreement`: value, default, what is allowed, and its sentences; of a
+    group its value and sentences. Raises SettingsError."""
+    *groups, last = name.split(".")
+    schema, group = _schema(type(settings)), settings
+    for part in groups:
+        inner = getattr(group, part, None) if part in type(group).model_fields else None
+        if not isinstance(inner, Settings):
+            known = f" Groups: {', '.join(type(settings).model_fields)}."
+            near = nearest(last, _names(schema), key=_last, cutoff=0.8) or known
+            raise SettingsError(f"{name} is no setting.{near} {_A_SETTING}")
+        group = inner
+    own = _schema(type(group))
+    if last not in type(group).model_fields:
+        near = _other_names([*groups, last], list(type(group).model_fields), schema)
+        raise SettingsError(f"{name} is no setting.{near} {_A_SETTING}")
+    node, value = own["properties"][last], group.model_dump(mode="json")[last]
+    allowed = "" if isinstance(getattr(group, last), Settings) else _allowed(_resolved(node, own))
+    found = {"setting": name, "value": value, "default": node.get("default", value), "allowed": allowed}
+    return found | {"description": node.get("description", "")}
+
+
 def load_yaml(path: Path, remedy: str = _A_FILE) -> dict[str, Any]:
     """A YAML file as a tree. Raises SettingsError, which ends with the remedy, where it is not one."""
     try:

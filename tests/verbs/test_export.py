@@ -23,6 +23,8 @@ from vplog.places.bobb import BobbSettings, BobbState
 from vplog.places.bobb_paper import PaperBobbSettings, PaperBobbState
 from vplog.results import tables
 from vplog.results.contracts import LAYOUTS
+from vplog.results.mcap_read import read_pictures, read_topics
+from vplog.results.messages import loop_closure_class
 from vplog.verbs.export import FORMATS
 
 if TYPE_CHECKING:
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
     from conftest import Said
 
     from vplog.data import Floats
+    from vplog.demo.record import Drive
 
     Verb = Callable[..., Said]
 
@@ -161,11 +164,16 @@ def test_utm_is_the_path_in_metres(exported: Callable[[str], Path], finished: Pa
 
 
 @pytest.mark.skipif(importlib.util.find_spec("rerun_cli") is None, reason="rerun-sdk is not installed")
-def test_rerun_reads_its_own(exported: Callable[[str], Path], finished: Path, tmp_path: Path) -> None:
-    path = exported("rrd")
+def test_rerun_reads_its_own_with_its_blueprint(verb: Verb, drive: Drive, finished: Path, tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    assert verb("export", finished, "--format", "rrd", "-o", path, "--truth", drive.truth).code == 0
     rerun(tmp_path, "rrd", "verify", str(path))
-    chunks = rerun(tmp_path, "rrd", "print", str(path)).splitlines()
+    printed = rerun(tmp_path, "rrd", "print", str(path))
+    chunks = printed.splitlines()
+    assert "BlueprintActivationCommand" in printed
+    assert sum("ViewBlueprint:class_identifier" in chunk for chunk in chunks) == 5  # all have something to show
     keyframes, _ = tables.read_keyframes(finished / "keyframes.parquet")
+    accepted = int(tables.read_closures(finished / "closures.parquet").accepted.sum())
     for entity, rows, component in (
         ("/map/path/odometry", 1, "LineStrips3D:strips"),
         ("/map/path/optimised", 1, "LineStrips3D:strips"),
@@ -174,6 +182,11 @@ def test_rerun_reads_its_own(exported: Callable[[str], Path], finished: Path, tm
         ("/map/body", len(keyframes.stamp_ns), "Transform3D:translation"),
         ("/map/body/camera", 1, "Pinhole:image_from_camera"),
         ("/map/body/camera/image", len(keyframes.stamp_ns), "EncodedImage:blob"),
+        ("/map/path/truth", 1, "LineStrips3D:strips"),
+        ("/closures/picture", len(read_pictures(finished / "result.mcap").pictures), "EncodedImage:blob"),
+        ("/errors/sigma/after", accepted, "Scalars:scalars"),
+        ("/errors/metres/odometry", len(keyframes.stamp_ns), "Scalars:scalars"),
+        ("/errors/metres/truth", len(keyframes.stamp_ns), "Scalars:scalars"),
     ):
         found = [int(c.split("with ")[1].split()[0]) for c in chunks if f"- {entity} -" in c and component in c]
         assert sum(found) == rows, entity
@@ -184,8 +197,41 @@ def test_without_rerun_one_line_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     said = verb("export", finished, "--format", "rrd", "-o", tmp_path / "a.rrd")
-    assert "pip install rerun-sdk" in said.error
+    assert "pip install 'vplog[rerun]'" in said.error
     assert not list(tmp_path.iterdir())
+
+
+def test_a_foxglove_layout_shows_topics_of_the_run_in_panels_that_lie_in_one_tree(
+    exported: Callable[[str], Path], finished: Path
+) -> None:
+    """As Foxglove's own layouts: a config for every panel of the tree, `Type!id`, and no topic that is not there."""
+    tree = json.loads(exported("foxglove-layout").read_text())
+    panels = tree["configById"]
+
+    def leaves(node: Any) -> list[str]:
+        if isinstance(node, str):
+            return [node]
+        assert set(node) == {"direction", "first", "second", "splitPercentage"}
+        assert node["direction"] in ("row", "column")
+        return leaves(node["first"]) + leaves(node["second"])
+
+    assert sorted(leaves(tree["layout"])) == sorted(panels)
+    assert {name.partition("!")[0] for name in panels} == {"3D", "Image", "Plot"}
+    topics = read_topics(finished / "result.mcap")
+    images = [one["imageMode"] for name, one in panels.items() if name.startswith("Image!")]
+    assert {one["imageTopic"] for one in images} == {one for one in topics if one.endswith(("/image", "/picture"))}
+    named = [*panels["3D!map"]["topics"], *(one["calibrationTopic"] for one in images if "calibrationTopic" in one)]
+    named += [topic for one in images for topic in one.get("annotations", ())]
+    assert set(named) <= set(topics)
+    fields = loop_closure_class().DESCRIPTOR.fields_by_name
+    for path in (series["value"] for one in panels.values() for series in one.get("paths", ())):
+        assert path.startswith("/loop_closures{")
+        assert path.rpartition(".")[2] in fields
+
+
+def test_a_truth_is_for_rerun_alone(verb: Verb, finished: Path, tmp_path: Path) -> None:
+    said = verb("export", finished, "--format", "tum", "-o", tmp_path / "a.tum", "--truth", "auto")
+    assert "--truth is shown in rrd alone" in said.error
 
 
 def test_a_run_without_fixes_has_no_place_on_earth(verb: Verb, finished: Path, tmp_path: Path) -> None:

@@ -194,7 +194,7 @@ def draw_reliability(found: dict[str, Reliability], folder: Path) -> None:
             top.plot(
                 one.confidence[filled], one.accuracy[filled], marker="o", color=colour,
                 label=f"{as_text(plain_name)}  ECE {one.expected_calibration_error:.3f}, "
-                f"over-confident by {one.overconfidence:+.3f}",
+                f"{'over' if one.overconfidence > 0 else 'under'}-confident by {abs(one.overconfidence):.3f}",
             )  # fmt: skip
             width = (one.edges[1] - one.edges[0]) / len(found)
             below.bar(one.edges[:-1] + number * width, one.count, width, align="edge", color=colour)

@@ -92,8 +92,11 @@ class Steps:
 
     def __call__(self, one: Step[T], *inputs: Any) -> T:
         """The result of a step, from the cache or computed."""
-        with self._watch.stage(one.name, one.items(*inputs) if one.items else None):
+        items = one.items(*inputs) if one.items else None
+        self._execution.progress(one.name, 0, items or 1)
+        with self._watch.stage(one.name, items):
             value, reused = self._result(one, one.name, inputs)
+        self._execution.progress(one.name, items or 1, items or 1)
         self._results.setdefault(one.name, {"result": "reused" if reused else "computed"})
         return value
 

@@ -9,7 +9,8 @@ from functools import partial
 from vplog import api
 from vplog.cli import parser, printing
 from vplog.cli.parser import call, option, place
-from vplog.cli.printing import Progress, print_result
+from vplog.cli.printing import print_result
+from vplog.cli.progress import Progress
 from vplog.execution.execution import Execution
 
 
@@ -44,7 +45,8 @@ def add_studies(add: Callable[..., argparse.ArgumentParser], *parents: argparse.
 
 
 def _truth_options(required: bool) -> argparse.ArgumentParser:
-    sub = argparse.ArgumentParser(add_help=False)
+    parent = argparse.ArgumentParser(add_help=False)
+    sub = parent.add_argument_group("truth, library and cache")
     text = (
         "equal numbers in file names or frames, a table `query,match` or `image,label`, VPR-Bench's array, folders as "
         "labels, positions in file names, poses in one frame, the odometry of the drives, or their GPS"
@@ -60,7 +62,7 @@ def _truth_options(required: bool) -> argparse.ArgumentParser:
     text = "reference images of the library (default: 100)"
     option(sub, "--library-size", parser.at_least_one, "L", text, default=100)
     parser.cache_options(sub, "features are kept between calls")
-    return sub
+    return parent
 
 
 def _add_comparison(sub: argparse.ArgumentParser) -> None:

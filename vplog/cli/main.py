@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """The verbs: each a plain function of its arguments. The only place that prints and exits."""
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from vplog.cli import parser, printing
 from vplog.cli.benchmark import add_studies
 from vplog.cli.maps import add_maps
 from vplog.cli.parser import Parser, flag, option, place
-from vplog.cli.printing import Progress, print_json, print_result, print_status
+from vplog.cli.printing import print_json, print_result, print_status
+from vplog.cli.progress import Progress, events_of
 from vplog.cli.results import add_results
 from vplog.errors import LogError, VplogError, plural, was_interrupted
 from vplog.execution.cores import available, limited
@@ -49,11 +51,19 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
         os.environ.setdefault(name, "1")
     sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # noqa: SIM115, PTH123 (of the process)
     words = sys.argv[1:] if argv is None else argv
-    arguments = _parser().parse_args(words)
+    root = _parser()
+    if "_ARGCOMPLETE" in os.environ:  # set by the shell's completion, of the extra `completion`
+        _complete(root)
+    arguments = root.parse_args(words)
     arguments.command = words
     arguments.shown = getattr(arguments, "output", None)  # a verb may write elsewhere first
     try:
-        with _interrupted_by(signal.SIGTERM), _local_copies(arguments), limited(getattr(arguments, "threads", None)):
+        with (
+            _interrupted_by(signal.SIGTERM),
+            events_of(arguments),
+            _local_copies(arguments),
+            limited(getattr(arguments, "threads", None)),
+        ):
             arguments.verb(arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output has gone; nothing is wrong
@@ -75,6 +85,14 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
         text = " ".join(str(error).split())[:200]
         _fail(arguments, f"Internal error: {type(error).__name__}: {text}. See it with --debug.")
     sys.exit(0)
+
+
+def _complete(root: argparse.ArgumentParser) -> None:
+    """Write the words that may follow those in the environment, and exit; nothing without argcomplete."""
+    with suppress(ImportError):
+        import argcomplete
+
+        argcomplete.autocomplete(root)
 
 
 @contextmanager
@@ -195,11 +213,12 @@ def library(arguments: argparse.Namespace) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Turn a recorded drive into an optimised trajectory; several drives into one map where closures join them."""
+    from vplog.pipeline import STAGES
     from vplog.run.report import outcome_of
 
     paths, pipeline, library, topics = _request(arguments)
     remote = "://" in str(arguments.shown)  # and `output` what is sent there
-    with Progress(arguments) as progress:
+    with Progress(arguments, STAGES, arguments.output) as progress:
         found = api.run(
             paths, arguments.output, pipeline, topics=topics, library=library, one_drive=arguments.one_drive,
             cache=arguments.cache and not remote, force=arguments.force, threads=arguments.threads, progress=progress,
@@ -241,11 +260,15 @@ def _request(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path 
 
 
 def config(arguments: argparse.Namespace) -> None:
-    """Print every setting of a pipeline as YAML, in the form of a pipeline file."""
-    import yaml
+    """Print every setting of a pipeline as YAML with comments, in the form of a pipeline file, or explain one."""
+    from vplog.settings import commented_yaml, explained
 
-    tree = parser.pipeline_of(arguments).model_dump(mode="json")
-    print_result(arguments, tree, lambda tree: print(yaml.safe_dump(tree, sort_keys=False), end=""))
+    pipeline = parser.pipeline_of(arguments)
+    if arguments.setting is not None:
+        print_result(arguments, explained(pipeline, arguments.setting), printing.print_setting)
+    else:
+        tree = pipeline.model_dump(mode="json")
+        print_result(arguments, tree, lambda _: print(commented_yaml(pipeline), end=""))
 
 
 def schemas(arguments: argparse.Namespace) -> None:
@@ -270,14 +293,15 @@ def _folder(path: Path) -> None:
 def demo(arguments: argparse.Namespace) -> None:
     """Render a small drive, run on it and evaluate the result."""
     from vplog.demo import DemoSettings, make_drive
+    from vplog.pipeline import STAGES
     from vplog.run.report import outcome_of
     from vplog.verbs.report import report as write_report
 
     pipeline = parser.pipeline_of(arguments)
     _folder(arguments.output)
-    with Progress(arguments) as progress:
+    out = arguments.output / "run"
+    with Progress(arguments, STAGES, out) as progress:
         drive = make_drive(arguments.output / "drive", DemoSettings(), Execution(arguments.threads, progress))
-        out = arguments.output / "run"
         done = api.run(drive.log, out, pipeline, force=arguments.force, threads=arguments.threads, progress=progress)
     found = api.evaluate(done, drive.truth)
     write_report(out, truth=str(drive.truth))
@@ -293,11 +317,14 @@ def _parser() -> argparse.ArgumentParser:
     root = Parser(prog="vplog", description=about)
     root.add_argument("-V", "--version", action="version", version=f"vplog {__version__}")
     common = argparse.ArgumentParser(add_help=False)
-    flag(common, "--json", "print one JSON object")
-    flag(common, "--debug", "show the traceback of an error")
+    said = common.add_argument_group("output and errors")
+    flag(said, "--json", "print one JSON object")
+    flag(said, "--debug", "show the traceback of an error")
     topics = parser.topic_options()
     threads = argparse.ArgumentParser(add_help=False)
-    option(threads, "--threads", parser.at_least_one, "N", "threads (default: all cores)", default=available())
+    work = threads.add_argument_group("execution")
+    option(work, "--threads", parser.at_least_one, "N", "threads (default: all cores)", default=available())
+    option(work, "--events", parser.output_file, "FILE", "write progress as JSON lines, each as it happens")
     settings = parser.settings_options("default", "default")
     verbs = root.add_subparsers(title="verbs", required=True, metavar="VERB")
 
@@ -332,7 +359,8 @@ def _parser() -> argparse.ArgumentParser:
     _add_force(sub)
     sub = add("schemas", schemas)
     option(sub, "-o --output", parser.local, "OUT", "folder (default: schemas)", default=Path("schemas"))
-    add("config", config, settings)
+    sub = add("config", config, settings)
+    option(sub, "setting", str, "SETTING", "explain this one, as places.agreement (default: print all)", nargs="?")
     sub = group("help", "Show what a verb does, and all its options.")
     sub.add_argument("words", nargs="*", metavar="VERB", help="such as `run` or `map query` (default: list the verbs)")
     sub.set_defaults(

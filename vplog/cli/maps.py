@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 from vplog import api
 from vplog.cli import parser, printing
 from vplog.cli.parser import call, flag, option, place
-from vplog.cli.printing import Progress, print_result
+from vplog.cli.printing import print_result
+from vplog.cli.progress import Progress
 from vplog.errors import plural
 from vplog.execution.execution import Execution
 
@@ -202,8 +203,9 @@ def _box(text: str) -> tuple[float, float, float, float]:
     return south, west, north, east
 
 
-def _add_workers(sub: argparse.ArgumentParser) -> None:
+def _add_workers(verb: argparse.ArgumentParser) -> None:
     """Who computes drives."""
+    sub = verb.add_argument_group("workers")
     text = "drives at once (default: 1; over Ray as many as the cluster has cores for)"
     option(sub, "--jobs", parser.at_least_one, "N", text)
     text = "processes of this machine, or tasks of a Ray cluster (default: local)"

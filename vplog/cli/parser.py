@@ -17,6 +17,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from vplog.cli.examples import EXAMPLES
 from vplog.errors import VplogError, nearest
 from vplog.storage.folders import is_unicode
 from vplog.storage.urls import printable, without_secrets
@@ -47,6 +48,7 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, *args: Any, family: list[Parser] | None = None, **options: Any) -> None:
         """`family` collects the parsers of one command line, to tell which verb a misplaced option belongs to."""
         super().__init__(*args, allow_abbrev=False, formatter_class=_Help, **options)
+        self.epilog = f"example: {EXAMPLES[self.prog]}" if self.prog in EXAMPLES else None
         self._family = [] if family is None else family
         self._family.append(self)
         self._intermixing, self._brief_usage = False, ""
@@ -209,7 +211,7 @@ def _path(text: str) -> Path:
 
 
 def option(
-    sub: argparse.ArgumentParser,
+    sub: argparse._ActionsContainer,
     names: str,
     kind: Callable[[str], Any],
     metavar: str,
@@ -220,7 +222,7 @@ def option(
     sub.add_argument(*names.split(), type=kind, metavar=metavar, help=text, **more)
 
 
-def flag(sub: argparse.ArgumentParser, name: str, text: str, dest: str | None = None) -> None:
+def flag(sub: argparse._ActionsContainer, name: str, text: str, dest: str | None = None) -> None:
     """An option without a value; with `dest` it switches that off."""
     sub.add_argument(
         name, action="store_false" if dest else "store_true", dest=dest or name[2:].replace("-", "_"), help=text
@@ -251,7 +253,8 @@ def topics_of(arguments: argparse.Namespace) -> TopicChoice:
 
 
 def topic_options() -> argparse.ArgumentParser:
-    topics = argparse.ArgumentParser(add_help=False)
+    parent = argparse.ArgumentParser(add_help=False)
+    topics = parent.add_argument_group("the log")
     for role in _ROLES:
         names = "--odometry --odometry-topic" if role == "odometry" else f"--{role}-topic"
         source = ", or a source: twist, gps, visual, lidar, truth" if role == "odometry" else ""
@@ -268,7 +271,7 @@ def topic_options() -> argparse.ArgumentParser:
         "image whose zero pixels give no features, TOPIC=FILE with several cameras; or a folder with one for each image"
     )
     option(topics, "--mask", _mask, "[TOPIC=]FILE", text, action="append", default=[])
-    return topics
+    return parent
 
 
 def _mask(text: str) -> tuple[str, Path]:
@@ -281,13 +284,14 @@ def _mask(text: str) -> tuple[str, Path]:
 
 def settings_options(unless_given: str | None, called: str) -> argparse.ArgumentParser:
     """`--pipeline`, with what it is unless given, and what help calls that; and `--set`."""
-    settings = argparse.ArgumentParser(add_help=False)
+    parent = argparse.ArgumentParser(add_help=False)
+    settings = parent.add_argument_group("settings")
     option(settings, "--pipeline", str, "P", f"shipped name or .yaml file (default: {called})", default=unless_given)
     option(settings, "--set", str, "A.B=C", "change one setting; repeatable", action="append", default=[])
-    return settings
+    return parent
 
 
-def cache_options(sub: argparse.ArgumentParser, what: str) -> None:
+def cache_options(sub: argparse._ActionsContainer, what: str) -> None:
     text = f"folder in which {what} (default: $VPLOG_CACHE, else ~/.cache/vplog)"
     option(sub, "--cache", local, "DIR", text)
     text = "largest size of the cache in GB; least recently used files go first, 0 keeps none (default: 20)"

@@ -1,4 +1,4 @@
-"""Results on a terminal: text, tables, progress, and JSON for programs."""
+"""Results on a terminal: text, tables, and JSON for programs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from vplog.errors import plural
 from vplog.storage.urls import printable, without_secrets
 
 if TYPE_CHECKING:
-    from vplog.batch.worker import Drive
     from vplog.run.report import Outcome
 
 
@@ -266,6 +265,26 @@ def print_explanation(found: dict[str, Any]) -> None:
         print_line("to change" if name == "change" else name, found[name])
     if found["picture"]:
         print(f"{'picture':10}{found['picture']['file']}")
+
+
+def print_opened(found: dict[str, Any]) -> None:
+    if not found["opened"]:
+        print_line(f"{found['run']}:", f"not opened, as {found['why']}: {found['path']}")
+    elif found["viewer"] == "rerun":
+        print_line(f"{found['run']}:", "opens in rerun, until its window is closed")
+    else:
+        where = "in the browser" if found["viewer"] == "report" else "in Foxglove"
+        print_line(f"{found['run']}:", f"{found['path']} opens {where}")
+
+
+def print_setting(found: dict[str, Any]) -> None:
+    value, default = (json.dumps(found[name], ensure_ascii=False) for name in ("value", "default"))
+    print(f"{found['setting']}: {value}")
+    print_line("", " ".join(found["description"].split()))
+    if found["allowed"]:
+        print_line("allowed", found["allowed"])
+    if value != default:
+        print_line("default", default)
 
 
 def print_optimised(found: dict[str, Any]) -> None:
@@ -518,42 +537,6 @@ def print_study(out: Path, found: dict[str, Any]) -> None:
     warn(found["warnings"])
     figures = sum(len(one["figures"]) for one in done.values()) // 2
     print_line(f"{out}:", f"study.json, and {figures} figures as PNG and SVG")
-
-
-class Progress:
-    """Bars with an ETA on a terminal's stderr; silence elsewhere."""
-
-    def __init__(self, arguments: argparse.Namespace) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-        from rich.progress import TimeRemainingColumn as Eta
-
-        self._tasks: dict[str, Any] = {}
-        self._line_by_line = not (arguments.json or sys.stderr.isatty())
-        self._bars = Progress(
-            TextColumn("{task.description:<18}", markup=False),
-            BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), Eta(),
-            console=Console(file=sys.stderr), disable=arguments.json or not sys.stderr.isatty(),
-        )  # fmt: skip
-
-    def __enter__(self) -> Progress:
-        self._bars.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._bars.stop()
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        if stage not in self._tasks:
-            self._tasks[stage] = self._bars.add_task(stage, total=total)
-        self._bars.update(self._tasks[stage], completed=done, total=total)
-
-    def print_drive(self, drive: Drive) -> None:
-        """A line for each drive of a batch where there are no bars, as in the log of a job of the night."""
-        if self._line_by_line:
-            print_status(
-                f"{drive.drive}: {drive.state}, {drive.seconds:.1f} s{f': {drive.error}' if drive.error else ''}"
-            )
 
 
 def print_result(

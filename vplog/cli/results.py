@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 from vplog import api
 from vplog.cli import parser, printing
 from vplog.cli.parser import call, flag, option, place
-from vplog.cli.printing import Progress, print_json, print_result
+from vplog.cli.printing import print_json, print_result
+from vplog.cli.progress import Progress
 from vplog.errors import ResultError, SettingsError
 from vplog.execution.execution import Execution
 
@@ -31,8 +32,10 @@ _seconds = parser.number(
     lambda value: abs(value) <= _MOST_OFFSET_S, f"between -{_MOST_OFFSET_S:g} and {_MOST_OFFSET_S:g}"
 )
 _FOLDERS = ("colmap", "nerfstudio")
-_FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd", *_FOLDERS)
+_FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd", "foxglove-layout", *_FOLDERS)
 """Formats of export.py, here too since that imports numpy."""
+_VIEWERS = ("rerun", "report", "foxglove")
+"""Those of open_run.py, here too since that imports numpy."""
 _BINARY = ("geoparquet", "rrd")
 
 
@@ -89,17 +92,31 @@ def export(arguments: argparse.Namespace) -> None:
     """Write a finished run in the format of another tool."""
     from vplog.verbs.export import export as export_run
 
+    if arguments.truth is not None and arguments.format != "rrd":
+        raise SettingsError(f"--truth is shown in rrd alone, not in {arguments.format}. Leave it out.")
     if arguments.output is parser.STDOUT and arguments.format in _FOLDERS:
         raise SettingsError(f"{arguments.format} is a folder, which stdout does not take. Name one with -o.")
     if arguments.output.is_dir() and arguments.format not in _FOLDERS:
         raise SettingsError(f"{arguments.output} is a folder, and {arguments.format} a file. Name one with -o.")
     with _file_or_stdout(arguments, arguments.format in _BINARY) as path, Progress(arguments) as progress:
         execution = Execution(arguments.threads, progress)
-        found = export_run(arguments.run, arguments.format, path, arguments.log, execution)
+        found = export_run(arguments.run, arguments.format, path, arguments.log, execution, arguments.truth)
     if arguments.json:
         print_json(found)
     elif path == arguments.output:
         print("\n".join(found["written"]))
+
+
+def open_run(arguments: argparse.Namespace) -> None:
+    """Open a finished run in rerun, in Foxglove, or its report in the browser."""
+    from vplog.verbs.open_run import opening
+
+    with opening(arguments.run, arguments.viewer) as opened:
+        found = {"run": arguments.run, "viewer": opened.viewer, "path": opened.path, "opened": opened.start is not None}
+        print_result(arguments, found | {"why": opened.why}, printing.print_opened)
+        sys.stdout.flush()  # the viewer may stay for hours
+        if opened.start is not None and not opened.start():
+            raise ResultError(f"{opened.viewer} did not open {opened.path}. Choose another with --with.")
 
 
 def _truth_options(arguments: argparse.Namespace) -> TruthOptions:
@@ -109,7 +126,8 @@ def _truth_options(arguments: argparse.Namespace) -> TruthOptions:
     return TruthOptions(**{name: value for name in names if (value := getattr(arguments, name)) is not None})
 
 
-def _add_truth_options(sub: argparse.ArgumentParser) -> None:
+def _add_truth_options(verb: argparse.ArgumentParser) -> None:
+    sub = verb.add_argument_group("places and alignment of the truth")
     option(sub, "--distance-m", parser.positive, "M", "largest distance within one place (default: 6)")
     option(sub, "--heading-deg", parser.positive, "DEG", "largest angle between optical axes (default: 45)")
     sub.add_argument("--align", choices=_ALIGNMENTS, help="alignment of the ATE (default: se3)")
@@ -163,6 +181,11 @@ def add_results(
     text = "file to write, a folder for colmap and nerfstudio; - writes a file to stdout"
     option(sub, "-o --output", parser.output_or_stdout, "FILE|FOLDER|-", text, required=True)
     option(sub, "--log", place, "LOG", "log of the run, for the pictures of colmap and nerfstudio, where it has moved")
+    option(sub, "--truth", str, "FILE.tum|auto", "truth that rrd shows beside the solution")
+    sub = add("open", open_run)
+    option(sub, "run", place, "RUN")
+    text = "viewer (default: rerun where it is installed, else the report in the browser)"
+    sub.add_argument("--with", choices=_VIEWERS, dest="viewer", help=text)
     sub = add("optimize", optimize)
     option(sub, "graph", parser.local_file, "GRAPH.g2o")
     option(sub, "-o --output", _graph, "OUT", "the graph at its solved poses, as g2o", required=True)

@@ -87,9 +87,7 @@ def read_fixes(path: Path) -> Gps | None:
 def read_images(path: Path) -> Iterator[CameraPicture]:
     """The camera's pictures in order of time, one in memory at a time. Raises ResultError as above."""
     with _reading(path) as reader:
-        summary = reader.get_summary()
-        topics = [channel.topic for channel in summary.channels.values()] if summary is not None else []
-        wanted = [topic for topic in topics if re.fullmatch(r"/cam/[^/]+/(image|calibration)", topic)]
+        wanted = [topic for topic in _topics(reader) if re.fullmatch(r"/cam/[^/]+/(image|calibration)", topic)]
         matrix, size = None, (0, 0)
         for _, channel, message in reader.iter_messages(topics=wanted) if wanted else ():
             if channel.topic.endswith("/calibration"):
@@ -109,6 +107,17 @@ def read_camera_pose(path: Path) -> Floats | None:
                     q, t = one.rotation, one.translation
                     return se3.from_vectors(np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w]))
     return None
+
+
+def read_topics(path: Path) -> list[str]:
+    """The topics of the file. Raises ResultError as above."""
+    with _reading(path) as reader:
+        return _topics(reader)
+
+
+def _topics(reader: McapReader) -> list[str]:
+    summary = reader.get_summary()
+    return [channel.topic for channel in summary.channels.values()] if summary is not None else []
 
 
 @contextmanager

@@ -1,29 +1,34 @@
-"""A recording for rerun: both paths, the closures, the body with its camera, and the way on earth where it is known."""
+"""A recording for rerun: both paths, the closures and their pictures, the body with its camera, errors over time, the
+way on earth and the truth where they are known, and the blueprint that lays them out."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import ACCEPTED, Closures, Verdict
+from vplog.data import ACCEPTED, Closures, Floats, Ints, Verdict
 from vplog.errors import ResultError
 from vplog.geometry import se3
 from vplog.results.geo import on_earth
-from vplog.results.mcap_read import read_camera_pose, read_images
+from vplog.results.mcap_read import read_camera_pose, read_images, read_topics
 from vplog.storage.scratch import put_in_place
 
 if TYPE_CHECKING:
-    from vplog.results.report.page import Tracks
+    from vplog.results.report.page import Tracks, TruthComparison
 
 _GREY, _BLUE, _GREEN, _RED = (150, 150, 150), (60, 130, 240), (40, 200, 80), (230, 50, 50)
-_AMBER = (240, 180, 30)
-_APPLICATION = "vplog"
+_AMBER, _VIOLET = (240, 180, 30), (170, 90, 220)
+_APPLICATION, _TIMELINE = "vplog", "stamp"
+_CAMERA, _PICTURES = "map/body/camera", "closures/picture"
 
 
-def write_rrd(path: Path, tracks: Tracks, closures: Closures, result: Path) -> None:
+def write_rrd(
+    path: Path, tracks: Tracks, closures: Closures, result: Path, judged: TruthComparison | None = None
+) -> None:
     """Write with rerun's own SDK; the camera's pictures are those of the run's result.mcap, `result`.
 
     Raises ResultError where the SDK is not installed, a file cannot be read, or this one not be written.
@@ -32,14 +37,18 @@ def write_rrd(path: Path, tracks: Tracks, closures: Closures, result: Path) -> N
         import rerun as rr
     except ImportError:
         raise ResultError(
-            "The .rrd format is written by rerun's SDK, which is not installed: pip install rerun-sdk"
+            "The .rrd format is written by rerun's SDK, which is not installed: pip install 'vplog[rerun]'"
         ) from None
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     recording = rr.RecordingStream(_APPLICATION, recording_id=f"vplog-{tracks.keyframes.drive}")
     try:
-        recording.save(part)
+        recording.save(part, default_blueprint=_blueprint(tracks, read_topics(result)))
         _log(recording, rr, tracks, closures)
+        _log_errors(recording, rr, tracks, closures, judged)
         _log_camera(recording, rr, result)
+        for row, picture in tracks.found.pictures.items():
+            recording.set_time(_TIMELINE, timestamp=_time(tracks.keyframes.stamp_ns[closures.query[row]]))
+            recording.log(_PICTURES, rr.EncodedImage(contents=picture, media_type="image/jpeg"))
         recording.disconnect()
         put_in_place(part, path)
     except OSError as error:
@@ -66,9 +75,64 @@ def _log(recording: Any, rr: Any, tracks: Tracks, closures: Closures) -> None:
         recording.log("earth/optimised", rr.GeoLineStrings(lat_lon=[where], colors=[_BLUE]), static=True)
     recording.send_columns(
         "map/body",
-        indexes=[rr.TimeColumn("stamp", timestamp=tracks.keyframes.stamp_ns.astype("datetime64[ns]"))],
+        indexes=[rr.TimeColumn(_TIMELINE, timestamp=_time(tracks.keyframes.stamp_ns))],
         columns=rr.Transform3D.columns(translation=ends, quaternion=se3.vectors(tracks.world_from_body)[:, 3:]),
     )
+
+
+def _blueprint(tracks: Tracks, topics: Collection[str]) -> Any:
+    """Map beside the pictures that there are, errors over time below; no view that asks servers for tiles of a map."""
+    import rerun.blueprint as rrb
+
+    pictures: list[Any] = []
+    if any(topic.startswith("/cam/") for topic in topics):
+        pictures.append(rrb.Spatial2DView(origin=f"{_CAMERA}/image", name="Camera"))
+    if tracks.found.pictures:
+        pictures.append(rrb.Spatial2DView(origin=_PICTURES, name="Closures"))
+    space = rrb.Spatial3DView(origin="map", name="Map")
+    upper = rrb.Horizontal(space, rrb.Vertical(*pictures), column_shares=[3, 2]) if pictures else space
+    plots = [
+        rrb.TimeSeriesView(origin="errors/sigma", name="Residual of accepted closures in sigma"),
+        rrb.TimeSeriesView(origin="errors/metres", name="Metres from the solution"),
+    ]
+    panels = rrb.TimePanel(timeline=_TIMELINE, state="collapsed"), rrb.SelectionPanel(state="collapsed")
+    return rrb.Blueprint(rrb.Vertical(upper, rrb.Horizontal(*plots), row_shares=[3, 1]), *panels)
+
+
+def _log_errors(recording: Any, rr: Any, tracks: Tracks, closures: Closures, judged: TruthComparison | None) -> None:
+    """Residuals of accepted closures at their queries' stamps, and distances of the solved keyframes from the odometry
+    and from the truth."""
+    rows = np.flatnonzero(closures.accepted)
+    rows = rows[np.argsort(closures.query[rows], kind="stable")]
+    stamp_ns, keyframes = tracks.keyframes.stamp_ns, tracks.world_from_body
+    for name, sigma, colour in (
+        ("before", closures.residual_before, _GREY),
+        ("after", closures.residual_after, _GREEN),
+    ):
+        style = rr.SeriesPoints(colors=colour, names=name, markers="circle", marker_sizes=2)
+        _series(recording, rr, f"errors/sigma/{name}", style, stamp_ns[closures.query[rows]], sigma[rows])
+    odometry = keyframes[:1] @ se3.inverse(tracks.keyframes.odom_from_body[:1]) @ tracks.keyframes.odom_from_body
+    distances = [("odometry", np.linalg.norm((odometry - keyframes)[:, :3, 3], axis=1), _GREY)]
+    if judged is not None and judged.error_m is not None and judged.path is not None:
+        distances.append(("truth", judged.error_m, _VIOLET))
+        recording.log("map/path/truth", rr.LineStrips3D([judged.path], colors=[_VIOLET]), static=True)
+    for name, metres, colour in distances:
+        style = rr.SeriesLines(colors=colour, names=f"to the {name}")
+        _series(recording, rr, f"errors/metres/{name}", style, stamp_ns, metres)
+
+
+def _series(recording: Any, rr: Any, entity: str, style: Any, stamp_ns: Ints, values: Floats) -> None:
+    known = np.isfinite(values)
+    recording.log(entity, style, static=True)
+    recording.send_columns(
+        entity,
+        indexes=[rr.TimeColumn(_TIMELINE, timestamp=_time(stamp_ns[known]))],
+        columns=rr.Scalars.columns(scalars=values[known]),
+    )
+
+
+def _time(stamp_ns: Any) -> Any:
+    return stamp_ns.astype("datetime64[ns]")
 
 
 def _log_camera(recording: Any, rr: Any, result: Path) -> None:
@@ -76,14 +140,14 @@ def _log_camera(recording: Any, rr: Any, result: Path) -> None:
     placed = read_camera_pose(result)
     if placed is not None:
         transform = rr.Transform3D(translation=placed[:3, 3], mat3x3=placed[:3, :3])
-        recording.log("map/body/camera", transform, static=True)
+        recording.log(_CAMERA, transform, static=True)
     known = False
     for picture in read_images(result):
         if picture.matrix is not None and not known:
             pinhole = rr.Pinhole(
                 image_from_camera=picture.matrix, resolution=picture.size, camera_xyz=rr.ViewCoordinates.RDF
             )
-            recording.log("map/body/camera", pinhole, static=True)
+            recording.log(_CAMERA, pinhole, static=True)
             known = True
-        recording.set_time("stamp", timestamp=np.datetime64(picture.stamp_ns, "ns"))
-        recording.log("map/body/camera/image", rr.EncodedImage(contents=picture.image, media_type="image/jpeg"))
+        recording.set_time(_TIMELINE, timestamp=np.datetime64(picture.stamp_ns, "ns"))
+        recording.log(f"{_CAMERA}/image", rr.EncodedImage(contents=picture.image, media_type="image/jpeg"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,26 +11,36 @@ from vplog.errors import ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import tum
 from vplog.results import geo, poses, tables
+from vplog.results.foxglove_layout import foxglove_layout
+from vplog.results.mcap_read import read_topics
 from vplog.results.rrd import write_rrd
 from vplog.results.run_record import read_single_run
 from vplog.run.report import gather_tracks
 from vplog.storage.scratch import replacing
+from vplog.verbs.evaluate_run import TruthOptions
 from vplog.verbs.export_images import FOLDERS, export_images
+from vplog.verbs.report import judge
 
 if TYPE_CHECKING:
     from vplog.results.geo import Earth
     from vplog.results.report.page import Tracks
 
-FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd")
+FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd", "foxglove-layout")
 """Formats that are one file; two more are a folder."""
 
 
 def export(
-    folder: Path, kind: str, path: Path, log: Path | None = None, execution: Execution = Execution()
+    folder: Path,
+    kind: str,
+    path: Path,
+    log: Path | None = None,
+    execution: Execution = Execution(),
+    truth: str | None = None,
 ) -> dict[str, Any]:
     """Write the run in `folder` as one of `FORMATS` or `FOLDERS`; what was written. Raises VplogError.
 
-    The pictures of a folder are those of the run's log, or of `log` where that has moved.
+    The pictures of a folder are those of the run's log, or of `log` where that has moved. `truth` is a TUM file or
+    `auto`, which an rrd shows beside the solution.
     """
     record = read_single_run(folder)
     tracks = gather_tracks(folder, record)
@@ -57,7 +68,12 @@ def export(
             geo.write_geoparquet(path, tracks.after, _earth(folder, kind, tracks), header)
         case "rrd":
             closures = tables.read_closures(folder / "closures.parquet")
-            write_rrd(path, tracks, closures, folder / "result.mcap")
+            judged = judge(folder, record, truth, None, TruthOptions()) if truth is not None else None
+            write_rrd(path, tracks, closures, folder / "result.mcap", judged)
+        case "foxglove-layout":
+            tree = foxglove_layout(read_topics(folder / "result.mcap"), tracks.world_from_body[:, :3, 3])
+            with replacing(path) as stream:
+                stream.write(f"{json.dumps(tree, indent=2)}\n".encode())
         case _:
             raise ResultError(f"No format {kind!r}. Formats: {', '.join([*FORMATS, *FOLDERS])}.")
     return {"run": str(folder), "format": kind, "written": written, "poses": len(tracks.after.stamp_ns)}

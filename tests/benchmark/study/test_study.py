@@ -206,6 +206,7 @@ def test_a_drive_and_its_own_past(verb: Verb, drive: Drive, tmp_path: Path) -> N
     assert all(row["query"] == row["map"] == drive.log.stem for row in rows)
     for example in found["experiments"]["examples"]["rows"]:
         assert example["query_frame"] - example["map_frame"] >= 20
+        assert (example["answer_frame"] == example["map_frame"]) == (example["kind"] == "found")
 
 
 # Departures from the paper

@@ -57,7 +57,8 @@ def references(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str
 
 
 def examples(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, Any], list[str]]:
-    """Fig. 4: a frame that is found and one that is missed of every pair, each with the true frame of the map."""
+    """Fig. 4: a frame that is found and one that is missed of every pair, each with the true frame of the map, and the
+    missed one with the answer given."""
     rows, files = [], []
     shown = bench.pairs[:_MOST_EXAMPLES]
     done, total = 0, sum(len(bench.frames[query]) + len(bench.frames[other]) for query, other in shown)
@@ -75,12 +76,18 @@ def examples(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, 
             by_rank = np.argsort(ranks.top_score[among] if right else ranks.better[among], kind="stable")
             row = int(among[by_rank[len(among) // 2]])
             true = truth.rows(row)
-            match = int(ranks.top_row[row]) if right else int(true[len(true) // 2])
+            answer = int(ranks.top_row[row])
+            match = answer if right else int(true[len(true) // 2])
             file = f"examples-{len(files) + 1:02d}-{kind}"
             outcome = f"{kind}: the true frame is no. {int(ranks.better[row]) + 1} of {int(ranks.candidates[row])}"
-            sides = (query, row, places[query][row]), (other, match, places[other][match])
-            mine, theirs = (state.boxes(place).references for _, _, place in sides)
-            _draw_example(bench, state, *sides, outcome, file, out)
+            sides = {
+                "query": (query, row, places[query][row]),
+                "true map frame": (other, match, places[other][match]),
+            }
+            mine, theirs = (state.boxes(place).references for _, _, place in sides.values())
+            if not right:
+                sides["answer"] = other, answer, places[other][answer]
+            _draw_example(bench, state, sides, outcome, file, out)
             files.append(file)
             rows.append(
                 {
@@ -90,6 +97,7 @@ def examples(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, 
                     "kind": kind,
                     "query_frame": int(bench.traversal(query).frames[row]),
                     "map_frame": int(bench.traversal(other).frames[match]),
+                    "answer_frame": int(bench.traversal(other).frames[answer]),
                     "rank": int(ranks.better[row]),
                     "shared_references": len(np.intersect1d(mine, theirs)),
                     "figure": f"{file}.png",
@@ -185,19 +193,20 @@ def _draw_references(
 
 
 def _draw_example(
-    bench: Bench, state: BoxState, query: tuple[int, int, Any], match: tuple[int, int, Any], outcome: str, file: str,
-    out: Path,
-) -> None:  # fmt: skip
+    bench: Bench, state: BoxState, sides: dict[str, tuple[int, int, Any]], outcome: str, file: str, out: Path
+) -> None:
+    """Rows of a picture: drive, frame and descriptor by role, the query first and the true frame second."""
+    query, match, *_ = sides.values()
     mine, other = state.boxes(query[2]), state.boxes(match[2])
     # the query's best references, those that the true frame has too first: there Eq. (1) compares boxes
     both = set(other.references.tolist())
     chosen = sorted(range(len(mine.references)), key=lambda j: (int(mine.references[j]) not in both, j))[:_SHOWN]
     chosen.sort()
-    with saved_figure(out, file, 2.6 * (1 + max(len(chosen), 1)), 4.3) as figure:
-        grid = figure.subplots(2, 1 + max(len(chosen), 1), squeeze=False)
-        sides = ((query, mine, "query"), (match, other, "true map frame"))
-        for line, ((drive, row, _), boxes, role) in enumerate(sides):
-            axes = grid[line, 0]
+    answered = ", below them the answer given" if "answer" in sides else ""
+    with saved_figure(out, file, 2.6 * (1 + max(len(chosen), 1)), 0.5 + 1.9 * len(sides)) as figure:
+        grid = figure.subplots(len(sides), 1 + max(len(chosen), 1), squeeze=False)
+        for line, (role, (drive, row, place)) in enumerate(sides.items()):
+            axes, boxes = grid[line, 0], state.boxes(place)
             _show(axes, bench.images(drive, [row])[0])
             _windows(axes, state.windows(0))
             axes.set_title(
@@ -219,10 +228,11 @@ def _draw_example(
         explain(
             figure,
             f"{bench.names[query[0]]} in {bench.names[match[0]]}, {outcome}",
-            "Left: a query and the frame of the map that shows the same place, with the middles of the windows. "
-            "Right: reference images that explain the query, with the votes of all features of the frame at the left "
-            "(bright: many) and, in the colour of each window, the box it is found in. The same place: the same "
-            "references, and boxes of one colour in one spot. A frame of the library is explained by itself first.",
+            f"Left: a query and the frame of the map that shows the same place{answered}, with the middles of the "
+            "windows. Right: reference images that explain the query, with the votes of all features of the frame at "
+            "the left (bright: many) and, in the colour of each window, the box it is found in. The same place: the "
+            "same references, and boxes of one colour in one spot. A frame of the library is explained by itself "
+            "first.",
         )
 
 
