@@ -378,6 +378,30 @@ def print_removed(found: dict[str, Any]) -> None:
     warn(found["warnings"])
 
 
+def print_condensed(found: dict[str, Any]) -> None:
+    rows = [
+        (one["drive"], *(str(one["places"][end]) for end in ("before", "after")), str(one["faded"]),
+         *(f"{one['descriptor_bytes'][end] / 1e3:.1f}" for end in ("before", "after")))
+        for one in found["drives"]
+    ]  # fmt: skip
+    print_table(("drive", "places", "kept", "faded", "kB", "kept kB"), rows)
+    warn(found["warnings"])
+    asked, recall, places, size = found["queries"], found["recall"], found["places"], found["descriptor_bytes"]
+    print(
+        f"own queries  {asked['places']}: {asked['by_other_drives']} answered by other drives, "
+        f"{asked['by_own_drive']} by their own, {asked['alone']} by no other place, within {found['distance_m']:g} m"
+    )
+    print(f"recall       {recall['before']:.4f} before, {recall['after']:.4f} after; {found['loss']:g} may be lost")
+    if found["faded"]["found"]:
+        print(f"faded        {found['faded']['found']} places, {found['faded']['removed']} of them removed")
+    if (known := found["references"]) is not None:
+        print(f"references   {known['after']} of {known['library']} named by places, {known['before']} before")
+    print(
+        f"{found['written']}: {places['after']} of {plural(places['before'], 'place')}, "
+        f"{size['after'] / 1e3:.1f} of {size['before'] / 1e3:.1f} kB of descriptors"
+    )
+
+
 def print_index(found: dict[str, Any]) -> None:
     places, drives = plural(found["places"], "place"), plural(len(found["drives"]), "drive")
     files = plural(len(found["segments"]), "file")

@@ -16,7 +16,7 @@ from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
 from vplog.maps.search.exact import Answers, best_places
-from vplog.maps.search.index import SegmentView, update_index
+from vplog.maps.search.index import SegmentView, place_keyframes, update_index
 from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, best_lines, drives_by_credit
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
@@ -232,12 +232,12 @@ def search(
 
 def _short_drives(store: Store, drives: Iterable[str], length: int) -> list[str]:
     """A warning where a window of views is longer than drives: they have too few places for its statistics."""
-    short = [drive for drive in drives if store.rows("descriptors", drive) < length] if length > 1 else []
+    short = [drive for drive in drives if store.rows("keyframes", drive) < length] if length > 1 else []
     if not short:
         return []
     more = f" and {len(short) - 1} more have" if len(short) > 1 else " has"
     return [
-        f"{short[0]}{more} fewer places than the window of {length} views, so matches there are missed. Search "
+        f"{short[0]}{more} fewer keyframes than the window of {length} views, so matches there are missed. Search "
         "single views: --sequence 1"
     ]
 
@@ -271,11 +271,11 @@ def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints) 
     for one in set(numbers):
         path = store.file(drives[one], "descriptors.parquet")
         with reading_drive(drives[one]):
-            known = tables.read_stamps(path)
+            known, keyframe_of = tables.read_stamps(path), place_keyframes(store, drives[one])
         rows = keyframe[number == one]
         if rows.max() >= len(known):
             raise ResultError(f"{path} was replaced while the map was searched. Run the query again.")
-        stamp[number == one] = known[rows]
+        stamp[number == one], keyframe[number == one] = known[rows], keyframe_of[rows]
     names = [drives[one] for one in numbers]
     return tables.placed_table(
         [
