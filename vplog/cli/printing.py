@@ -427,11 +427,12 @@ def print_answers(found: dict[str, Any]) -> None:
             one.get("match_name", str(one["keyframe"])),
             f"{one['score']:.3f}",
             str(one["support"]),
+            "" if one["p_match"] is None else f"{one['p_match']:.2f}",
         )
         for one in found["answers"]
         if one["rank"] == 0
     ]
-    print_table(("view", "drive", "keyframe", "score", "support"), rows)
+    print_table(("view", "drive", "keyframe", "score", "support", "p_match"), rows)
     warn(found["warnings"])
     views = plural(found["views"], "view")
     print(f"{found['log']}: {found['answered']} of {views} matched to a place of {found['map']}")
@@ -526,8 +527,11 @@ def print_study(out: Path, found: dict[str, Any]) -> None:
             cells = [f"{r['r_at_1']:.2f} / {r['anr']:.2f}" for r in rows if r["method"] == mean["method"]]
             cells += [f"{mean['r_at_1']:.3f} / {mean['anr']:.2f}"]
             cells += [f"{mean['r_at_1_worst']:.2f} / {mean['anr_worst']:.2f}", f"{mean['bytes_per_image']:g}"]
+            cells.append("" if mean["p_match_error"] is None else f"{mean['p_match_error']:.2f}")
             table.append((mean["method"], *cells))
-        print_table(("R@1 / ANR %", *(f"{a}\nin {b}" for a, b in pairs), "mean", "worst", "bytes"), table)
+        print_table(
+            ("R@1 / ANR %", *(f"{a}\nin {b}" for a, b in pairs), "mean", "worst", "bytes", "p_match\nerror"), table
+        )
     titles = ("R@1", "ANR %", "AP")
     if "sizes" in done:
         rows = done["sizes"]["mean"]

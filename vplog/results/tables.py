@@ -185,6 +185,14 @@ PLACED = pa.schema(
         column("stamp_ns", pa.int64(), "ns", "Stamp of the keyframe, in its log's clock."),
         column("score", pa.float32(), "1", "Similarity by the recogniser; of a sequence, how much above the usual."),
         column("support", pa.int32(), "1", "Other views of the window that agree; 0 where views stand alone."),
+        column(
+            "p_match",
+            pa.float32(),
+            "1",
+            "Probability that the view's best answer is its place, learned on the answers without a truth, so that it "
+            "compares between views; null for other answers, and where too few views have look-alikes.",
+            True,
+        ),
     ]
 )
 """Answers of a query of a map, by view, then by rank."""
@@ -522,8 +530,8 @@ def read_table_metadata(path: Path) -> TableMetadata:
 
 
 def placed_table(columns: Sequence[Any]) -> pa.Table:
-    """The table PLACED of values (R,) for each column in order."""
-    arrays = [pa.array(values, field.type) for values, field in zip(columns, PLACED, strict=True)]
+    """The table PLACED of values (R,) for each column in order, NaN for null."""
+    arrays = [pa.array(values, field.type, from_pandas=True) for values, field in zip(columns, PLACED, strict=True)]
     return pa.Table.from_arrays(arrays, schema=PLACED)
 
 

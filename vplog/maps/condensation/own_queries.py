@@ -114,6 +114,11 @@ def search_of(
             return best_places(some, state, views, top, Execution(execution.threads))
 
         return by_index, warnings
+    return search_in_memory(places, state), []
+
+
+def search_in_memory(places: OwnPlaces, state: PlaceState) -> Search:
+    """The search for single views by an index of each drive."""
     indexes = [index_of_part(state, state.from_arrow(column)) for column in places.columns]
 
     def by_drive(views: Sequence[Any], top: int, without: int) -> Answers:
@@ -127,7 +132,7 @@ def search_of(
             best = merge([best, found], top)
         return best
 
-    return by_drive, []
+    return by_drive
 
 
 @dataclass(frozen=True, eq=False)
