@@ -36,6 +36,7 @@ from vplog.errors import ResultError, nearest
 from vplog.geometry import se3
 from vplog.storage.json_records import canonical_json
 from vplog.storage.parquet_limits import (
+    VERSION_KEY,
     check_columns,
     filled,
     open_table,
@@ -480,8 +481,9 @@ def write_some_descriptors(source: Path, path: Path, rows: Ints) -> None:
     with reading(source), open_table(source) as file:
         _check_name(source, "descriptors", file.schema_arrow)
         table = read_table(source, file, ["keyframe", "stamp_ns", "descriptor"]).take(pa.array(rows))
+    header = {key: value for key, value in (table.schema.metadata or {}).items() if key != VERSION_KEY.encode()}
     with replacing(path) as stream:
-        write_table(stream, table, DESCRIPTORS_PER_GROUP, compression="zstd")
+        write_table(stream, table.replace_schema_metadata(header), DESCRIPTORS_PER_GROUP, compression="zstd")
 
 
 def read_arrow(path: Path) -> pa.Table:
