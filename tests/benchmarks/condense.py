@@ -91,7 +91,7 @@ def _curves(state: PlaceState, columns: list[pa.Array], frames: list[Ints], aski
     asked = ask(places, search_in_memory(places, state), state, TOLERANCE)
     count = len(places.drive)
     removable = np.isin(np.arange(count), asked.place)
-    removal = remove_redundant(asked.queries, places.drive, removable, asked.faded, count)
+    removal = remove_redundant(asked.queries, places.drive, np.cumsum(places.steps_m()), removable, asked.faded, count)
     index = state.index(state.from_arrow(pa.concat_arrays(places.columns)))
     scores = np.stack([index.scores(one) for one in state.from_arrow(columns[asking])])
     near = np.abs(places.keyframe - frames[asking][:, None]) <= TOLERANCE

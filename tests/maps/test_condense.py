@@ -36,7 +36,7 @@ def whole(halves: Path, tmp_path: Path) -> Path:
 
 def line(rng: np.random.Generator, count: int, near: float) -> tuple[np.ndarray, OwnQueries]:
     """Places along a line that score by how near they are, with noise, each looked for among all others."""
-    at = np.sort(rng.uniform(0, count, count))
+    at = np.arange(count, dtype=np.float64)
     score = np.exp(-np.abs(at[:, None] - at) / 4) + rng.normal(0, 0.1, (count, count))
     np.fill_diagonal(score, -np.inf)
 
@@ -53,9 +53,9 @@ def line(rng: np.random.Generator, count: int, near: float) -> tuple[np.ndarray,
 @pytest.mark.parametrize("most", [0, 5])
 def test_no_more_queries_are_lost_than_may_be(most: int) -> None:
     """Answers among the places that stay are those of a search among them alone, however short the lists were."""
-    _, queries = line(np.random.default_rng(1), 60, 3.0)
+    at, queries = line(np.random.default_rng(1), 60, 3.0)
     every = np.ones(60, np.bool_)
-    removal = remove_redundant(queries, np.zeros(60, np.int64), every, ~every, most)
+    removal = remove_redundant(queries, np.zeros(60, np.int64), at, every, ~every, most)
     kept = every.copy()
     kept[removal.places] = False
 
@@ -68,10 +68,11 @@ def test_no_more_queries_are_lost_than_may_be(most: int) -> None:
         return count
 
     assert answered(every) - answered(kept) == removal.lost[-1] <= most
-    assert 15 < len(removal.places) < 59
-    assert np.diff(np.append(0, removal.lost)).max() <= 1 + most
-    longer = remove_redundant(queries, np.zeros(60, np.int64), every, ~every, most + 3)
-    assert len(longer.places) > len(removal.places)
+    assert 10 < len(removal.places) < 59
+    rest = np.sort(removal.places[:10])
+    assert np.diff(rest).min() > 1, "no gap is left while there are smaller ones"
+    longer = remove_redundant(queries, np.zeros(60, np.int64), at, every, ~every, most + 3)
+    assert longer.places[: len(removal.places)].tolist() == removal.places.tolist()
 
 
 def test_places_that_later_drives_pass_without_finding_them_fade() -> None:
@@ -93,7 +94,6 @@ def test_a_condensed_map_works_as_before(whole: Path, halves: Path, tmp_path: Pa
     assert told["places"]["before"] > told["places"]["after"] >= 2
     assert told["descriptor_bytes"]["before"] > told["descriptor_bytes"]["after"]
     assert 0 <= told["recall"]["loss"] <= 0.05
-    assert told["queries"]["by_other_drives"], "the halves share places"
     sizes = {one["drive"]: one["places"] for one in told["drives"]}
     for drive in HALVES:
         check_rows(whole, small, drive, sizes[drive]["after"])

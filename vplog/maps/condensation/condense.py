@@ -93,7 +93,7 @@ def choose_places(
     most_lost = math.floor(loss * int(posed.sum()) + 1e-9)  # .01 of 300 is 3
     total = int(removable.sum())
     removal = remove_redundant(
-        asked.queries, places.drive, removable, asked.faded, most_lost,
+        asked.queries, places.drive, np.cumsum(places.steps_m()), removable, asked.faded, most_lost,
         lambda done: execution.progress("remove", done, total),
     )  # fmt: skip
     lost = int(removal.lost[-1]) if len(removal.lost) else 0
@@ -141,6 +141,8 @@ def _account(found: Condensed, state: PlaceState, root: Path, target: Path, warn
     """What was removed, as plain values."""
     places, asked, kept = found.places, found.asked, found.kept
     posed, answered = int((places.frame >= 0).sum()), len(asked.place)
+    best = np.array([one.rows[0] for one in asked.queries.best], np.int64)
+    others = int((places.drive[best] != places.drive[asked.place]).sum())
     drives = []
     for number, drive in enumerate(places.drives):
         own, files = places.drive == number, [f"runs/{layout.folder_name(drive)}/descriptors.parquet"] * 2
@@ -161,8 +163,8 @@ def _account(found: Condensed, state: PlaceState, root: Path, target: Path, warn
         "distance_m": round(found.distance_m, 3),
         "queries": {
             "places": posed,
-            "by_other_drives": int((~asked.of_own).sum()),
-            "by_own_drive": int(asked.of_own.sum()),
+            "by_other_drives": others,
+            "by_own_drive": answered - others,
             "alone": posed - answered,
         },
         "recall": {"before": recall[0], "after": recall[1], "loss": round(found.lost / max(posed, 1), 6)},

@@ -1,13 +1,9 @@
-"""The places of a map as queries of itself: each is looked for among those of the other drives.
-
-Where these do not show it, as where only one drive came by, or came by at night, its own drive's other places count,
-too. So what other drives can do without is told from what nothing else shows.
-"""
+"""The places of a map as queries of itself: each is looked for among all others, of every drive."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,8 +24,8 @@ from vplog.stages import CodedState, PlaceState, index_of_part
 if TYPE_CHECKING:
     from vplog.maps.storage.map_store import Store
 
-    Search = Callable[[Sequence[Any], int, int], Answers]
-    """The best so many places for each view, by a drive to leave out (-1: none)."""
+    Search = Callable[[Sequence[Any], int], Answers]
+    """The best so many places for each view."""
 
 BEST = 16
 """Places that are looked up for each query at first: 192 bytes, as much as the codes of one."""
@@ -71,10 +67,14 @@ class OwnPlaces:
 
         return same
 
+    def steps_m(self) -> Floats:
+        """(N,) distance of each place from the one before; 0 of the first of a drive."""
+        step = np.linalg.norm(np.diff(self.pose[:, :3, 3], axis=0, prepend=self.pose[:1, :3, 3]), axis=1)
+        return np.where(np.diff(self.drive, prepend=-1) == 0, step, 0.0)
+
     def spacing_m(self) -> float:
         """Median distance of places that follow each other; 0 without any."""
-        follow = (np.diff(self.drive) == 0) & (self.frame[1:] >= 0)
-        step = np.linalg.norm(np.diff(self.pose[:, :3, 3], axis=0), axis=1)[follow]
+        step = self.steps_m()[(np.diff(self.drive, prepend=-1) == 0) & (self.frame >= 0)]
         return float(np.median(step)) if len(step) else 0.0
 
 
@@ -109,9 +109,8 @@ def search_of(
     if isinstance(state, CodedState):
         parts, warnings = update_index(store, {drive: about[drive] for drive in places.drives}, state, execution)
 
-        def by_index(views: Sequence[Any], top: int, without: int) -> Answers:
-            some = [replace(one, numbers=np.where(one.numbers == without, -1, one.numbers)) for one in parts]
-            return best_places(some, state, views, top, Execution(execution.threads))
+        def by_index(views: Sequence[Any], top: int) -> Answers:
+            return best_places(parts, state, views, top, Execution(execution.threads))
 
         return by_index, warnings
     return search_in_memory(places, state), []
@@ -121,12 +120,12 @@ def search_in_memory(places: OwnPlaces, state: PlaceState) -> Search:
     """The search for single views by an index of each drive."""
     indexes = [index_of_part(state, state.from_arrow(column)) for column in places.columns]
 
-    def by_drive(views: Sequence[Any], top: int, without: int) -> Answers:
+    def by_drive(views: Sequence[Any], top: int) -> Answers:
         best = no_answers(len(views), top)
         for number, index in enumerate(indexes):
             found = no_answers(len(views), top)
             found.drive[:] = number
-            for view, descriptor in enumerate(views if number != without else ()):
+            for view, descriptor in enumerate(views):
                 one = index.query(descriptor, top)
                 found.keyframe[view, : len(one.rows)], found.score[view, : len(one.rows)] = one.rows, one.score
             best = merge([best, found], top)
@@ -141,8 +140,6 @@ class AskedPlaces:
 
     place: Ints
     """(Q,) places that are answered rightly."""
-    of_own: Bools
-    """(Q,) whether that takes the drive's own other places."""
     queries: OwnQueries
     faded: Bools
     """(N,) places that `PASSES` later drives came by, of which none has it among its best."""
@@ -153,19 +150,13 @@ def ask(
 ) -> AskedPlaces:
     """Look for every place among the others; an answer within the distance is right."""
     first, same = places.first, places.same_place(distance_m)
-    matched = np.zeros(len(places.drive), np.bool_)
-    best: dict[int, Ranking] = {}
-    of_own: dict[int, bool] = {}
+    matched, best = np.zeros(len(places.drive), np.bool_), dict[int, Ranking]()
 
-    def views(rows: Ints) -> Sequence[Any]:
+    def looked_for(rows: Ints, top: int) -> list[Ranking]:
+        """The best of all other places for rows of one drive."""
         number = int(places.drive[rows[0]])
-        return state.from_arrow(places.columns[number].take(pa.array(rows - first[number])))
-
-    def looked_for(rows: Ints, top: int, own: bool) -> list[Ranking]:
-        """Rows of one drive, among the places of the others or, with `own`, among all but themselves."""
-        number = int(places.drive[rows[0]])
-        found = search(views(rows), min(top + own, len(places.drive)), -1 if own else number)
-        known = []
+        column = places.columns[number].take(pa.array(rows - first[number]))
+        found, known = search(state.from_arrow(column), min(top + 1, len(places.drive))), []
         for at, row in enumerate(rows.tolist()):
             count = int(found.count[at])
             others = first[found.drive[at, :count]] + found.keyframe[at, :count]
@@ -173,31 +164,21 @@ def ask(
             known.append(Ranking(others[other].astype(np.int32), found.score[at, :count][other]))
         return known
 
-    def take(rows: Ints, own: bool) -> Ints:
-        """Keep the answers that are right, and return the rows without one."""
-        wrong = []
-        for row, found in zip(rows.tolist(), looked_for(rows, BEST, own) if len(rows) else [], strict=True):
-            right = same(row, found.rows)
-            earlier = right & (places.drive[found.rows] < places.drive[row])
-            matched[found.rows[earlier]] = True
-            if right[:1].any():
-                best[row], of_own[row] = found, own
-            else:
-                wrong.append(row)
-        return np.array(wrong, np.int64)
-
     for number in execution.counted("query", range(len(places.drives)), len(places.drives)):
         rows = np.arange(first[number], first[number + 1])
-        take(take(rows[places.frame[rows] >= 0], False), True)
-    asking = sorted(best)
-    place = np.array(asking, np.int64)
+        rows = rows[places.frame[rows] >= 0]
+        for row, found in zip(rows.tolist(), looked_for(rows, BEST) if len(rows) else [], strict=True):
+            right = same(row, found.rows)
+            matched[found.rows[right & (places.drive[found.rows] < number)]] = True
+            if right[:1].any():
+                best[row] = found
+    place = np.array(sorted(best), np.int64)
     queries = OwnQueries(
-        [best[row] for row in asking],
-        lambda query, top: looked_for(place[query : query + 1], top, of_own[asking[query]])[0],
-        lambda query, others: same(asking[query], others),
+        [best[row] for row in place.tolist()],
+        lambda query, top: looked_for(place[query : query + 1], top)[0],
+        lambda query, others: same(int(place[query]), others),
     )
-    faded = (later_passes(places, distance_m) >= PASSES) & ~matched
-    return AskedPlaces(place, np.array([of_own[row] for row in asking], np.bool_), queries, faded)
+    return AskedPlaces(place, queries, (later_passes(places, distance_m) >= PASSES) & ~matched)
 
 
 def later_passes(places: OwnPlaces, distance_m: float) -> Ints:

@@ -1,8 +1,9 @@
 """Places that recognition can do without, found by removing them one after the other.
 
-The next to go is the place whose removal loses fewest of the queries that are answered rightly and, of these, least of
-the scores of the right answers: the facility location function, which is submodular, so that a stale cost is a bound
-and only the best few are evaluated again (Minoux, Accelerated greedy algorithms, 1978).
+The next to go is the place that leaves the smallest gap in its drive; of equal gaps the one that loses fewest of the
+queries that are answered rightly and, of these, least of the scores of the right answers, the facility location
+function. None of these becomes less as others go, or only where an answer becomes right, so a stale cost is a bound and
+only the best few are evaluated again (Minoux, Accelerated greedy algorithms, 1978).
 """
 
 from __future__ import annotations
@@ -14,7 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vplog.data import Bools, Ints, Ranking
+from vplog.data import Bools, Floats, Ints, Ranking
+
+_MILLIMETRES = 3
+"""Decimals of a gap in m: what differs by less is rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,18 +119,46 @@ class _Remaining:
             self.users.setdefault(place, []).append(query)
 
 
+@dataclass(eq=False)
+class _Gaps:
+    """Distances between the places of drives that are left, each drive's in a row."""
+
+    along_m: Floats
+    before: Ints
+    """(N,) the place before each in its drive; itself where it is the first."""
+    after: Ints
+
+    @classmethod
+    def of(cls, drive: Ints, along_m: Floats) -> _Gaps:
+        every = np.arange(len(drive))
+        first, last = (np.diff(drive, **ends) != 0 for ends in ({"prepend": -1}, {"append": -1}))
+        return cls(along_m, np.where(first, every, every - 1), np.where(last, every, every + 1))
+
+    def without(self, place: int) -> float:
+        """The gap that the removal of a place leaves; at the end of a drive twice the distance to the next one."""
+        before, after = int(self.before[place]), int(self.after[place])
+        gap = self.along_m[after] - self.along_m[before]
+        return float(gap if before < place < after else 2 * gap)
+
+    def remove(self, place: int) -> None:
+        before, after = int(self.before[place]), int(self.after[place])
+        self.after[before] = after if after > place else before
+        self.before[after] = before if before < place else after
+
+
 def remove_redundant(
-    queries: OwnQueries, drive: Ints, removable: Bools, faded: Bools, most_lost: int,
+    queries: OwnQueries, drive: Ints, along_m: Floats, removable: Bools, faded: Bools, most_lost: int,
     progress: Callable[[int], None] = lambda _: None,
 ) -> Removal:  # fmt: skip
-    """Remove places (N,) of drives as long as at most so many queries are lost. `faded` ones go before others that cost
-    as many queries; of each drive one place stays."""
+    """Remove places (N,) of drives, in their order and so far along them, as long as at most so many queries are lost.
+    `faded` ones that cost no query go before all others; of each drive one place stays."""
     remaining = _Remaining(queries, np.ones(len(drive), np.bool_))
-    left, lost, order, losses = np.bincount(drive), 0, list[int](), list[int]()
+    gaps, left, lost, order, losses = _Gaps.of(drive, along_m), np.bincount(drive), 0, list[int](), list[int]()
 
-    def key(place: int) -> tuple[int, bool, float, int]:
+    def key(place: int) -> tuple[float, int, float, int]:
         queries_lost, drop = remaining.cost(place)
-        return queries_lost, not faded[place], drop, place
+        gap = 0.0 if faded[place] and queries_lost <= 0 else round(gaps.without(place), _MILLIMETRES)
+        return gap, queries_lost, drop, place
 
     heap = [key(place) for place in np.flatnonzero(removable).tolist()]
     heapq.heapify(heap)
@@ -138,10 +170,11 @@ def remove_redundant(
         if heap and now > heap[0]:
             heapq.heappush(heap, now)
             continue
-        if lost + now[0] > most_lost:
+        if lost + now[1] > most_lost:
             break
         remaining.remove(place)
-        lost += now[0]
+        gaps.remove(place)
+        lost += now[1]
         left[drive[place]] -= 1
         order.append(place)
         losses.append(lost)
