@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,8 +13,12 @@ import pytest
 
 from tests.maps.joining.test_join import digests
 from vplog.data import Ranking
+from vplog.execution.execution import Execution
 from vplog.maps.condensation.own_queries import PASSES, OwnPlaces, later_passes
 from vplog.maps.condensation.redundancy import OwnQueries, remove_redundant
+from vplog.maps.joining.candidate_drives import places_of
+from vplog.maps.search.query import open_map
+from vplog.maps.storage import map_store
 from vplog.maps.storage.map_store import Store
 from vplog.results import tables
 
@@ -109,6 +114,11 @@ def test_a_condensed_map_works_as_before(whole: Path, halves: Path, tmp_path: Pa
         assert {one["p_match"] is None for one in answers if one["rank"]} == {True}
         known = [one["p_match"] for one in answers if not one["rank"] and one["p_match"] is not None]
         assert all(0 <= one <= 1 for one in known)
+    with map_store.reading(small) as store:
+        state = open_map(store, Execution())[2]
+        for drive in HALVES:  # a new drive is searched among all keyframes
+            member: Any = SimpleNamespace(drive=drive)
+            assert len(places_of(store, member, state)) == kept_of(small, drive)[0][-1] + 1
     places = verb("map", "export", small, "-o", tmp_path / "places.parquet", "--json").json
     assert places["places"] == told["places"]["after"]
     whole_joins = digests(whole)

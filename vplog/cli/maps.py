@@ -178,7 +178,7 @@ def add_maps(
     option(sub, "-o --target", place, "MAP2", "the new map", required=True)
     text = "recall at rank one that the map's own queries may lose (default: 0.01)"
     option(sub, "--loss", parser.number(lambda value: 0 <= value < 1, "from 0, below 1"), "SHARE", text, default=0.01)
-    text = "distance within which an answer is right, in m (default: three times the spacing of the places)"
+    text = "distance within which an answer is right, in m (default: three times the spacing of keyframes)"
     option(sub, "--distance-m", parser.positive, "M", text)
     sub = verb("redescribe", redescribe_map, "describe the drives of a map with another library", threads)
     option(sub, "--library", place, "LIB|LOG", "the library, or a log to make one from", required=True)

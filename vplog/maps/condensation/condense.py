@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 LOSS = 0.01
 """Of recall at rank one, by the map's own queries."""
 _SPACINGS = 3.0
-"""Right is within so many times the distance of places that follow each other: 3 m of places a metre apart."""
+"""Right is within so many times the distance of keyframes that follow each other: 3 m of keyframes a metre apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ def condense_map(
             drives, _, state = open_map(store, execution)
             places = read_own_places(store, drives, state)
             search, warnings = search_of(store, drives, places, state, execution)
-            within = distance_m or _SPACINGS * places.spacing_m()
+            within = distance_m or _SPACINGS * places.spacing_m
             asked = ask(places, search, state, within, execution)
             return choose_places(places, asked, within, loss, execution), state, warnings
 

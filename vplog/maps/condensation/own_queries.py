@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from vplog.data import Bools, Floats, Int32s, Ints, Ranking
 from vplog.errors import ResultError
@@ -51,17 +51,19 @@ class OwnPlaces:
     """(N,) number of the frame that the pose is in, which drives share that closures join; -1 without a pose."""
     pose: Floats
     """(N, 4, 4) world_from_body."""
+    spacing_m: float = 0.0
+    """Median distance of keyframes that follow each other."""
 
     @property
     def first(self) -> Ints:
         """(D + 1,) number of each drive's first place, and of all places."""
         return np.cumsum([0, *map(len, self.columns)])
 
-    def same_place(self, distance_m: float) -> Callable[[int, Ints], Bools]:
+    def same_place(self, distance_m: float) -> Callable[[int, Int32s | Ints], Bools]:
         """Whether others are within a distance of a place, in one frame."""
         position = self.pose[:, :3, 3]
 
-        def same(place: int, others: Ints) -> Bools:
+        def same(place: int, others: Int32s | Ints) -> Bools:
             near = np.linalg.norm(position[others] - position[place], axis=1) <= distance_m
             return near & (self.frame[others] == self.frame[place]) & (self.frame[place] >= 0)
 
@@ -72,18 +74,13 @@ class OwnPlaces:
         step = np.linalg.norm(np.diff(self.pose[:, :3, 3], axis=0, prepend=self.pose[:1, :3, 3]), axis=1)
         return np.where(np.diff(self.drive, prepend=-1) == 0, step, 0.0)
 
-    def spacing_m(self) -> float:
-        """Median distance of places that follow each other; 0 without any."""
-        step = self.steps_m()[(np.diff(self.drive, prepend=-1) == 0) & (self.frame >= 0)]
-        return float(np.median(step)) if len(step) else 0.0
-
 
 def read_own_places(store: Store, drives: Mapping[str, Mapping[str, Any]], state: PlaceState) -> OwnPlaces:
     """All places of a map, with their poses in the frame of the drives that closures join. Raises ResultError."""
     joint = joint_components(store)
     after = {drive: number for number, drive in enumerate(joint)}  # in the map's order, so that later ones are known
     names = sorted(drives, key=lambda drive: (after.get(drive, len(after)), drive))
-    columns, keyframes, poses, frames = [], [], [], []
+    columns, keyframes, poses, frames, steps = [], [], [], [], [np.empty(0)]
     numbers: dict[Any, int] = {}
     for drive in names:
         columns.append(read_column(store, drive, state))
@@ -95,10 +92,12 @@ def read_own_places(store: Store, drives: Mapping[str, Mapping[str, Any]], state
         frame = numbers.setdefault(joint[drive].folder if drive in joint else drive, len(numbers))
         keyframes.append(keyframe)
         poses.append(known[keyframe])
+        steps.append(np.linalg.norm(np.diff(known[:, :3, 3], axis=0), axis=1))
         frames.append(np.full(len(keyframe), -1 if drives[drive].get(PICTURES) else frame))
     number = np.repeat(np.arange(len(names)), list(map(len, columns)))
     keyframe, frame, pose = (np.concatenate(parts) for parts in (keyframes, frames, poses))
-    return OwnPlaces(names, columns, keyframe, number, frame, pose)
+    step = np.concatenate(steps)
+    return OwnPlaces(names, columns, keyframe, number, frame, pose, float(np.median(step)) if len(step) else 0.0)
 
 
 def search_of(
@@ -189,7 +188,7 @@ def later_passes(places: OwnPlaces, distance_m: float) -> Ints:
         if len(np.unique(places.drive[rows])) <= PASSES:
             continue
         position, turn = places.pose[rows, :3, 3], places.pose[rows, :3, :3]
-        for at, near in enumerate(cKDTree(position).query_ball_point(position, distance_m)):
+        for at, near in enumerate(KDTree(position).query_ball_point(position, distance_m)):
             later = np.array([one for one in near if places.drive[rows[one]] > places.drive[rows[at]]], np.int64)
             facing = se3.angle(turn[at].T @ turn[later]) <= np.radians(HEADING_DEG)
             passes[rows[at]] = len(np.unique(places.drive[rows[later[facing]]]))

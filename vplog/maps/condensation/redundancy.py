@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vplog.data import Bools, Floats, Ints, Ranking
+from vplog.data import Bools, Floats, Int32s, Ints, Ranking
 
 _MILLIMETRES = 3
 """Decimals of a gap in m: what differs by less is rounding."""
@@ -29,7 +29,7 @@ class OwnQueries:
     """Of each, its best places."""
     deeper: Callable[[int, int], Ranking]
     """The best so many places of a query; fewer where no more share anything with it."""
-    right: Callable[[int, Ints], Bools]
+    right: Callable[[int, Int32s | Ints], Bools]
     """Whether places show that of a query."""
 
 

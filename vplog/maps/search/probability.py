@@ -36,7 +36,8 @@ def answer_probabilities(
     """
     best, size = np.full((len(descriptors), 3), np.nan), np.ones(len(descriptors))
     answered = answers.count > 0
-    for number in np.unique(answers.drive[answered, 0]).tolist():
+    numbers: list[int] = np.unique(answers.drive[answered, 0]).tolist()
+    for number in numbers:
         views = np.flatnonzero(answered & (answers.drive[:, 0] == number))
         index, _ = drive_index(store, drives[number], state, settings)
         with scratch("scores") as folder:
