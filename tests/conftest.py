@@ -205,6 +205,22 @@ def joint(drive: Drive, made_once: Callable[..., Path]) -> Path:
 
 
 @pytest.fixture(scope="session")
+def halves(drive: Drive, made_once: Callable[..., Path]) -> Path:
+    """A map of two halves of the small drive, joined, beside their logs. Tests leave it as it is, but for landmarks."""
+    import vplog
+    from tests.joined import copied
+
+    def fill(folder: Path) -> None:
+        middle = vplog.open_log(drive.log).stamps()[22]
+        before = copied(drive.log, folder / "before.mcap", lambda topic, ns: topic == "/tf_static" or ns <= middle)
+        after = copied(drive.log, folder / "after.mcap", lambda topic, ns: topic == "/tf_static" or ns > middle)
+        done = vplog.batch([before, after], folder / "map", settings={"library.size": 12})
+        assert done["failed"] == 0
+
+    return made_once("halves", fill) / "map"
+
+
+@pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of real data, which is not part of the project."""
     folder = Path(os.environ.get("VPLOG_DATA", Path(__file__).parents[2] / "shared" / "data"))

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from tests.benchmarks import backend
 from tests.benchmarks.batch import PARTS, batch
+from tests.benchmarks.condense import condense
 from tests.benchmarks.discovery import discovery
 from tests.benchmarks.graphs import graphs
 from tests.benchmarks.images import drives
@@ -47,7 +48,7 @@ DISCOVERY_BAR = 1000.0
 SEARCH_BARS = (4.0, 40.0)
 """Times faster than a scan of binary codes, and of vectors of floats."""
 SIZES = (10_000, 100_000, 1_000_000, 10_000_000)
-LONG = {"large", "batch", "localize"}
+LONG = {"large", "batch", "localize", "condense"}
 """What is measured where it is named."""
 LARGEST_NEEDS_GB = 12.0
 """Memory that must be free for the largest map: the places, the index, and what the system needs beside."""
@@ -84,6 +85,7 @@ def _arguments() -> argparse.Namespace:
         "large",
         "batch",
         "localize",
+        "condense",
     )
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     named = f"of {', '.join(kinds)}; where none is named all but {', '.join(sorted(LONG))}. Or backend (its own --help)"
@@ -94,7 +96,11 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, default=3, help="of the false closures put into pose graphs")
     parser.add_argument("--poses", type=int, nargs="+", default=[100_000, 1_000_000], help="of the large pose graphs")
     parser.add_argument("--places", type=int, default=1_000_000, help="size of the map that is searched")
-    parser.add_argument("--folder", type=Path, help="keep the map of `scale` here (default: made anew, then removed)")
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        help="keep the map of `scale` here, and what `condense` makes (default: made anew, then removed)",
+    )
     parser.add_argument("--codes", action="store_true", help="`scale` beside a graph of codes, too")
     parser.add_argument("--vectors", action="store_true", help="`scale` beside a graph of vectors, too")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=[], help="parts of `batch`")
@@ -144,6 +150,9 @@ def _long(arguments: argparse.Namespace) -> Iterator[Figure]:
         yield from large(arguments.poses)
     if "batch" in arguments.what:
         yield from batch(arguments.only, arguments.kills, arguments.set)
+    if "condense" in arguments.what:
+        with tempfile.TemporaryDirectory() as made:
+            yield from condense(arguments.folder or Path(made))
     if "localize" in arguments.what:
         with tempfile.TemporaryDirectory() as made:
             yield from localize(arguments.scenes, Path(made))

@@ -102,7 +102,10 @@ def put_rows(store: Store, name: str, run: Path, library: str, rows: slice = sli
     table = pq.read_table(path)
     order = np.arange(len(table))[rows]
     header = {**table.schema.metadata, b"vplog.library": library.encode()}
-    pq.write_table(table.take(pa.array(order)).replace_schema_metadata(header), path)
+    table = table.take(pa.array(order))
+    column = pa.array(np.arange(len(table), dtype=np.int32))
+    table = table.set_column(0, table.schema.field(0), column)  # each is of the keyframe of its row
+    pq.write_table(table.replace_schema_metadata(header), path)
     about = {"drive": name, "log": f"/logs/{name}.mcap", "key": "k", "library": library, "inputs": {}}
     run_record.write_run_json(made / "drive.json", about)
     map_store.publish(store, name, made)

@@ -56,7 +56,7 @@ def test_a_map_tells_what_is_in_it(root: Path, finished: Path, library: str, ver
     told = verb("map", "info", root, "--json").json
     every = len(pq.read_table(finished / "keyframes.parquet"))
     assert told["library"]["hash"] == library
-    assert {one["drive"]: one["keyframes"] for one in told["drives"]} == {
+    assert {one["drive"]: one["places"] for one in told["drives"]} == {
         "all": every,
         "back 1/2": every - 21,
         "ten": 10,

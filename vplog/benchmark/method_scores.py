@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from vplog.benchmark.match_probability import match_probabilities
 from vplog.benchmark.published_answers import AnswersSettings, fill_scores
 from vplog.data import Float32s, Floats, Ints, Reference
 from vplog.errors import ResultError
@@ -23,6 +22,7 @@ from vplog.evaluate import retrieval
 from vplog.evaluate.open_set import score_open_set
 from vplog.evaluate.retrieval import Ranks, Reliability, reliability
 from vplog.execution.execution import Execution
+from vplog.loops.match_probability import match_probabilities
 from vplog.places.sequence import SequenceSettings, sequence_rows
 from vplog.places.views import views_of
 from vplog.stages import FrameState, PlaceIndex, PlaceState, ProbableIndex, StoredState

@@ -54,6 +54,16 @@ def remove_drives(arguments: argparse.Namespace) -> None:
     print_result(arguments, remove(arguments.map, arguments.drives), printing.print_removed)
 
 
+def condense_map(arguments: argparse.Namespace) -> None:
+    """Copy a map to another without the places that recognition can do without, at a stated loss."""
+    from vplog.maps.condensation.condense import condense_map as condense
+
+    with Progress(arguments) as progress:
+        execution = Execution(arguments.threads, progress)
+        found = condense(arguments.map, arguments.target, arguments.loss, arguments.distance_m, execution)
+    print_result(arguments, found, printing.print_condensed)
+
+
 def redescribe_map(arguments: argparse.Namespace) -> None:
     """Copy a map to another, its drives described with another library; their logs are read again."""
     with api.drive_processes(arguments.engine, arguments.jobs) as processes, Progress(arguments) as progress:
@@ -165,6 +175,12 @@ def add_maps(
     verb("join", join_map, "find closures between the drives of a map and solve them together", threads)
     sub = verb("remove", remove_drives, "remove drives")
     option(sub, "drives", str, "DRIVE", "as `map info` names them", nargs="+")
+    sub = verb("condense", condense_map, "leave out the places that recognition can do without", threads)
+    option(sub, "-o --target", place, "MAP2", "the new map", required=True)
+    text = "recall at rank one that the map's own queries may lose (default: 0.01)"
+    option(sub, "--loss", parser.number(lambda value: 0 <= value < 1, "from 0, below 1"), "SHARE", text, default=0.01)
+    text = "distance within which an answer is right, in m (default: three times the spacing of keyframes)"
+    option(sub, "--distance-m", parser.positive, "M", text)
     sub = verb("redescribe", redescribe_map, "describe the drives of a map with another library", threads)
     option(sub, "--library", place, "LIB|LOG", "the library, or a log to make one from", required=True)
     option(sub, "-o --target", place, "MAP2", "the new map", required=True)

@@ -397,6 +397,30 @@ def print_removed(found: dict[str, Any]) -> None:
     warn(found["warnings"])
 
 
+def print_condensed(found: dict[str, Any]) -> None:
+    rows = [
+        (one["drive"], *(str(one["places"][end]) for end in ("before", "after")), str(one["faded"]),
+         *(f"{one['descriptor_bytes'][end] / 1e3:.1f}" for end in ("before", "after")))
+        for one in found["drives"]
+    ]  # fmt: skip
+    print_table(("drive", "places", "kept", "faded", "kB", "kept kB"), rows)
+    warn(found["warnings"])
+    asked, recall, places, size = found["queries"], found["recall"], found["places"], found["descriptor_bytes"]
+    print(
+        f"own queries  {asked['places']}: {asked['by_other_drives']} answered by other drives, "
+        f"{asked['by_own_drive']} by their own, {asked['alone']} by no other place, within {found['distance_m']:g} m"
+    )
+    print(f"recall       {recall['before']:.4f} before, {recall['after']:.4f} after; {found['loss']:g} may be lost")
+    if found["faded"]["found"]:
+        print(f"faded        {found['faded']['found']} places, {found['faded']['removed']} of them removed")
+    if (known := found["references"]) is not None:
+        print(f"references   {known['after']} of {known['library']} named by places, {known['before']} before")
+    print(
+        f"{found['written']}: {places['after']} of {plural(places['before'], 'place')}, "
+        f"{size['after'] / 1e3:.1f} of {size['before'] / 1e3:.1f} kB of descriptors"
+    )
+
+
 def print_index(found: dict[str, Any]) -> None:
     places, drives = plural(found["places"], "place"), plural(len(found["drives"]), "drive")
     files = plural(len(found["segments"]), "file")
@@ -422,11 +446,12 @@ def print_answers(found: dict[str, Any]) -> None:
             one.get("match_name", str(one["keyframe"])),
             f"{one['score']:.3f}",
             str(one["support"]),
+            "" if one["p_match"] is None else f"{one['p_match']:.2f}",
         )
         for one in found["answers"]
         if one["rank"] == 0
     ]
-    print_table(("view", "drive", "keyframe", "score", "support"), rows)
+    print_table(("view", "drive", "keyframe", "score", "support", "p_match"), rows)
     warn(found["warnings"])
     views = plural(found["views"], "view")
     print(f"{found['log']}: {found['answered']} of {views} matched to a place of {found['map']}")
@@ -521,8 +546,11 @@ def print_study(out: Path, found: dict[str, Any]) -> None:
             cells = [f"{r['r_at_1']:.2f} / {r['anr']:.2f}" for r in rows if r["method"] == mean["method"]]
             cells += [f"{mean['r_at_1']:.3f} / {mean['anr']:.2f}"]
             cells += [f"{mean['r_at_1_worst']:.2f} / {mean['anr_worst']:.2f}", f"{mean['bytes_per_image']:g}"]
+            cells.append("" if mean["p_match_error"] is None else f"{mean['p_match_error']:.2f}")
             table.append((mean["method"], *cells))
-        print_table(("R@1 / ANR %", *(f"{a}\nin {b}" for a, b in pairs), "mean", "worst", "bytes"), table)
+        print_table(
+            ("R@1 / ANR %", *(f"{a}\nin {b}" for a, b in pairs), "mean", "worst", "bytes", "p_match\nerror"), table
+        )
     titles = ("R@1", "ANR %", "AP")
     if "sizes" in done:
         rows = done["sizes"]["mean"]

@@ -71,7 +71,7 @@ def _describe(store: Store) -> dict[str, Any]:
     if damage := store.failures_damage:
         problems.append(damage)
     problems += damage_warnings(store) + _unused_folders(store, [*abouts, *store.damaged])
-    places = sum(one["keyframes"] for one in drives)
+    places = sum(one["places"] for one in drives)
     stored = sum(one["descriptor_bytes"] for one in drives)
     library = {}
     try:
@@ -101,7 +101,8 @@ def _drive(store: Store, drive: str, about: dict[str, Any]) -> dict[str, Any]:
         return {
             "drive": drive,
             "log": about["log"],
-            "keyframes": store.rows("descriptors", drive),
+            "keyframes": store.rows("keyframes", drive),
+            "places": store.rows("descriptors", drive),
             "candidates": store.rows("closures", drive),
             "accepted": _figure(record, "counts", "verdicts", "accepted") or 0,
             "on_earth": store.earth(drive) is not None,

@@ -55,7 +55,7 @@ def merge_maps(
                 outcomes += _merge_places(store, source, known, by_content, chosen)
                 continue
             _, drives = map_store.common_library(source)
-            _copy_library(store, source, library)
+            copy_library(store, source, library)
             for drive in natural_order(drives.keys() & set(chosen) if chosen else drives):
                 taken = _merge_drive(store, source, drives[drive], known, by_content)
                 outcomes += [] if taken is None else [taken]
@@ -114,7 +114,7 @@ def _check_chosen(sources: Sequence[Store | Path], chosen: Sequence[str]) -> Non
         raise SettingsError(f"No map given has a drive {unknown[0]!r}. Drives: {', '.join(natural_order(known))}.")
 
 
-def _copy_library(store: Store, other: Store, library: str) -> None:
+def copy_library(store: Store, other: Store, library: str) -> None:
     """The library and the settings of the first map are those of a new one."""
     if (store.root / "map.json").exists() and store.head().library is not None:
         return

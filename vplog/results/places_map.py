@@ -79,10 +79,11 @@ def read_places(folder: Path, drive: str | None = None) -> DrivePlaces:
     column, _ = tables.read_descriptors(folder / "descriptors.parquet")
     header = tables.read_metadata(folder / "descriptors.parquet")
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
-    if len(column) != len(keyframes.stamp_ns):
-        raise ResultError(f"{folder} has {len(column)} descriptors for {len(keyframes.stamp_ns)} keyframes. Run again.")
-    rows = np.arange(len(column), dtype=np.int32)
-    return DrivePlaces(drive or keyframes.drive, folder, rows, keyframes.stamp_ns, world_from_body, column, header)
+    rows, count = tables.read_place_keyframes(folder / "descriptors.parquet"), len(keyframes.stamp_ns)
+    if len(rows) and rows[-1] >= count:
+        raise ResultError(f"{folder} has a descriptor of keyframe {rows[-1]}, and {count} keyframes. Run again.")
+    stamps, poses = keyframes.stamp_ns[rows], world_from_body[rows]
+    return DrivePlaces(drive or keyframes.drive, folder, rows, stamps, poses, column, header)
 
 
 def write_map(path: Path, folders: Sequence[Path]) -> dict[str, Any]:

@@ -19,11 +19,24 @@ from typing import Any, TypeVar
 import numpy as np
 import pyarrow as pa
 
-from vplog.data import Closures, EdgeKind, Floats, Ints, Keyframes, Odometry, PoseGraph, Solution, Trajectory, Verdict
+from vplog.data import (
+    Closures,
+    EdgeKind,
+    Floats,
+    Int32s,
+    Ints,
+    Keyframes,
+    Odometry,
+    PoseGraph,
+    Solution,
+    Trajectory,
+    Verdict,
+)
 from vplog.errors import ResultError, nearest
 from vplog.geometry import se3
 from vplog.storage.json_records import canonical_json
 from vplog.storage.parquet_limits import (
+    VERSION_KEY,
     check_columns,
     filled,
     open_table,
@@ -173,6 +186,14 @@ PLACED = pa.schema(
         column("stamp_ns", pa.int64(), "ns", "Stamp of the keyframe, in its log's clock."),
         column("score", pa.float32(), "1", "Similarity by the recogniser; of a sequence, how much above the usual."),
         column("support", pa.int32(), "1", "Other views of the window that agree; 0 where views stand alone."),
+        column(
+            "p_match",
+            pa.float32(),
+            "1",
+            "Probability that the view's best answer is its place, learned on the answers without a truth, so that it "
+            "compares between views; null for other answers, and where too few views have look-alikes.",
+            True,
+        ),
     ]
 )
 """Answers of a query of a map, by view, then by rank."""
@@ -427,11 +448,42 @@ def write_descriptors(path: Path, keyframes: Keyframes, descriptors: pa.Array, m
 
 
 def read_descriptors(path: Path) -> tuple[pa.Array, str]:
-    """The descriptors in the order of the keyframes, and the hash of the library they belong to."""
+    """The descriptors in the order of the keyframes, and the hash of the library they belong to. In a condensed map not
+    every keyframe has one: `read_place_keyframes` tells which."""
     with reading(path), open_table(path) as file:
         _check_name(path, "descriptors", file.schema_arrow)
         table = read_table(path, file, ["descriptor"])
         return table["descriptor"].combine_chunks(), (table.schema.metadata or {}).get(b"vplog.library", b"").decode()
+
+
+def read_place_keyframes(path: Path) -> Int32s:
+    """(P,) rows of the keyframes whose descriptors a table holds, increasing: all of them unless it is of a condensed
+    map. Raises ResultError."""
+    with reading(path), open_table(path) as file:
+        keyframe = read_table(path, file, ["keyframe"])["keyframe"]
+    rows = keyframe.to_numpy() if keyframe.type == pa.int32() and not keyframe.null_count else np.array([-1])
+    if np.any(np.diff(rows, prepend=-1) <= 0):
+        raise ResultError(f"{path} is damaged: its keyframes do not increase. Run `vplog run` again.")
+    return np.asarray(rows, np.int32)
+
+
+def on_keyframes(keyframe: Int32s) -> Ints | None:
+    """(N,) the row nearest to each keyframe up to the last that has one, of places (P,) of these keyframes; None where
+    each keyframe is a row of its own."""
+    if not len(keyframe) or keyframe[-1] == len(keyframe) - 1:
+        return None
+    middle = (keyframe[1:].astype(np.int64) + keyframe[:-1]) // 2
+    return np.searchsorted(middle, np.arange(keyframe[-1] + 1), side="left")
+
+
+def write_some_descriptors(source: Path, path: Path, rows: Ints) -> None:
+    """Some rows of a table of descriptors, as they are, under its header. Raises ResultError."""
+    with reading(source), open_table(source) as file:
+        _check_name(source, "descriptors", file.schema_arrow)
+        table = read_table(source, file, ["keyframe", "stamp_ns", "descriptor"]).take(pa.array(rows))
+    header = {key: value for key, value in (table.schema.metadata or {}).items() if key != VERSION_KEY.encode()}
+    with replacing(path) as stream:
+        write_table(stream, table.replace_schema_metadata(header), DESCRIPTORS_PER_GROUP, compression="zstd")
 
 
 def read_arrow(path: Path) -> pa.Table:
@@ -480,8 +532,8 @@ def read_table_metadata(path: Path) -> TableMetadata:
 
 
 def placed_table(columns: Sequence[Any]) -> pa.Table:
-    """The table PLACED of values (R,) for each column in order."""
-    arrays = [pa.array(values, field.type) for values, field in zip(columns, PLACED, strict=True)]
+    """The table PLACED of values (R,) for each column in order, NaN for null."""
+    arrays = [pa.array(values, field.type, from_pandas=True) for values, field in zip(columns, PLACED, strict=True)]
     return pa.Table.from_arrays(arrays, schema=PLACED)
 
 

@@ -125,7 +125,8 @@ def frames_at(
 def recorded_places(
     folder: Path, record: dict[str, Any], pipeline: Pipeline, execution: Execution
 ) -> tuple[PlaceState, Array]:
-    """The recogniser of a run and its descriptors. Raises LibraryError where its library is not there."""
+    """The recogniser of a run and the descriptor of each keyframe. Raises LibraryError where its library is not there,
+    or where not all keyframes have one."""
     with library_at(folder, record) as library:
         state = pipeline.places.load(library, execution)
         column, made_by = tables.read_descriptors(folder / "descriptors.parquet")
@@ -133,4 +134,6 @@ def recorded_places(
             raise LibraryError(
                 f"{original(library)} is not the library of the run in {folder}, so its boxes cannot be drawn."
             )
+    if len(column) < len(tables.read_stamps(folder / "keyframes.parquet")):
+        raise LibraryError(f"{folder} is of a condensed map, without the places that its boxes are drawn from.")
     return state, column

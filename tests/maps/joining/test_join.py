@@ -235,7 +235,7 @@ def test_a_record_that_names_other_folders_is_refused(
 
 def test_a_query_says_what_cannot_be_found(copy: Path, drive: Drive, verb: Callable[..., Said], tmp_path: Path) -> None:
     command = ["map", "query", copy, drive.log]
-    assert "fewer places than the window of 99 views" in verb(*command, "--sequence", 99).err
+    assert "fewer keyframes than the window of 99 views" in verb(*command, "--sequence", 99).err
     assert "is a folder: name a file" in verb(*command, "-o", tmp_path).err
     assert "length 4 is even" in verb(*command, "--sequence", 4).error
     shutil.rmtree(copy / "libraries")

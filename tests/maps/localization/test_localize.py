@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import vplog
-from tests.joined import copied
 from vplog import api
 from vplog.errors import LogError, ResultError, SettingsError, TruthError
 from vplog.geometry import se3
@@ -143,19 +142,9 @@ def test_a_log_is_joined_by_its_odometry(drive: Drive, run: Path, tmp_path: Path
     assert np.linalg.norm(poses[:, :3, 3] - known.world_from_body[:, :3, 3], axis=1).max() < 0.3
 
 
-def test_a_map_localises_in_the_frame_of_its_joined_drives(
-    drive: Drive, pictures: Path, tmp_path: Path, made_once: Callable[..., Path]
-) -> None:
+def test_a_map_localises_in_the_frame_of_its_joined_drives(halves: Path, pictures: Path, tmp_path: Path) -> None:
     """Two halves of the drive, joined or not: a picture of either has a pose in a frame that the answer names."""
-
-    def fill(folder: Path) -> None:
-        middle = vplog.open_log(drive.log).stamps()[22]
-        before = copied(drive.log, folder / "before.mcap", lambda topic, ns: topic == "/tf_static" or ns <= middle)
-        after = copied(drive.log, folder / "after.mcap", lambda topic, ns: topic == "/tf_static" or ns > middle)
-        done = vplog.batch([before, after], folder / "map", settings={"library.size": 12})
-        assert done["failed"] == 0
-
-    root = made_once("halves", fill) / "map"
+    root = halves
     record = api.localize(root, pictures / "pictures", topics={"calibration_file": pictures / "camera.yaml"})
     assert record["localized"] == record["pictures"]
     assert {one["drive"] for one in record["answers"]} == {"before", "after"}

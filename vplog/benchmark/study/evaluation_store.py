@@ -11,11 +11,12 @@ from itertools import permutations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vplog.benchmark.method_scores import describe_traversal, score_table, search, stored_bytes
+from vplog.benchmark.method_scores import describe_traversal, ranked, score_table, search, stored_bytes
 from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal, images_at, references_of
 from vplog.data import Bytes, Ints, Reference
 from vplog.errors import ResultError
 from vplog.evaluate import retrieval
+from vplog.evaluate.open_set import score_open_set
 from vplog.execution.execution import Execution
 from vplog.places.library_files import references_hash
 from vplog.places.reference_choice import LibrarySettings, choose
@@ -124,7 +125,7 @@ class Bench:
         index = state.index(places[other])
         scores = score_table(len(traversals[0]), len(traversals[1]), self.scratch, "scores")
         search(index, places[query], stops, scores, Execution(self.execution.threads), timed=False)
-        return retrieval.rank_queries(scores, truth, stops), truth
+        return ranked(scores, truth, stops), truth
 
     def run(self, stage: str, evaluations: Iterable[Evaluation]) -> list[dict[str, Any]]:
         """Scores of every evaluation, in order; stored ones are not computed again."""
@@ -149,6 +150,7 @@ class Bench:
                 size = stored_bytes(state.to_arrow(places[evaluation.map])) / len(places[evaluation.map])
                 done[keys[evaluation]] = {
                     **asdict(retrieval.score_retrieval(ranks)),
+                    "p_match_error": score_open_set(ranks).get("p_match", {}).get("expected_calibration_error"),
                     "bytes_per_image": round(size, 1),
                     "bits": state.bits,
                     "library_hash": references_hash(self._learned[1], self.methods[method]),
@@ -186,7 +188,9 @@ class Bench:
 
 def _is_whole(entry: Any) -> bool:
     numbers = (*SCORES, "bytes_per_image", "bits")
-    return isinstance(entry, dict) and all(isinstance(entry.get(name), (int, float)) for name in numbers)
+    if not isinstance(entry, dict) or not isinstance(entry.get("p_match_error", ""), float | int | None):
+        return False
+    return all(isinstance(entry.get(name), (int, float)) for name in numbers)
 
 
 def all_pairs(count: int) -> list[tuple[int, int]]:

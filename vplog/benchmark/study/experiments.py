@@ -250,6 +250,8 @@ def _aggregated(by: tuple[str, ...], key: tuple[Any, ...], some: list[Row]) -> R
         row[score] = _rounded(sum(one[score] for one in some) / len(some))
         worst = max if score in LESS_IS_BETTER else min
         row[f"{score}_worst"] = _rounded(worst(one.get(f"{score}_worst", one[score]) for one in some))
+    errors = [one["p_match_error"] for one in some if one["p_match_error"] is not None]
+    row["p_match_error"] = _rounded(sum(errors) / len(errors)) if errors else None
     row["bytes_per_image"] = round(sum(one["bytes_per_image"] for one in some) / len(some), 1)
     row["bits"] = max(one["bits"] for one in some)
     return row

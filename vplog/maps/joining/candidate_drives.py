@@ -7,11 +7,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
 
 from vplog.execution.execution import Execution
 from vplog.maps.joining.inter_session import Candidates, candidates_among
 from vplog.maps.search.exact import best_places
-from vplog.maps.search.index import read_column, update_index
+from vplog.maps.search.index import read_column, rows_on_keyframes, update_index
 from vplog.maps.search.sequences import PLACES_A_VIEW, drive_credits
 from vplog.maps.storage.damage import reading_drive
 from vplog.stages import CodedState, PlaceState
@@ -29,8 +30,11 @@ _AT_ONCE = 64
 
 
 def places_of(store: Store, member: Member, state: PlaceState) -> Sequence[Any]:
-    """The places of a drive. Raises DamagedDriveError where they are of another recogniser."""
-    column = read_column(store, member.drive, state)
+    """The place of each keyframe of a drive; of a condensed map the nearest. Raises DamagedDriveError where they are of
+    another recogniser."""
+    column, nearest = read_column(store, member.drive, state), rows_on_keyframes(store, member.drive)
+    if nearest is not None:
+        column = column.take(pa.array(nearest))
     with reading_drive(member.drive):
         return state.from_arrow(column)
 

@@ -19,16 +19,16 @@ from vplog.geometry import se3
 from vplog.loops.localize import KeyframeLandmarks, landmarks_from
 from vplog.maps.geo_bounds import earth_of_run
 from vplog.maps.joining.drive_pairs import known_camera
-from vplog.maps.joining.joint_record import components_in
+from vplog.maps.joining.frames import Component, joint_components, keyframe_poses
 from vplog.maps.joining.members import CameraTrust, member_of, opened_drive, opened_log
-from vplog.maps.search.exact import best_places
-from vplog.maps.search.index import SegmentView, update_index
+from vplog.maps.search.exact import NO_SCORE, best_places
+from vplog.maps.search.index import SegmentView, place_keyframes, update_index
 from vplog.maps.search.query import open_map
 from vplog.maps.search.sequences import best_lines
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import reading_drive
-from vplog.maps.storage.layout import PICTURES, folder_name
+from vplog.maps.storage.layout import PICTURES
 from vplog.pipeline import recorded_pipeline
 from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record, tables
@@ -109,12 +109,13 @@ def _of_run(folder: Path, execution: Execution) -> Iterator[Places]:
     with library_at(folder, record) as library:
         state = pipeline.places.load(library, Execution(execution.threads))
     column, _ = tables.read_descriptors(folder / "descriptors.parquet")
+    keyframe_of = tables.read_place_keyframes(folder / "descriptors.parquet")
     index = state.index(state.from_arrow(column))
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
 
     def search(descriptors: Sequence[Any], top: int) -> list[list[tuple[int, int]]]:
         found = execution.map(lambda one: index.query(one, top).rows, descriptors)
-        return [[(0, row) for row in rows.tolist()] for rows in found]
+        return [[(0, row) for row in keyframe_of[rows].tolist()] for rows in found]
 
     key = landmark_key(folder, record, pipeline)
     with ExitStack() as stack:
@@ -132,42 +133,26 @@ def _of_run(folder: Path, execution: Execution) -> Iterator[Places]:
 def _of_map(root: Path, execution: Execution) -> Iterator[Places]:
     with map_store.reading(root) as store, ExitStack() as stack:
         known, pipeline, state = open_map(store, execution)
-        joint = {
-            drive: (root / "joint" / one["folder"], one["drives"][0])
-            for one in components_in(store) or []
-            for drive in one["drives"]
-        }
+        joint = joint_components(store)
 
         def load(name: str, first: str) -> Landmarked:
             with reading_drive(name):
                 table = _map_landmarks(store, known[name], pipeline, stack, execution)
-            return Landmarked(_keyframes(store, joint, name), _map_earth(store, joint, first), table)
+            return Landmarked(keyframe_poses(store, joint, name), _map_earth(store, joint, first), table)
 
-        first = {name: joint[name][1] if name in joint else name for name in known}
+        first = {name: joint[name].drives[0] if name in joint else name for name in known}
         drives = [PlacesOfDrive(name, first[name], partial(load, name, first[name])) for name in known]
         warnings: list[str] = []
         search = _map_search(store, known, drives, state, warnings, execution)
         yield Places(str(store), state, pipeline, drives, search, warnings)
 
 
-def _keyframes(store: Store, joint: Mapping[str, tuple[Path, str]], drive: str) -> Floats:
-    """(N, 4, 4) of a drive, in the frame that it shares with those it is joined with."""
-    if drive not in joint:
-        with reading_drive(drive):
-            return tables.read_keyframes(store.file(drive, "keyframes.parquet"))[1]
-    path = joint[drive][0] / folder_name(drive) / "keyframes.parquet"
-    try:
-        return tables.read_keyframes(path)[1]
-    except ResultError:
-        raise ResultError(f"{path} is damaged. Join the drives again: vplog map join {store}") from None
-
-
-def _map_earth(store: Store, joint: Mapping[str, tuple[Path, str]], first: str) -> Earth | None:
+def _map_earth(store: Store, joint: Mapping[str, Component], first: str) -> Earth | None:
     """The georeference of the frame of a drive and those joined with it, by its own run's."""
     earth = store.earth(first)
     if earth is None or first not in joint:
         return earth
-    own = _keyframes(store, {}, first)[0] @ se3.inverse(_keyframes(store, joint, first)[0])
+    own = keyframe_poses(store, {}, first)[0] @ se3.inverse(keyframe_poses(store, joint, first)[0])
     return replace(earth, enu_from_world=earth.enu_from_world @ own)
 
 
@@ -199,6 +184,9 @@ def _map_search(
                 found = best_places(own, state, descriptors, top, execution)
             else:
                 found = best_lines(store, there, state, descriptors, top, SequenceSettings(length=1), execution)
+            for at in np.unique(found.drive[found.score > NO_SCORE]).tolist():
+                own = (found.drive == at) & (found.score > NO_SCORE)
+                found.keyframe[own] = place_keyframes(store, drives[at].name)[found.keyframe[own]]
             rows = zip(found.drive.tolist(), found.keyframe.tolist(), found.count.tolist(), strict=True)
             likely = [list(zip(drive[:count], row[:count], strict=True)) for drive, row, count in rows]
             for at in sorted({drive for one in likely for drive, _ in one}):

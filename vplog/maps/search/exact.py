@@ -41,7 +41,7 @@ class Answers:
     drive: Int32s
     """(Q, K) number of the drive, in order of IDs."""
     keyframe: Int32s
-    """(Q, K) row of the drive's keyframes."""
+    """(Q, K) row of the drive's places, which is that of its keyframes unless the map was condensed."""
     score: Float32s
     """(Q, K), NONE where there are fewer."""
     support: Int32s

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from vplog.data import Int32s
+from vplog.data import Int32s, Ints
 from vplog.errors import LibraryError, ResultError
 from vplog.execution.execution import Execution
 from vplog.maps.search.segment import SUFFIX, Content, Segment, open_segment, write_segment
@@ -204,6 +204,17 @@ def read_column(store: Store, drive: str, state: PlaceState) -> pa.Array:
         raise DamagedDriveError(
             f"{path} is of another recogniser. Where it should not be, {ADD_AGAIN}", drive
         ) from None
+
+
+def place_keyframes(store: Store, drive: str) -> Int32s:
+    """(P,) keyframes of the places of a drive: all of them, unless the map was condensed. Raises DamagedDriveError."""
+    with reading_drive(drive):
+        return tables.read_place_keyframes(store.file(drive, "descriptors.parquet"))
+
+
+def rows_on_keyframes(store: Store, drive: str) -> Ints | None:
+    """(N,) row of the place nearest to each keyframe; None where each has its own. Raises DamagedDriveError."""
+    return tables.on_keyframes(place_keyframes(store, drive))
 
 
 def _remove(paths: Sequence[Path], store: Store) -> None:

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog import logs
-from vplog.data import Ints, Keyframes
+from vplog.data import Floats, Ints, Keyframes
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
 from vplog.maps.search.exact import Answers, best_places
-from vplog.maps.search.index import SegmentView, update_index
+from vplog.maps.search.index import SegmentView, place_keyframes, update_index
+from vplog.maps.search.probability import answer_probabilities
 from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, best_lines, drives_by_credit
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
@@ -79,7 +80,8 @@ def query_map(
             drives = map_store.common_library(store)[1]
             short = _short_drives(store, drives, settings.length)
             answers, more = search(store, drives, state, descriptors, query, settings, execution)
-            table = _table(store, list(drives), answers, stamps)
+            p_match = answer_probabilities(store, list(drives), state, descriptors, answers, settings, execution)
+            table = _table(store, list(drives), answers, stamps, p_match)
             return list(drives), answers, short + more, table, _named(store, drives, table, log)
 
         drives, answers, more, table, named = skip_damaged(store, attempt)
@@ -232,12 +234,12 @@ def search(
 
 def _short_drives(store: Store, drives: Iterable[str], length: int) -> list[str]:
     """A warning where a window of views is longer than drives: they have too few places for its statistics."""
-    short = [drive for drive in drives if store.rows("descriptors", drive) < length] if length > 1 else []
+    short = [drive for drive in drives if store.rows("keyframes", drive) < length] if length > 1 else []
     if not short:
         return []
     more = f" and {len(short) - 1} more have" if len(short) > 1 else " has"
     return [
-        f"{short[0]}{more} fewer places than the window of {length} views, so matches there are missed. Search "
+        f"{short[0]}{more} fewer keyframes than the window of {length} views, so matches there are missed. Search "
         "single views: --sequence 1"
     ]
 
@@ -262,7 +264,7 @@ def _named(
     return records
 
 
-def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints) -> pa.Table:
+def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints, p_match: Floats) -> pa.Table:
     there = np.arange(answers.score.shape[1]) < answers.count[:, None]
     query, rank = np.nonzero(there)
     number, keyframe = answers.drive[there], answers.keyframe[there]
@@ -271,15 +273,15 @@ def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints) 
     for one in set(numbers):
         path = store.file(drives[one], "descriptors.parquet")
         with reading_drive(drives[one]):
-            known = tables.read_stamps(path)
+            known, keyframe_of = tables.read_stamps(path), place_keyframes(store, drives[one])
         rows = keyframe[number == one]
         if rows.max() >= len(known):
             raise ResultError(f"{path} was replaced while the map was searched. Run the query again.")
-        stamp[number == one] = known[rows]
+        stamp[number == one], keyframe[number == one] = known[rows], keyframe_of[rows]
     names = [drives[one] for one in numbers]
     return tables.placed_table(
         [
             query.astype(np.int32), stamps[query], rank.astype(np.int32), names, keyframe, stamp,
-            answers.score[there], answers.support[there],
+            answers.score[there], answers.support[there], np.where(rank == 0, p_match[query], np.nan),
         ]
     )  # fmt: skip

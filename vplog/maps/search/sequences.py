@@ -10,17 +10,19 @@ views.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Floats, Int32s, Ints
+from vplog.data import Float32s, Floats, Int32s, Ints, Ranking
 from vplog.execution.execution import Execution
 from vplog.maps.search.exact import NO_SCORE, Answers, merge, no_answers
-from vplog.maps.search.index import read_column
+from vplog.maps.search.index import read_column, rows_on_keyframes
 from vplog.maps.storage.damage import reading_drive
+from vplog.places.dense import best_rows
 from vplog.places.sequence import SequenceSettings, rank_places
-from vplog.stages import PlaceState, index_of_part
+from vplog.stages import PlaceIndex, PlaceState, index_of_part
 
 if TYPE_CHECKING:
     from vplog.maps.storage.map_store import Store
@@ -44,19 +46,52 @@ def best_lines(
     """
     best = no_answers(len(descriptors), top)
     for number, drive in execution.counted("search", drives.items(), len(drives)):
-        column = read_column(store, drive, state)
-        with reading_drive(drive):
-            index = index_of_part(state, state.from_arrow(column))
-        stops = np.full(len(descriptors), len(column), np.int64)
-        rankings = rank_places(index, descriptors, stops, top, settings, Execution(execution.threads))
+        index, nearest = drive_index(store, drive, state, settings)
+        stops = np.full(len(descriptors), len(index), np.int64)
+        most = top if nearest is None else top * -(-len(nearest) // (int(nearest[-1]) + 1))
+        rankings = rank_places(index, descriptors, stops, most, settings, Execution(execution.threads))
         found = no_answers(len(descriptors), top)
         found.drive[:] = number
         for view, (ranking, support) in enumerate(rankings):
-            count = len(ranking.rows)
-            found.keyframe[view, :count], found.score[view, :count] = ranking.rows, ranking.score
-            found.support[view, :count] = support
+            rows, first = ranking.rows, np.arange(len(ranking.rows))
+            if nearest is not None:  # of the keyframes that a place stands for, the best one
+                rows = nearest[rows]
+                first = np.sort(np.unique(rows, return_index=True)[1])
+            first = first[:top]
+            count = len(first)
+            found.keyframe[view, :count], found.score[view, :count] = rows[first], ranking.score[first]
+            found.support[view, :count] = support[first]
         best = merge([best, found], top)
     return best
+
+
+def drive_index(
+    store: Store, drive: str, state: PlaceState, settings: SequenceSettings
+) -> tuple[PlaceIndex, Ints | None]:
+    """The index of a drive's places. For lines it has a row for every keyframe, since these are spaced evenly, with the
+    scores of the nearest place, whose row comes along where the map was condensed."""
+    column = read_column(store, drive, state)
+    nearest = rows_on_keyframes(store, drive) if settings.length > 1 else None
+    with reading_drive(drive):
+        index = index_of_part(state, state.from_arrow(column))
+    return (index, None) if nearest is None else (_OnKeyframes(index, nearest), nearest)
+
+
+@dataclass(frozen=True, eq=False)
+class _OnKeyframes:
+    """Places with the row of the nearest one for each keyframe (N,)."""
+
+    index: PlaceIndex
+    nearest: Ints
+
+    def __len__(self) -> int:
+        return len(self.nearest)
+
+    def scores(self, descriptor: Any, stop: int | None = None) -> Float32s:
+        return self.index.scores(descriptor)[self.nearest[:stop]]
+
+    def query(self, descriptor: Any, k: int, stop: int | None = None) -> Ranking:
+        return best_rows(self.scores(descriptor, stop), k)
 
 
 def drives_by_credit(single: Answers, length: int) -> Ints:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vplog.benchmark.match_probability import best_places, match_probabilities, place_extent
 from vplog.loops.false_rate import conformal_p
+from vplog.loops.match_probability import best_places, match_probabilities, place_extent
 
 Q, M = 300, 400
 

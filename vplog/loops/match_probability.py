@@ -28,13 +28,25 @@ def match_probabilities(scores: Float32s, stops: Ints) -> Floats | None:
     NaN without two more places to compare with; None where too few queries have these.
     """
     extent = place_extent(scores)
-    best = np.array([best_places(scores[q, : stops[q]], extent) for q in range(len(scores))]).reshape(-1, 3)
-    known = np.flatnonzero(np.isfinite(best).all(axis=1))
+    return probabilities(np.array([best_places(scores[q, : stops[q]], extent) for q in range(len(scores))]))
+
+
+def probabilities(best: Floats, share: Floats | float = 1.0) -> Floats | None:
+    """(Q,) probability that the best place is right, by the scores (Q, 3) of the best three; None where too few queries
+    have these.
+
+    Where the three are the best of one part of a map, the best look-alike of the whole map, `share` times as large,
+    exceeds that of the part by the logarithm of it, in units of the tail.
+    """
+    known = np.flatnonzero(np.isfinite(best).all(axis=1)) if len(best) else np.empty(0, np.int64)
     if len(known) < _LEAST:
         return None
     first, second, third = best[known].T
-    found = np.full(len(scores), np.nan)
-    found[known] = 1.0 - null_probabilities(first, second + 2.0 * (second - third))
+    found = np.full(len(best), np.nan)
+    tail = 2.0 * (second - third)
+    found[known] = 1.0 - null_probabilities(
+        first, second + tail * (1.0 + np.log(np.broadcast_to(share, len(best))[known]))
+    )
     return found
 
 

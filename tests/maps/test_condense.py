@@ -1,0 +1,157 @@
+"""Maps without the places that recognition can do without: what stays, and that they work on as before."""
+
+from __future__ import annotations
+
+import shutil
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from tests.maps.joining.test_join import digests
+from vplog.data import Ranking
+from vplog.execution.execution import Execution
+from vplog.maps.condensation.own_queries import PASSES, OwnPlaces, later_passes
+from vplog.maps.condensation.redundancy import OwnQueries, remove_redundant
+from vplog.maps.joining.candidate_drives import places_of
+from vplog.maps.search.query import open_map
+from vplog.maps.storage import map_store
+from vplog.maps.storage.map_store import Store
+from vplog.results import tables
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from conftest import Said
+
+    Verb = Callable[..., Said]
+
+HALVES = ("before", "after")
+
+
+@pytest.fixture
+def whole(halves: Path, tmp_path: Path) -> Path:
+    """A map of two halves of a drive, joined."""
+    return shutil.copytree(halves, tmp_path / "map", ignore=shutil.ignore_patterns("landmarks.parquet", ".cache"))
+
+
+def line(rng: np.random.Generator, count: int, near: float) -> tuple[np.ndarray, OwnQueries]:
+    """Places along a line that score by how near they are, with noise, each looked for among all others."""
+    at = np.arange(count, dtype=np.float64)
+    score = np.exp(-np.abs(at[:, None] - at) / 4) + rng.normal(0, 0.1, (count, count))
+    np.fill_diagonal(score, -np.inf)
+
+    def best(query: int, top: int) -> Ranking:
+        rows = np.argsort(-score[query], kind="stable")[: min(top, count - 1)]
+        return Ranking(rows.astype(np.int32), score[query, rows].astype(np.float32))
+
+    def right(query: int, rows: np.ndarray) -> np.ndarray:
+        return np.abs(at[rows] - at[query]) <= near
+
+    return at, OwnQueries([best(query, 3) for query in range(count)], best, right)
+
+
+@pytest.mark.parametrize("most", [0, 5])
+def test_no_more_queries_are_lost_than_may_be(most: int) -> None:
+    """Answers among the places that stay are those of a search among them alone, however short the lists were."""
+    at, queries = line(np.random.default_rng(1), 60, 3.0)
+    every = np.ones(60, np.bool_)
+    removal = remove_redundant(queries, np.zeros(60, np.int64), at, every, ~every, most)
+    kept = every.copy()
+    kept[removal.places] = False
+
+    def answered(kept: np.ndarray) -> int:
+        count = 0
+        for query in range(60):
+            rows = queries.deeper(query, 60).rows
+            rows = rows[kept[rows]]
+            count += bool(queries.right(query, rows[:1])[0])
+        return count
+
+    assert answered(every) - answered(kept) == removal.lost[-1] <= most
+    assert 10 < len(removal.places) < 59
+    rest = np.sort(removal.places[:10])
+    assert np.diff(rest).min() > 1, "no gap is left while there are smaller ones"
+    longer = remove_redundant(queries, np.zeros(60, np.int64), at, every, ~every, most + 3)
+    assert longer.places[: len(removal.places)].tolist() == removal.places.tolist()
+
+
+def test_places_that_later_drives_pass_without_finding_them_fade() -> None:
+    """Those that come by looking the other way say nothing."""
+    pose = np.tile(np.eye(4), (PASSES + 2, 1, 1))
+    drive = np.arange(len(pose))
+    places = OwnPlaces(
+        [f"{one}" for one in drive], [pa.array([0])] * len(drive), drive.astype(np.int32), drive, drive * 0, pose
+    )
+    assert later_passes(places, 1.0).tolist() == [*range(PASSES + 1, -1, -1)]
+    pose[-1, :3, :3] = np.diag([-1.0, 1.0, -1.0])
+    pose[-2, 0, 3] = 2.0
+    assert later_passes(places, 1.0)[0] == PASSES - 1
+
+
+def test_a_condensed_map_works_as_before(whole: Path, halves: Path, tmp_path: Path, verb: Verb) -> None:
+    small = tmp_path / "small"
+    told = verb("map", "condense", whole, "-o", small, "--loss", "0.05", "--json").json
+    assert told["places"]["before"] > told["places"]["after"] >= 2
+    assert told["descriptor_bytes"]["before"] > told["descriptor_bytes"]["after"]
+    assert 0 <= told["recall"]["loss"] <= 0.05
+    sizes = {one["drive"]: one["places"] for one in told["drives"]}
+    for drive in HALVES:
+        check_rows(whole, small, drive, sizes[drive]["after"])
+    info = verb("map", "info", small, "--check", "--json").json
+    assert (info["problems"], info["places"]) == ([], told["places"]["after"])
+    log = halves.parent / "after.mcap"
+    for length in (1, 5):
+        answers = verb("map", "query", small, log, "--sequence", length, "--json").json["answers"]
+        for one in answers:
+            keyframe, stamp_ns = kept_of(small, one["drive"])
+            assert one["stamp_ns"] == stamp_ns[keyframe.tolist().index(one["keyframe"])]
+        assert {one["rank"] for one in answers} >= {0, 1}
+        assert {one["p_match"] is None for one in answers if one["rank"]} == {True}
+        known = [one["p_match"] for one in answers if not one["rank"] and one["p_match"] is not None]
+        assert all(0 <= one <= 1 for one in known)
+    with map_store.reading(small) as store:
+        state = open_map(store, Execution())[2]
+        for drive in HALVES:  # a new drive is searched among all keyframes
+            member: Any = SimpleNamespace(drive=drive)
+            assert len(places_of(store, member, state)) == kept_of(small, drive)[0][-1] + 1
+    places = verb("map", "export", small, "-o", tmp_path / "places.parquet", "--json").json
+    assert places["places"] == told["places"]["after"]
+    whole_joins = digests(whole)
+    assert digests(small) == whole_joins
+    assert verb("map", "join", small, "--json").json["searched"] == []
+    assert digests(small) == whole_joins
+    merged = tmp_path / "merged"
+    verb("map", "merge", small, "-o", merged)
+    assert verb("map", "info", merged, "--json").json["places"] == told["places"]["after"]
+    again = verb("map", "condense", small, "-o", tmp_path / "again", "--loss", "0.05", "--json").json
+    assert again["places"]["after"] <= told["places"]["after"]
+    assert "holds a map already" in verb("map", "condense", whole, "-o", small).error
+
+
+def kept_of(root: Path, drive: str) -> tuple[np.ndarray, np.ndarray]:
+    path = Store(root).file(drive, "descriptors.parquet")
+    return tables.read_place_keyframes(path), tables.read_stamps(path)
+
+
+def check_rows(whole: Path, small: Path, drive: str, count: int) -> None:
+    """The rows that stay are as they were, and so are all other files."""
+    before, after = (pq.read_table(Store(root).file(drive, "descriptors.parquet")) for root in (whole, small))
+    assert len(after) == count
+    assert after.schema.equals(before.schema, check_metadata=True)
+    assert after.to_pylist() == before.take(after["keyframe"]).to_pylist()
+    for path in Store(whole).run(drive).iterdir():
+        if path.is_file() and path.name not in ("drive.json", "descriptors.parquet"):
+            assert (Store(small).run(drive) / path.name).read_bytes() == path.read_bytes()
+
+
+def test_drives_that_nothing_joins_are_condensed_each_for_itself(whole: Path, tmp_path: Path, verb: Verb) -> None:
+    apart = shutil.copytree(whole, tmp_path / "apart", ignore=shutil.ignore_patterns("joint.json", "joint"))
+    told: dict[str, Any] = verb("map", "condense", apart, "-o", tmp_path / "small", "--json").json
+    assert told["queries"]["by_other_drives"] == 0
+    assert any("No drives are joined" in line for line in told["warnings"])
+    assert all(one["places"]["after"] for one in told["drives"])

@@ -1,0 +1,195 @@
+"""The places of a map as queries of itself: each is looked for among all others, of every drive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+from scipy.spatial import KDTree
+
+from vplog.data import Bools, Floats, Int32s, Ints, Ranking
+from vplog.errors import ResultError
+from vplog.execution.execution import Execution
+from vplog.geometry import se3
+from vplog.maps.condensation.redundancy import OwnQueries
+from vplog.maps.joining.frames import joint_components, keyframe_poses
+from vplog.maps.search.exact import Answers, best_places, merge, no_answers
+from vplog.maps.search.index import place_keyframes, read_column, update_index
+from vplog.maps.storage.layout import PICTURES
+from vplog.stages import CodedState, PlaceState, index_of_part
+
+if TYPE_CHECKING:
+    from vplog.maps.storage.map_store import Store
+
+    Search = Callable[[Sequence[Any], int], Answers]
+    """The best so many places for each view."""
+
+BEST = 16
+"""Places that are looked up for each query at first: 192 bytes, as much as the codes of one."""
+PASSES = 3
+"""Later drives that come by a place without finding it, after which it has faded: fewer may all have had bad light."""
+HEADING_DEG = 45.0
+"""Drives that come by look the same way within this angle of the whole rotation."""
+
+
+@dataclass(frozen=True, eq=False)
+class OwnPlaces:
+    """The N places of a map, drive after drive."""
+
+    drives: list[str]
+    """In the map's order where closures join them."""
+    columns: list[pa.Array]
+    """Descriptors of each drive's places."""
+    keyframe: Int32s
+    """(N,) row of the drive's keyframes."""
+    drive: Ints
+    """(N,) number of the drive."""
+    frame: Ints
+    """(N,) number of the frame that the pose is in, which drives share that closures join; -1 without a pose."""
+    pose: Floats
+    """(N, 4, 4) world_from_body."""
+    spacing_m: float = 0.0
+    """Median distance of keyframes that follow each other."""
+
+    @property
+    def first(self) -> Ints:
+        """(D + 1,) number of each drive's first place, and of all places."""
+        return np.cumsum([0, *map(len, self.columns)])
+
+    def same_place(self, distance_m: float) -> Callable[[int, Int32s | Ints], Bools]:
+        """Whether others are within a distance of a place, in one frame."""
+        position = self.pose[:, :3, 3]
+
+        def same(place: int, others: Int32s | Ints) -> Bools:
+            near = np.linalg.norm(position[others] - position[place], axis=1) <= distance_m
+            return near & (self.frame[others] == self.frame[place]) & (self.frame[place] >= 0)
+
+        return same
+
+    def steps_m(self) -> Floats:
+        """(N,) distance of each place from the one before; 0 of the first of a drive."""
+        step = np.linalg.norm(np.diff(self.pose[:, :3, 3], axis=0, prepend=self.pose[:1, :3, 3]), axis=1)
+        return np.where(np.diff(self.drive, prepend=-1) == 0, step, 0.0)
+
+
+def read_own_places(store: Store, drives: Mapping[str, Mapping[str, Any]], state: PlaceState) -> OwnPlaces:
+    """All places of a map, with their poses in the frame of the drives that closures join. Raises ResultError."""
+    joint = joint_components(store)
+    after = {drive: number for number, drive in enumerate(joint)}  # in the map's order, so that later ones are known
+    names = sorted(drives, key=lambda drive: (after.get(drive, len(after)), drive))
+    columns, keyframes, poses, frames, steps = [], [], [], [], [np.empty(0)]
+    numbers: dict[Any, int] = {}
+    for drive in names:
+        columns.append(read_column(store, drive, state))
+        keyframe = place_keyframes(store, drive)
+        known = keyframe_poses(store, joint, drive)
+        if len(keyframe) and keyframe[-1] >= len(known):
+            wrong = f"{store} has more keyframes of {drive} than the graph that joins it."
+            raise ResultError(f"{wrong} Join the drives again: vplog map join {store}")
+        frame = numbers.setdefault(joint[drive].folder if drive in joint else drive, len(numbers))
+        keyframes.append(keyframe)
+        poses.append(known[keyframe])
+        steps.append(np.linalg.norm(np.diff(known[:, :3, 3], axis=0), axis=1))
+        frames.append(np.full(len(keyframe), -1 if drives[drive].get(PICTURES) else frame))
+    number = np.repeat(np.arange(len(names)), list(map(len, columns)))
+    keyframe, frame, pose = (np.concatenate(parts) for parts in (keyframes, frames, poses))
+    step = np.concatenate(steps)
+    return OwnPlaces(names, columns, keyframe, number, frame, pose, float(np.median(step)) if len(step) else 0.0)
+
+
+def search_of(
+    store: Store, about: Mapping[str, Mapping[str, Any]], places: OwnPlaces, state: PlaceState,
+    execution: Execution = Execution(),
+) -> tuple[Search, list[str]]:  # fmt: skip
+    """The search for single views in a map, by its index where the recogniser has one, and warnings."""
+    if isinstance(state, CodedState):
+        parts, warnings = update_index(store, {drive: about[drive] for drive in places.drives}, state, execution)
+
+        def by_index(views: Sequence[Any], top: int) -> Answers:
+            return best_places(parts, state, views, top, Execution(execution.threads))
+
+        return by_index, warnings
+    return search_in_memory(places, state), []
+
+
+def search_in_memory(places: OwnPlaces, state: PlaceState) -> Search:
+    """The search for single views by an index of each drive."""
+    indexes = [index_of_part(state, state.from_arrow(column)) for column in places.columns]
+
+    def by_drive(views: Sequence[Any], top: int) -> Answers:
+        best = no_answers(len(views), top)
+        for number, index in enumerate(indexes):
+            found = no_answers(len(views), top)
+            found.drive[:] = number
+            for view, descriptor in enumerate(views):
+                one = index.query(descriptor, top)
+                found.keyframe[view, : len(one.rows)], found.score[view, : len(one.rows)] = one.rows, one.score
+            best = merge([best, found], top)
+        return best
+
+    return by_drive
+
+
+@dataclass(frozen=True, eq=False)
+class AskedPlaces:
+    """Places that ask for themselves, and what the answers say of the others."""
+
+    place: Ints
+    """(Q,) places that are answered rightly."""
+    queries: OwnQueries
+    faded: Bools
+    """(N,) places that `PASSES` later drives came by, of which none has it among its best."""
+
+
+def ask(
+    places: OwnPlaces, search: Search, state: PlaceState, distance_m: float, execution: Execution = Execution()
+) -> AskedPlaces:
+    """Look for every place among the others; an answer within the distance is right."""
+    first, same = places.first, places.same_place(distance_m)
+    matched, best = np.zeros(len(places.drive), np.bool_), dict[int, Ranking]()
+
+    def looked_for(rows: Ints, top: int) -> list[Ranking]:
+        """The best of all other places for rows of one drive."""
+        number = int(places.drive[rows[0]])
+        column = places.columns[number].take(pa.array(rows - first[number]))
+        found, known = search(state.from_arrow(column), min(top + 1, len(places.drive))), []
+        for at, row in enumerate(rows.tolist()):
+            count = int(found.count[at])
+            others = first[found.drive[at, :count]] + found.keyframe[at, :count]
+            other = others != row
+            known.append(Ranking(others[other].astype(np.int32), found.score[at, :count][other]))
+        return known
+
+    for number in execution.counted("query", range(len(places.drives)), len(places.drives)):
+        rows = np.arange(first[number], first[number + 1])
+        rows = rows[places.frame[rows] >= 0]
+        for row, found in zip(rows.tolist(), looked_for(rows, BEST) if len(rows) else [], strict=True):
+            right = same(row, found.rows)
+            matched[found.rows[right & (places.drive[found.rows] < number)]] = True
+            if right[:1].any():
+                best[row] = found
+    place = np.array(sorted(best), np.int64)
+    queries = OwnQueries(
+        [best[row] for row in place.tolist()],
+        lambda query, top: looked_for(place[query : query + 1], top)[0],
+        lambda query, others: same(int(place[query]), others),
+    )
+    return AskedPlaces(place, queries, (later_passes(places, distance_m) >= PASSES) & ~matched)
+
+
+def later_passes(places: OwnPlaces, distance_m: float) -> Ints:
+    """(N,) later drives that came by each place, within the distance and looking the same way."""
+    passes = np.zeros(len(places.drive), np.int64)
+    for frame in np.unique(places.frame[places.frame >= 0]).tolist():
+        rows = np.flatnonzero(places.frame == frame)
+        if len(np.unique(places.drive[rows])) <= PASSES:
+            continue
+        position, turn = places.pose[rows, :3, 3], places.pose[rows, :3, :3]
+        for at, near in enumerate(KDTree(position).query_ball_point(position, distance_m)):
+            later = np.array([one for one in near if places.drive[rows[one]] > places.drive[rows[at]]], np.int64)
+            facing = se3.angle(turn[at].T @ turn[later]) <= np.radians(HEADING_DEG)
+            passes[rows[at]] = len(np.unique(places.drive[rows[later[facing]]]))
+    return passes

@@ -1,0 +1,189 @@
+"""Places that recognition can do without, found by removing them one after the other.
+
+The next to go is the place that leaves the smallest gap in its drive; of equal gaps the one that loses fewest of the
+queries that are answered rightly and, of these, least of the scores of the right answers, the facility location
+function. None of these becomes less as others go, or only where an answer becomes right, so a stale cost is a bound and
+only the best few are evaluated again (Minoux, Accelerated greedy algorithms, 1978).
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from vplog.data import Bools, Floats, Int32s, Ints, Ranking
+
+_MILLIMETRES = 3
+"""Decimals of a gap in m: what differs by less is rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class OwnQueries:
+    """Q queries of a map's own places, each answered rightly by the N places that it is looked for among."""
+
+    best: list[Ranking]
+    """Of each, its best places."""
+    deeper: Callable[[int, int], Ranking]
+    """The best so many places of a query; fewer where no more share anything with it."""
+    right: Callable[[int, Int32s | Ints], Bools]
+    """Whether places show that of a query."""
+
+
+@dataclass(frozen=True, eq=False)
+class Removal:
+    """Places in the order in which they are removed."""
+
+    places: Ints
+    """(R,)."""
+    lost: Ints
+    """(R,) queries that are not answered rightly any more after each."""
+
+
+class _Answer(NamedTuple):
+    """The answer to a query among the places that are left."""
+
+    top: int
+    """Place; -1 without an answer."""
+    is_right: bool
+    best_right: int
+    """The best right place that is known; -1 where none is."""
+    score: float
+    """Of that place, 0 without."""
+
+
+@dataclass(eq=False)
+class _Remaining:
+    """The places that are left, and the answers of all queries among them."""
+
+    queries: OwnQueries
+    kept: Bools
+    best: list[Ranking] = field(default_factory=list)
+    right: list[Bools] = field(default_factory=list)
+    answers: list[_Answer] = field(default_factory=list)
+    users: dict[int, list[int]] = field(default_factory=dict)
+    """Queries whose answer or best right place each place is, or was."""
+    whole: set[int] = field(default_factory=set)
+    """Queries whose lists have every place that shares anything with them."""
+
+    def __post_init__(self) -> None:
+        self.best = list(self.queries.best)
+        self.right = [self.queries.right(query, one.rows) for query, one in enumerate(self.best)]
+        self.answers = [_Answer(-1, False, -1, 0.0)] * len(self.best)
+        for query in range(len(self.best)):
+            self._update(query)
+
+    def answer(self, query: int, without: int = -1) -> _Answer:
+        """The answer without one place more; longer lists of places are looked up where all of one are gone."""
+        while True:
+            found = self.best[query]
+            alive = self.kept[found.rows] & (found.rows != without)
+            if alive.any():
+                break
+            if query in self.whole:
+                return _Answer(-1, False, -1, 0.0)
+            more = self.queries.deeper(query, 4 * len(found.rows) + 1)
+            if len(more.rows) <= 4 * len(found.rows):
+                self.whole.add(query)
+            self.best[query], self.right[query] = more, self.queries.right(query, more.rows)
+        top, good = int(alive.argmax()), alive & self.right[query]
+        at = int(good.argmax()) if good.any() else -1
+        best_right, score = (int(found.rows[at]), float(found.score[at])) if at >= 0 else (-1, 0.0)
+        return _Answer(int(found.rows[top]), bool(self.right[query][top]), best_right, score)
+
+    def cost(self, place: int) -> tuple[int, float]:
+        """Queries lost by the removal of a place, and the drop of the scores of right answers."""
+        lost, drop, using = 0, 0.0, []
+        for query in dict.fromkeys(self.users.get(place, ())):
+            now = self.answers[query]
+            if place not in (now.top, now.best_right):
+                continue
+            using.append(query)
+            then = self.answer(query, place)
+            lost += now.is_right - then.is_right
+            drop += now.score - then.score if now.best_right == place else 0.0
+        self.users[place] = using
+        return lost, drop
+
+    def remove(self, place: int) -> None:
+        self.kept[place] = False
+        for query in dict.fromkeys(self.users.pop(place, ())):
+            self._update(query)
+
+    def _update(self, query: int) -> None:
+        self.answers[query] = found = self.answer(query)
+        for place in {found.top, found.best_right} - {-1}:
+            self.users.setdefault(place, []).append(query)
+
+
+@dataclass(eq=False)
+class _Gaps:
+    """Distances between the places of drives that are left, each drive's in a row."""
+
+    along_m: Floats
+    before: Ints
+    """(N,) the place before each in its drive; itself where it is the first."""
+    after: Ints
+
+    @classmethod
+    def of(cls, drive: Ints, along_m: Floats) -> _Gaps:
+        every = np.arange(len(drive))
+        first, last = (np.diff(drive, **ends) != 0 for ends in ({"prepend": -1}, {"append": -1}))
+        return cls(along_m, np.where(first, every, every - 1), np.where(last, every, every + 1))
+
+    def without(self, place: int) -> float:
+        """The gap that the removal of a place leaves; at the end of a drive twice the distance to the next one."""
+        before, after = int(self.before[place]), int(self.after[place])
+        gap = self.along_m[after] - self.along_m[before]
+        return float(gap if before < place < after else 2 * gap)
+
+    def remove(self, place: int) -> None:
+        before, after = int(self.before[place]), int(self.after[place])
+        self.after[before] = after if after > place else before
+        self.before[after] = before if before < place else after
+
+
+def remove_redundant(
+    queries: OwnQueries, drive: Ints, along_m: Floats, removable: Bools, faded: Bools, most_lost: int,
+    progress: Callable[[int], None] = lambda _: None,
+) -> Removal:  # fmt: skip
+    """Remove places (N,) of drives, in their order and so far along them, as long as at most so many queries are lost.
+    `faded` ones that cost no query go before all others; of each drive one place stays."""
+    remaining = _Remaining(queries, np.ones(len(drive), np.bool_))
+    gaps, left, lost, order, losses = _Gaps.of(drive, along_m), np.bincount(drive), 0, list[int](), list[int]()
+
+    def key(place: int) -> tuple[float, int, float, int]:
+        queries_lost, drop = remaining.cost(place)
+        gap = 0.0 if faded[place] and queries_lost <= 0 else round(gaps.without(place), _MILLIMETRES)
+        return gap, queries_lost, drop, place
+
+    heap = [key(place) for place in np.flatnonzero(removable).tolist()]
+    heapq.heapify(heap)
+    while heap:
+        place = heapq.heappop(heap)[-1]
+        if left[drive[place]] == 1:
+            continue
+        now = key(place)
+        if heap and now > heap[0]:
+            heapq.heappush(heap, now)
+            continue
+        if lost + now[1] > most_lost:
+            break
+        remaining.remove(place)
+        gaps.remove(place)
+        lost += now[1]
+        left[drive[place]] -= 1
+        order.append(place)
+        losses.append(lost)
+        progress(len(order))
+    return Removal(np.array(order, np.int64), np.array(losses, np.int64))
+
+
+def kept_after(count: int, removed: Sequence[int] | Ints) -> Bools:
+    """(N,) whether each of `count` places stays."""
+    kept = np.ones(count, np.bool_)
+    kept[np.asarray(removed, np.int64)] = False
+    return kept
