@@ -53,7 +53,7 @@ def saying(answer: Callable[[str], bytes]) -> Iterator[str]:
         (b"HTTP/1.1 200 OK\r\n" + b"X: y\r\n" * 500 + b"\r\n", "is not HTTP"),
         (b"HTTP/1.1 200 OK\r\nX: " + b"y" * 100_000 + b"\r\n\r\n", "does not say how long"),
         (b"", "is not HTTP"),
-        (b"HTTP/1.1 302 Found\r\nLocation: /drive.mcap\r\n\r\n", "redirects without end"),
+        (b"HTTP/1.1 302 Found\r\nConnection: close\r\nLocation: /drive.mcap\r\n\r\n", "redirects without end"),
         (b"HTTP/1.1 302 Found\r\nLocation: file:///etc/passwd\r\n\r\n", "answers 302"),
         (
             b"HTTP/1.1 302 Found\r\nLocation: ftp://127.0.0.1:1/a\r\n\r\n",
