@@ -280,7 +280,7 @@ def print_questions(found: dict[str, Any]) -> None:
             (
                 *(str(one[name]) for name in names),
                 "" if one["p_false"] is None else f"{one['p_false']:.3f}",
-                f"{one['p_wrong']:.2f}",
+                f"{one['p_wrong']:.3f}",
                 f"{one['moved_m']:.3f}",
                 str(len(one["closures"])),
             )

@@ -167,7 +167,7 @@ def _questions(content: Content) -> list[list[Any]]:
             *(str(int(end[row])) for end in (closures.query, closures.match)),
             closures.verdict[row].value,
             figure(closures.p_false[row], 3),
-            figure(one.p_wrong, 2),
+            figure(one.p_wrong, 3),
             figure(one.moved_m, 3),
             str(len(one.rows)),
         ]
