@@ -25,8 +25,10 @@ if TYPE_CHECKING:
 
     from vplog.data import Bools, Floats, Ints, PoseGraph
 
-_MOST = 64
-"""Sets of either verdict that are turned: each costs a solve from the map as it is."""
+_MOST = 16
+"""Runs of closures that are turned, of either verdict by either order: each costs a solve from the map as it is."""
+_FAMILIES = 8
+"""Largest families of runs that are turned as a whole."""
 _POWER = 0.1
 """Of the evidence: the closures of a run, some ten, see the same things and err together."""
 _KEPT = 0.005
@@ -86,16 +88,26 @@ def _sets(graph: PoseGraph, weight: Floats, decided: Bools, chain: OdometryChain
     for used in (True, False):
         some = [run[(weight[run] > 0) == used] for run in accidents(graph, loops, chain, log_room(graph, chain.poses))]
         some = [run for one in some if len(run := one[~decided[one]])]
-        # as the search flips them: the used ones that fit worst, the others that fit best
-        parts += sorted(some, key=lambda run: float(misfit[run].mean()) * (-1.0 if used else 1.0))[:_MOST]
+        # as the search flips them: the used ones that fit worst, the others that fit best; and what stands alone
+        doubtful = np.argsort([float(misfit[run].mean()) * (-1.0 if used else 1.0) for run in some], kind="stable")
+        alone = np.argsort(-_apart(graph, some), kind="stable")
+        chosen = dict.fromkeys([*doubtful[:_MOST].tolist(), *alone[:_MOST].tolist()])
+        parts += [some[at] for at in chosen]
     yield from ((run, run) for run in parts)
-    for family in agreeing(graph, loops, chain):
-        if decided[family].any():
-            continue
+    families = [one for one in agreeing(graph, loops, chain)[:_FAMILIES] if not decided[one].any()]
+    for family in families:
         used = (weight[family] > 0).any()
         members = [run for run in parts if (weight[run[0]] > 0) == used and np.isin(run[0], family)]
         if len(members) > 1:
             yield max(members, key=len), np.concatenate(members)
+
+
+def _apart(graph: PoseGraph, runs: list[Ints]) -> Floats:
+    """Poses (R,) between the ends of each run and those of the nearest other one."""
+    middle = np.array([run[len(run) // 2] for run in runs], np.int64)
+    ends = np.sort(np.stack([graph.a[middle], graph.b[middle]], axis=1).astype(np.float64), axis=1)
+    apart = [np.sort(np.abs(ends - one).sum(1))[1:2].sum() for one in ends]
+    return np.array(apart, np.float64)
 
 
 def _moved_m(now: Floats, then: Floats) -> float:
