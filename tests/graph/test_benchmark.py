@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tests.benchmarks import graphs as benchmark
-from tests.benchmarks.ask import WAYS, Case, compared
+from tests.benchmarks.ask import WAYS, Case, coarse, compared
 from tests.benchmarks.large_graphs import drives
 from vplog.graph.build import parts
 from vplog.graph.consistency import is_loop
@@ -59,7 +59,7 @@ def test_every_figure_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def test_questions_bring_a_map_near_the_one_that_knows_all() -> None:
     graph, false = benchmark.with_groups(CITY, CITY.world_from_body, 2, 5, 0)
-    case = Case("city", graph, false, 0.0 * false, lambda poses: benchmark.aligned_error(poses, CITY.world_from_body))
+    case = coarse(Case("city", graph, false, 0.0 * false, CITY.world_from_body))
     figures = list(compared(case, 10))
     assert [figure.name for figure in figures] == [f"city: questions of ask to those of {way}" for way in WAYS[1:]]
     facts = figures[0].facts

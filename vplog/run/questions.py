@@ -70,5 +70,5 @@ def _with_candidates(graph: PoseGraph, weight: Floats, closures: Closures) -> tu
         ),
         kind=[graph.kind[edge] for edge in edges.tolist()] + [EdgeKind.LOOP] * len(others),
     )
-    used = np.concatenate([np.ones(len(odometry)), weight[loops] > 0.5, np.zeros(len(others))])
-    return bounded(checked(whole)[0]), np.concatenate([solved, others]), used
+    used = np.concatenate([np.ones(len(odometry)), np.where(weight[loops] > 0.5, 1.0, 0.0), np.zeros(len(others))])
+    return bounded(checked(whole)[0]), np.concatenate([solved, others]).astype(np.int64), used

@@ -114,7 +114,7 @@ def _pictures(
         panels = [FramePanel(image, title, np.zeros((0, 2))) for title, image in found if image is not None]
         if row not in drawn and len(panels) < len(ends):
             continue
-        content = drawn[row] if row in drawn else jpeg(collage(*panels, np.zeros(0, bool), []), _QUALITY)
+        content = drawn.get(row) or jpeg(collage(panels[0], panels[1], np.zeros(0, bool), []), _QUALITY)
         written[row] = output / f"closure-{row}.jpg"
         with replacing(written[row], parents=True) as stream:
             stream.write(content)
