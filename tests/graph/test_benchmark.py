@@ -60,7 +60,7 @@ def test_every_figure_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 def test_questions_bring_a_map_near_the_one_that_knows_all() -> None:
     graph, false = benchmark.with_groups(CITY, CITY.world_from_body, 2, 5, 0)
     case = coarse(Case("city", graph, false, 0.0 * false, CITY.world_from_body))
-    figures = list(compared(case, 10))
+    figures = list(compared(case, 3))
     assert [figure.name for figure in figures] == [f"city: questions of ask to those of {way}" for way in WAYS[1:]]
     facts = figures[0].facts
     assert facts["false"] == 10
