@@ -1,9 +1,9 @@
 """Questions that a person answers until the map is as good as one that knows every answer.
 
 Asked are those of `vplog ask`, random ones, and those of the lowest score first, three at a time, after which the
-robust solve goes on with the answers; an answer is for all closures of a run, whoever asks. The map is as good where its error
-is at most 5 % above that with every answer, which is taken to be 2 % of the odometry's at least. Of the poses without a
-closure one in 25 is left, joined by the odometry between, so that a solve takes seconds.
+robust solve goes on with the answers; an answer is for all closures of a run, whoever asks. The map is as good where
+its error is at most 5 % above that with every answer, which is taken to be 2 % of the odometry's at least. Of the poses
+without a closure one in 25 is left, joined by the odometry between, so that a solve takes seconds.
 """
 
 from __future__ import annotations

@@ -29,6 +29,8 @@ _MOST = 16
 """Runs of closures that are turned, of either verdict by either order: each costs a solve from the map as it is."""
 _FAMILIES = 8
 """Largest families of runs that are turned as a whole."""
+_LEAST, _POSES = 4, 40_000
+"""Fewer are turned, but so many at least, where the graph has so many poses that each takes long."""
 _POWER = 0.1
 """Of the evidence: the closures of a run, some ten, see the same things and err together."""
 _KEPT = 0.005
@@ -84,20 +86,21 @@ def _sets(graph: PoseGraph, weight: Floats, decided: Bools, chain: OdometryChain
     """
     loops = np.flatnonzero(~graph.odometry)
     misfit = residual_sigma(graph, graph.world_from_body)
-    parts: list[Ints] = []
+    most = min(_MOST, max(_LEAST, _POSES // len(graph.world_from_body)))
+    runs: list[Ints] = []
     for used in (True, False):
         some = [run[(weight[run] > 0) == used] for run in accidents(graph, loops, chain, log_room(graph, chain.poses))]
         some = [run for one in some if len(run := one[~decided[one]])]
         # as the search flips them: the used ones that fit worst, the others that fit best; and what stands alone
         doubtful = np.argsort([float(misfit[run].mean()) * (-1.0 if used else 1.0) for run in some], kind="stable")
         alone = np.argsort(-_apart(graph, some), kind="stable")
-        chosen = dict.fromkeys([*doubtful[:_MOST].tolist(), *alone[:_MOST].tolist()])
-        parts += [some[at] for at in chosen]
-    yield from ((run, run) for run in parts)
+        chosen = dict.fromkeys([*doubtful[:most].tolist(), *alone[:most].tolist()])
+        yield from ((some[at], some[at]) for at in chosen)
+        runs += some
     families = [one for one in agreeing(graph, loops, chain)[:_FAMILIES] if not decided[one].any()]
     for family in families:
         used = (weight[family] > 0).any()
-        members = [run for run in parts if (weight[run[0]] > 0) == used and np.isin(run[0], family)]
+        members = [run for run in runs if (weight[run[0]] > 0) == used and np.isin(run[0], family)]
         if len(members) > 1:
             yield max(members, key=len), np.concatenate(members)
 
