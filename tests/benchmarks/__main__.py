@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tests.benchmarks import backend
+from tests.benchmarks.ask import ask
 from tests.benchmarks.batch import PARTS, batch
 from tests.benchmarks.condense import condense
 from tests.benchmarks.discovery import discovery
@@ -48,7 +49,7 @@ DISCOVERY_BAR = 1000.0
 SEARCH_BARS = (4.0, 40.0)
 """Times faster than a scan of binary codes, and of vectors of floats."""
 SIZES = (10_000, 100_000, 1_000_000, 10_000_000)
-LONG = {"large", "batch", "localize", "condense"}
+LONG = {"large", "batch", "localize", "condense", "ask"}
 """What is measured where it is named."""
 LARGEST_NEEDS_GB = 12.0
 """Memory that must be free for the largest map: the places, the index, and what the system needs beside."""
@@ -86,6 +87,7 @@ def _arguments() -> argparse.Namespace:
         "batch",
         "localize",
         "condense",
+        "ask",
     )
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     named = f"of {', '.join(kinds)}; where none is named all but {', '.join(sorted(LONG))}. Or backend (its own --help)"
@@ -107,6 +109,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--kills", type=int, default=10, help="of a batch, at random moments")
     parser.add_argument("--set", nargs="+", default=[], metavar="A.B=C", help="settings of the drives of `batch`")
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=[], help="of `localize`")
+    parser.add_argument("--questions", type=int, default=60, help="that `ask` asks at most, of each graph")
     arguments = parser.parse_args()
     unknown = sorted(set(arguments.what) - set(kinds))
     if unknown:
@@ -153,6 +156,8 @@ def _long(arguments: argparse.Namespace) -> Iterator[Figure]:
     if "condense" in arguments.what:
         with tempfile.TemporaryDirectory() as made:
             yield from condense(arguments.folder or Path(made))
+    if "ask" in arguments.what:
+        yield from ask(arguments.questions, arguments.seeds)
     if "localize" in arguments.what:
         with tempfile.TemporaryDirectory() as made:
             yield from localize(arguments.scenes, Path(made))

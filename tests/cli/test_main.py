@@ -86,7 +86,7 @@ def started(*arguments: object, **options: Any) -> subprocess.Popen[str]:
 def test_help_names_every_verb_and_explains_it(verb: Verb) -> None:
     said = verb("--help")
     assert said.code == 0
-    for name in ("info", "library", "run", "evaluate", "diff", "compare", "study", "demo", "schemas", "config"):
+    for name in ("info", "library", "run", "evaluate", "ask", "diff", "compare", "study", "demo", "schemas", "config"):
         assert name in said.out
         of_verb = verb(name, "--help")
         assert of_verb.code == 0

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tests.benchmarks import graphs as benchmark
+from tests.benchmarks.ask import WAYS, Case, coarse, compared
 from tests.benchmarks.large_graphs import drives
 from vplog.graph.build import parts
 from vplog.graph.consistency import is_loop
@@ -54,6 +55,18 @@ def test_every_figure_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert figures[0].passed
     assert figures[0].facts["gnc"]["false_kept"] == [0]
     assert figures[-1].facts["error"] <= figures[-1].facts["error_of_bare"] * (1 + 1e-4)
+
+
+def test_questions_bring_a_map_near_the_one_that_knows_all() -> None:
+    graph, false = benchmark.with_groups(CITY, CITY.world_from_body, 2, 5, 0)
+    case = coarse(Case("city", graph, false, 0.0 * false, CITY.world_from_body))
+    figures = list(compared(case, 3))
+    assert [figure.name for figure in figures] == [f"city: questions of ask to those of {way}" for way in WAYS[1:]]
+    facts = figures[0].facts
+    assert facts["false"] == 10
+    for way in WAYS:
+        assert len(facts["curves_m"][way]) <= 2
+        assert (facts["needed"][way] is None) == (facts["curves_m"][way][-1] > facts["goal_m"])
 
 
 def test_drives_are_joined_by_closures_alone() -> None:

@@ -39,6 +39,9 @@ def test_pairs_are_named_by_row_or_stamp_in_either_order(tmp_path: Path) -> None
     )
     found = read_decisions(path, KEYFRAMES)
     assert (found.accepted, found.rejected) == ([(31, 3), (35, 1)], [(30, 2)])
+    path.write_text("query,match,decision\n31,3,accept\n32,4,same\n33,5,\n34,6,same\n35,7,reject\n36,8,same\n")
+    found = read_decisions(path, KEYFRAMES)
+    assert (found.accepted, found.rejected) == ([(31, 3), (32, 4)], [(35, 7), (36, 8)])  # and others are open
     path.write_text("query,match,decision\n30,2,reject\n30,2,reject\n")
     assert read_decisions(path, KEYFRAMES).rejected == [(30, 2)]
 

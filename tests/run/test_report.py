@@ -467,6 +467,19 @@ def test_a_closure_is_selected_from_map_and_ledger_and_decisions_are_downloaded(
     assert fits
 
 
+def test_an_answer_to_a_question_is_for_all_of_its_run(browser: str, page: str, tmp_path: Path) -> None:
+    asked, title, decided, decision = driven(
+        browser, page, tmp_path,
+        f"""{HELPERS} const question = document.querySelector("#questions tr[data-closure]");
+        question.click(); press("r");
+        return [question.dataset.closure, $("closure-title").textContent, $("decided").textContent,
+          question.lastElementChild.textContent];""",
+    )  # fmt: skip
+    assert f"Closure {asked}: " in title
+    members = ledger(page)["questions"][asked]
+    assert (decided, decision) == (f"{len(members)} decision{'s' * (len(members) > 1)}", "reject")
+
+
 def test_the_map_fits_a_window_that_becomes_narrower(browser: str, page: str, tmp_path: Path) -> None:
     """As a phone that is turned; a map that was moved stays where it was put."""
     fitted, moved = driven(

@@ -287,6 +287,32 @@ def print_setting(found: dict[str, Any]) -> None:
         print_line("default", default)
 
 
+def print_questions(found: dict[str, Any]) -> None:
+    if not found["questions"]:
+        print(f"{found['run']}: no closure is left to ask about")
+        return
+    titles = ("query", "match", "query\nstamp ns", "match\nstamp ns", "verdict", "p_false", "wrong", "moves\nm", "rows")
+    names = ("query", "match", "query_stamp_ns", "match_stamp_ns", "verdict")
+    print_table(
+        titles,
+        [
+            (
+                *(str(one[name]) for name in names),
+                "" if one["p_false"] is None else f"{one['p_false']:.3f}",
+                f"{one['p_wrong']:.3f}",
+                f"{one['moved_m']:.3f}",
+                str(len(one["closures"])),
+            )
+            for one in found["questions"]
+        ],
+    )
+    pictures = [one["picture"] for one in found["questions"] if one["picture"]]
+    if pictures:
+        print(f"{'pictures':10}{os.path.dirname(pictures[0])}")  # noqa: PTH120
+    print_line("answer", f"accept or reject, in the third column: {found['decisions']}")
+    print(f"{'next':10}{found['command']}")
+
+
 def print_optimised(found: dict[str, Any]) -> None:
     print(
         f"{found['output']}: {found['poses']} poses, {found['edges']} edges; of {found['loops']} closures "

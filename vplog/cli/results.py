@@ -54,6 +54,13 @@ def explain(arguments: argparse.Namespace) -> None:
     print_result(arguments, found, printing.print_explanation)
 
 
+def ask(arguments: argparse.Namespace) -> None:
+    """Ask about the closures of a run whose verdicts are doubtful and would move its map most."""
+    from vplog.verbs.ask import ask as ask_about
+
+    print_result(arguments, ask_about(arguments.run, arguments.count, arguments.output), printing.print_questions)
+
+
 def optimize(arguments: argparse.Namespace) -> None:
     """Solve a pose graph from a g2o file, planar or spatial, robust against false loop closures."""
     from vplog.verbs.optimize import optimize as optimize_graph
@@ -161,6 +168,11 @@ def add_results(
     option(sub, "--truth", str, "FILE.tum|gps|auto", _TRUTH, required=True)
     _add_truth_options(sub)
     _add_explain(add("explain", explain))
+    sub = add("ask", ask)
+    option(sub, "run", place, "RUN")
+    option(sub, "--count", parser.at_least_one, "N", "questions (default: 10)", default=10)
+    text = "folder of their pictures and of decisions.csv, to be answered in (default: RUN/questions)"
+    option(sub, "-o --output", parser.local, "FOLDER", text)
     sub = add("report", report, topics, threads)
     option(sub, "run", place, "RUN")
     option(sub, "--truth", str, "FILE.tum|gps|auto", _TRUTH)

@@ -79,10 +79,10 @@ def log_evidence(factors: Factors, weight: Floats, poses: Floats, chain: Odometr
     loops = ~graph.odometry
     true, false = np.flatnonzero(loops & (weight > 0)), np.flatnonzero(loops & (weight == 0))
     room = log_room(graph, chain.poses)
-    total, accidents = _log_false(graph, false, chain, room)
+    total, count = _log_false(graph, false, chain, room)
     places = sum(1 for _ in runs(graph, true))
     # each place is true or an accident, the share of true ones unknown: the beta function
-    total += math.lgamma(places + 1) + math.lgamma(accidents + 1) - math.lgamma(places + accidents + 2)
+    total += math.lgamma(places + 1) + math.lgamma(count + 1) - math.lgamma(places + count + 2)
     return total + (_log_true(factors, weight, poses, true, room) if len(true) else 0.0)
 
 
@@ -182,9 +182,9 @@ def runs(graph: PoseGraph, loops: Ints) -> Iterator[Ints]:
 
 def _log_false(graph: PoseGraph, false: Ints, chain: OdometryChain, room: float) -> tuple[float, int]:
     """Log density of the false closures, and how many runs they are."""
-    total, accidents, together = 0.0, 0, []
-    for run in _accidents(graph, false, chain, room):
-        accidents += 1
+    total, count, together = 0.0, 0, []
+    for run in accidents(graph, false, chain, room):
+        count += 1
         inner, one = _as_one(graph, run, chain)
         if one is None or inner < -room * (len(run) - 1):  # they do not agree with each other
             total -= room * len(run)
@@ -193,10 +193,10 @@ def _log_false(graph: PoseGraph, false: Ints, chain: OdometryChain, room: float)
             together.append(one)
     if together:
         total += families(Displacements.of(together, chain), room)[1]
-    return total, accidents
+    return total, count
 
 
-def _accidents(graph: PoseGraph, false: Ints, chain: OdometryChain, room: float) -> Iterator[Ints]:
+def accidents(graph: PoseGraph, false: Ints, chain: OdometryChain, room: float) -> Iterator[Ints]:
     """Runs of false closures that agree with each other: of those that do not, each lot is an accident of its own."""
     for run in runs(graph, false):
         if len(run) == 1:
@@ -275,7 +275,7 @@ def agreeing(graph: PoseGraph, loops: Ints, chain: OdometryChain) -> list[Ints]:
     """The edges `loops` (K,) in sets that claim one displacement, largest first; runs that disagree are in none."""
     room = log_room(graph, chain.poses)
     members, together = [], []
-    for run in _accidents(graph, loops, chain, room):
+    for run in accidents(graph, loops, chain, room):
         _, one = _as_one(graph, run, chain)
         if one is not None:
             members.append(run)

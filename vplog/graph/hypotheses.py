@@ -94,7 +94,7 @@ def best_hypothesis(
         found.append(_refit(claimed, kept, solution.world_from_body, Sigmas()))
     likeliest = [one.sigmas for one in _likeliest(found)]
     for sigmas in dict.fromkeys([Sigmas(), *likeliest]):  # others would be of what false closures happen to share
-        alone = _judged(claimed, none, chain.poses, sigmas)
+        alone = hypothesis_of(claimed, none, chain.poses, sigmas)
         margin = _VERY_STRONG if isinstance(optimiser, GncSettings) else 0.0
         found.append(replace(alone, log_evidence=alone.log_evidence + margin))
     if cost is None:
@@ -143,18 +143,18 @@ def _searched(claimed: Factors, gnc: GncSettings, loops: Ints, chain: OdometryCh
         if _is_new(likely, tried):
             weight = np.ones(len(graph.a))
             weight[loops] = likely
-            of_families += _attempted(lambda weight=weight: [_refit(claimed, weight, chain.poses, Sigmas())])
+            of_families += attempted(lambda weight=weight: [_refit(claimed, weight, chain.poses, Sigmas())])
     of_families = sorted(of_families, key=lambda one: -one.log_evidence)[:_FAMILIES]
     for one in of_families:
-        found += _attempted(lambda one=one: _tested(claimed, gnc, one.weight, one.poses, one.sigmas))
+        found += attempted(lambda one=one: _tested(claimed, gnc, one.weight, one.poses, one.sigmas))
     found += of_families
     best = _likeliest(found)
     if all((one.weight[loops] == 0).mean() <= _ALIKE for one in best):  # next to all agree
         return found + [_improved(claimed, one) for one in best]
-    grown = _attempted(lambda: [_grown(claimed, sigmas, chain)])
+    grown = attempted(lambda: [_grown(claimed, sigmas, chain)])
     found += [_improved(claimed, one, whole) for one in [*best, *grown]]
     for one in _likeliest(found):
-        found += _attempted(lambda one=one: _tested(claimed, gnc, one.weight, one.poses, one.sigmas))
+        found += attempted(lambda one=one: _tested(claimed, gnc, one.weight, one.poses, one.sigmas))
     return found
 
 
@@ -167,7 +167,9 @@ def _at_the_sigmas_of_others(claimed: Factors, found: list[Hypothesis]) -> list[
             sets.append(one)
     pairs = [(one, other.sigmas) for one in sets for other in sets if one.sigmas.differ(other.sigmas, _STEADY)]
     return [
-        two for one, s in pairs for two in _attempted(lambda one=one, s=s: [_judged(claimed, one.weight, one.poses, s)])
+        two
+        for one, s in pairs
+        for two in attempted(lambda one=one, s=s: [hypothesis_of(claimed, one.weight, one.poses, s)])
     ]
 
 
@@ -205,7 +207,7 @@ def _is_new(likely: Bools, tried: list[Bools]) -> bool:
     return new
 
 
-def _attempted(solve: Callable[[], list[Hypothesis]]) -> list[Hypothesis]:
+def attempted(solve: Callable[[], list[Hypothesis]]) -> list[Hypothesis]:
     """The hypotheses of a solve; none where closures leave poses open."""
     try:
         return solve()
@@ -254,7 +256,7 @@ def _flipped(claimed: Factors, best: Hypothesis, run: Ints) -> list[Hypothesis]:
     weight[run] = 1.0 - weight[run]
     if not weight[is_loop(claimed.graph)].any():
         return []
-    return _attempted(lambda: [_judged(claimed, weight, best.poses, best.sigmas)])
+    return attempted(lambda: [hypothesis_of(claimed, weight, best.poses, best.sigmas)])
 
 
 def bounded(graph: PoseGraph) -> PoseGraph:
@@ -279,7 +281,7 @@ def _from_start(claimed: Factors, gnc: GncSettings, sigmas: Sigmas, likely: Bool
         all_true = _refit(claimed, weight, poses, sigmas)  # noise first, by which least squares finds its way
         return [all_true, *_tested(claimed, gnc, weight, all_true.poses, all_true.sigmas)]
 
-    return _attempted(solve)
+    return attempted(solve)
 
 
 def _tested(claimed: Factors, gnc: GncSettings, weight: Floats, poses: Floats, sigmas: Sigmas) -> list[Hypothesis]:
@@ -297,12 +299,12 @@ def _tested(claimed: Factors, gnc: GncSettings, weight: Floats, poses: Floats, s
             if not sigmas.differ(before, _STEADY):
                 break
         if not found or (weight != found[0].weight).any():
-            found.append(_judged(claimed, weight, poses, sigmas))
+            found.append(hypothesis_of(claimed, weight, poses, sigmas))
     return found
 
 
 def _refit(claimed: Factors, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
-    return _judged(claimed, weight, *_estimated(claimed, weight, poses, sigmas))
+    return hypothesis_of(claimed, weight, *_estimated(claimed, weight, poses, sigmas))
 
 
 def _estimated(claimed: Factors, weight: Floats, poses: Floats, sigmas: Sigmas) -> tuple[Floats, Sigmas]:
@@ -316,7 +318,8 @@ def _estimated(claimed: Factors, weight: Floats, poses: Floats, sigmas: Sigmas) 
     return poses, sigmas
 
 
-def _judged(claimed: Factors, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
+def hypothesis_of(claimed: Factors, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
+    """The least squares of the weighted edges from `poses`, and their evidence, with these sigmas."""
     factors = _times(claimed, sigmas)
     if (weight[~claimed.graph.odometry] > 0).any():
         poses = descend(factors, weight, poses, _STEPS, _TOLERANCE).world_from_body

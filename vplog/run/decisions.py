@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -20,8 +22,11 @@ from vplog.loops.verify import verify_between
 from vplog.run.keyframes import row_of
 from vplog.run.verification import DriveFeatures, calibrated, for_verification, merged
 from vplog.settings import FileName, Settings
+from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
     from vplog.cache.steps import Steps
     from vplog.data import Closures, Keyframes
     from vplog.execution.execution import Execution
@@ -29,12 +34,12 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 _COLUMNS = ["query", "match", "decision", "who", "when", "reason"]
 _REQUIRED = 3
-_CHOICES = ("accept", "reject", "add")
+_CHOICES = ("accept", "reject", "add", "same", "")
 _MOST_ACCEPTED = 10_000
 """Pairs that may be accepted: each that geometry rejected is verified again, some milliseconds apiece."""
 _FORM = (
     f"Decisions are a CSV with the header `{','.join(_COLUMNS)}`: two keyframes, by row or by stamp in ns, and accept, "
-    "reject or add; the last three may be left out."
+    "reject or add, same as the line before, or nothing where it is open; the last three may be left out."
 )
 
 
@@ -60,9 +65,36 @@ class Decisions:
     rejected: list[tuple[int, int]]
 
 
+@dataclass(frozen=True)
+class Decided:
+    """A line of a file of decisions."""
+
+    pair: tuple[int, int]
+    """Keyframe rows of query and match, the query the later one."""
+    decision: str
+    """`accept`, `reject` or `add`."""
+    about: list[str]
+    """Who, when and reason."""
+    where: str
+    """The file and line."""
+
+
 def read_decisions(path: Path, keyframes: Keyframes) -> Decisions:
     """The decisions in a CSV. Raises SettingsError with the place of the first line that does not fit."""
-    header, found = list[str](), dict[tuple[int, int], tuple[bool, str]]()
+    found = dict[tuple[int, int], tuple[bool, str]]()
+    for one in decided_lines(path, keyframes):
+        accepted = one.decision != "reject"
+        if found.setdefault(one.pair, (accepted, one.where))[0] is not accepted:
+            raise SettingsError(f"{one.where} decides otherwise than {found[one.pair][1]} on one pair. Leave one out.")
+    pairs = {choice: sorted(pair for pair, (one, _) in found.items() if one is choice) for choice in (True, False)}
+    if len(pairs[True]) > _MOST_ACCEPTED:
+        raise SettingsError(f"{path} accepts {len(pairs[True])} pairs, and at most {_MOST_ACCEPTED} can be.")
+    return Decisions(pairs[True], pairs[False])
+
+
+def decided_lines(path: Path, keyframes: Keyframes) -> Iterator[Decided]:
+    """The lines of a CSV that decide on a pair. Raises SettingsError with the place of the first that does not fit."""
+    header, before = list[str](), ""
     for where, cells in read_lines(path, _FORM, SettingsError):
         if not header:
             header = cells
@@ -80,15 +112,23 @@ def read_decisions(path: Path, keyframes: Keyframes) -> Decisions:
         match, query = sorted(row for row in rows if row is not None)
         if query - match < 2:
             raise SettingsError(f"{where}: keyframes {match} and {query} are joined by odometry. Leave the line out.")
-        accepted = cells[2] != "reject"
-        if found.setdefault((query, match), (accepted, where))[0] is not accepted:
-            raise SettingsError(f"{where} decides otherwise than {found[query, match][1]} on one pair. Leave one out.")
+        before = before if cells[2] == "same" else cells[2]
+        if before:
+            yield Decided((query, match), before, cells[_REQUIRED:], where)
     if not header:
         raise SettingsError(f"{path} is empty. {_FORM}")
-    pairs = {choice: sorted(pair for pair, (one, _) in found.items() if one is choice) for choice in (True, False)}
-    if len(pairs[True]) > _MOST_ACCEPTED:
-        raise SettingsError(f"{path} accepts {len(pairs[True])} pairs, and at most {_MOST_ACCEPTED} can be.")
-    return Decisions(pairs[True], pairs[False])
+
+
+def write_decisions(path: Path, keyframes: Keyframes, lines: Iterable[Sequence[Any]]) -> None:
+    """Write lines of two keyframe rows, a decision, who, when and reason; keyframes by their stamps, as other settings
+    choose other rows."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(_COLUMNS)
+    for query, match, *rest in lines:
+        table.writerow([*keyframes.stamp_ns[[query, match]].tolist(), *rest, *[""] * (len(_COLUMNS) - 2 - len(rest))])
+    with replacing(path, parents=True) as stream:
+        stream.write(text.getvalue().encode())
 
 
 @step("decide", lambda *_: closures_codec(), items=lambda closures, decisions, *_: len(decisions.accepted))

@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog.data import USED, Trajectory
+from vplog.errors import GraphError, ResultError
 from vplog.geometry import se3
 from vplog.graph.joint import spaced_apart
 from vplog.results import mcap_read, tables
 from vplog.results.previews import jpeg, shrink
 from vplog.results.report.page import Content, Tracks, false_closures, page
 from vplog.run.figures.run_figures import earth_of
+from vplog.run.questions import ask_ledger
 from vplog.storage.image_file import decode_image
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.results.report.page import TruthComparison
+    from vplog.results.report.page import Question, TruthComparison
 
+_log = logging.getLogger(__name__)
 
+_QUESTIONS = 10
 _MOST_THUMBNAILS, _THUMBNAIL_MEGAPIXELS, _THUMBNAIL_QUALITY = 5000, 0.04, 60
 """Keyframes with a thumbnail in the page, of 230 x 170 px and some 5 kB: 35 MB in base64."""
 
@@ -89,14 +94,26 @@ def gather(
     covariance = tables.read_keyframe_covariance(folder / "keyframes.parquet")
     closures = tables.read_closures(folder / "closures.parquet")
     content = Content(record, tracks, covariance, closures, tracks.found.pictures or pictures or {}, judged=judged)
+    content = replace(content, questions=_questions(folder, content))
     return replace(content, thumbnails=_thumbnails(folder, content))
 
 
+def _questions(folder: Path, content: Content) -> list[Question]:
+    """The first questions; none where the poses are not determined, or the graph is not that of the ledger."""
+    try:
+        graph, weight, _ = tables.read_edges(folder / "edges.parquet", content.tracks.world_from_body)
+        return ask_ledger(graph, weight, content.closures)[:_QUESTIONS]
+    except (GraphError, ResultError) as error:
+        _log.warning("No questions are asked: %s", error)
+        return []
+
+
 def _thumbnails(folder: Path, content: Content) -> dict[int, bytes]:
-    """Small JPEGs of at most `_MOST_THUMBNAILS` keyframes of closures: of false ones, those in the solution, then
-    the nearest misses, by inliers; empty where result.mcap has no pictures."""
+    """Small JPEGs of at most `_MOST_THUMBNAILS` keyframes of closures: those asked about, false ones, those in the
+    solution, then the nearest misses, by inliers; empty where result.mcap has no pictures."""
     closures = content.closures
-    nearest = np.lexsort((-closures.inliers, ~closures.of(*USED), ~false_closures(content)))
+    asked = np.isin(np.arange(len(closures)), [row for one in content.questions for row in one.rows])
+    nearest = np.lexsort((-closures.inliers, ~closures.of(*USED), ~false_closures(content), ~asked))
     ends = np.stack([closures.query[nearest], closures.match[nearest]], 1).ravel().tolist()
     wanted = set(list(dict.fromkeys(ends))[:_MOST_THUMBNAILS])
     row_at = {stamp: row for row, stamp in enumerate(content.tracks.keyframes.stamp_ns.tolist()) if row in wanted}

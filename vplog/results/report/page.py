@@ -83,6 +83,18 @@ class Tracks:
 
 
 @dataclass(frozen=True, eq=False)
+class Question:
+    """Neighbouring closures that agree with each other, as one question to a person."""
+
+    rows: list[int]
+    """Rows of the ledger, that of most inliers first: its picture is the easiest to judge."""
+    p_wrong: float
+    """Probability that their verdict is wrong."""
+    moved_m: float
+    """Root mean square distance by which the map moves where it is."""
+
+
+@dataclass(frozen=True, eq=False)
 class Content:
     """A finished run."""
 
@@ -97,6 +109,7 @@ class Content:
     thumbnails: dict[int, bytes] = field(default_factory=dict)
     """Small JPEG of a keyframe by its row."""
     judged: TruthComparison | None = None
+    questions: list[Question] = field(default_factory=list)
 
 
 def page(content: Content) -> str:
@@ -115,6 +128,7 @@ def page(content: Content) -> str:
         losses=[_loss(one, content) for one in _list(record.get("losses")) if isinstance(one, dict)][:_MOST_LOSSES],
         map_lines=legend,
         judged=judged,
+        questions=_questions(content),
         truth=_truth(judged) if judged else [],
         curves=charts.curves(judged.curves) if judged and judged.curves else None,
         verdicts=[(verdict.value, figure(count), verdict.sentence) for verdict, count in counts if count],
@@ -141,6 +155,23 @@ def _tiles(content: Content) -> list[tuple[str, str]]:
         (figure(int(content.closures.accepted.sum())), "accepted closures"),
         (f"{figure(totals.get('seconds'))} s", "to compute"),
         (f"{figure(totals.get('peak_memory_mb'), 0)} MB", "peak memory"),
+    ]
+
+
+def _questions(content: Content) -> list[list[Any]]:
+    """Rows of the table of questions, the ledger row first."""
+    closures = content.closures
+    return [
+        [
+            (row := one.rows[0]),
+            *(str(int(end[row])) for end in (closures.query, closures.match)),
+            closures.verdict[row].value,
+            figure(closures.p_false[row], 3),
+            figure(one.p_wrong, 3),
+            figure(one.moved_m, 3),
+            str(len(one.rows)),
+        ]
+        for one in content.questions
     ]
 
 
@@ -282,6 +313,7 @@ def _audit(content: Content, drawn: dict[str, Any], pictures: list[int]) -> dict
         "stamps": list(map(str, content.tracks.keyframes.stamp_ns.tolist())),  # beyond 2^53, where JavaScript rounds
         "map": drawn,
         "pictures": pictures,
+        "questions": {str(one.rows[0]): one.rows for one in content.questions},
         "thumbnails": {str(row): base64.b64encode(jpeg).decode() for row, jpeg in content.thumbnails.items()},
         "explain": "vplog explain RUN --closure ",
         "again": command,

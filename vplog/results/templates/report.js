@@ -14,11 +14,11 @@
     if (verdict.endsWith("_by_decision"))
       decisions.set(pairOf(row), { decision: verdict.startsWith("accepted") ? "accept" : "reject", who: "", when: "", reason: "" });
   });
-  let unsaved = false, rows = [], selected = -1, by = "inliers", down = true;
+  let unsaved = false, rows = [], selected = -1, answered = [], by = "inliers", down = true;
 
-  const decide = (pair, decision) => {
+  const decide = (pairs, decision) => {
     unsaved = true;
-    if (decision === null) decisions.delete(pair);
+    for (const pair of pairs) if (decision === null) decisions.delete(pair);
     else decisions.set(pair, { decision, who: $("who").value, when: new Date().toISOString(), reason: $("reason").value });
     $("reason").value = "";
     refresh();
@@ -204,7 +204,8 @@
     if (selected < 0) return;
     const row = selected, verdict = columns.verdict[row], decision = decisions.get(pairOf(row))?.decision;
     $("closure-title").textContent = "Closure " + columns.row[row] + ": keyframe " + columns.query[row] + " as a return to " + columns.match[row];
-    $("closure-verdict").textContent = verdict + ". " + sentences[verdict] + (decision ? " Your decision: " + decision + "." : "");
+    $("closure-verdict").textContent = verdict + ". " + sentences[verdict] + (decision ? " Your decision: " + decision + "." : "")
+      + (answered.length > 1 ? " An answer is for all " + answered.length + " closures of its run." : "");
     $("closure-verdict").className = isUsed(row) ? "accepted" : "rejected";
     $("closure-numbers").textContent = names.filter((name) => !["row", "verdict", "query", "match"].includes(name) && columns[name][row] !== null)
       .map((name) => name + " " + columns[name][row]).join(", ");
@@ -217,8 +218,8 @@
     $("no-picture").hidden = [columns.query[row], columns.match[row]].every((at) => thumbnails[at]);
     $("full").hidden = !pictures.includes(columns.row[row]); $("full").href = "#closure-" + columns.row[row];
   };
-  const select = (row) => {
-    selected = row;
+  const select = (row, run = [row]) => {  // an answer is for all of a run where a question was selected
+    selected = row; answered = run;
     const at = rows.indexOf(row);
     if (at >= 0 && (at * tall < box.scrollTop || (at + 3) * tall > box.scrollTop + box.clientHeight)) box.scrollTop = at * tall - box.clientHeight / 2;
     refresh();
@@ -226,10 +227,19 @@
   const step = (by) => rows.length && select(rows[Math.min(Math.max(rows.indexOf(selected) + by, 0), rows.length - 1)]);
   function refresh() {
     drawLedger(); show(); highlight();
+    for (const [tr, row] of questions) {
+      tr.setAttribute("aria-selected", row === selected && answered.length > 1);
+      tr.lastElementChild.textContent = decisions.get(pairOf(row))?.decision ?? "";
+    }
     $("decided").textContent = decisions.size + (decisions.size === 1 ? " decision" : " decisions");
     $("download").disabled = !decisions.size && !unsaved;
   }
-  const act = (decision) => selected >= 0 && decide(pairOf(selected), decision);
+  const act = (decision) => selected >= 0 && decide(answered.map(pairOf), decision);
+  const questions = [...document.querySelectorAll("#questions tr[data-closure]")].map((tr) => [tr, columns.row.indexOf(+tr.dataset.closure)]);
+  for (const [tr, row] of questions) tr.addEventListener("click", () => { if (row >= 0) {
+    select(row, data.questions[tr.dataset.closure].map((one) => columns.row.indexOf(one)).filter((one) => one >= 0));
+    $("work").scrollIntoView();
+  } });
   const keys = { j: () => step(1), k: () => step(-1), a: () => act("accept"), r: () => act("reject"), u: () => act(null) };
   document.addEventListener("keydown", (event) => {
     if (event.target.matches("input, select, textarea") || event.ctrlKey || event.metaKey || event.altKey) return;
@@ -240,7 +250,7 @@
     const ends = [+$("add-query").value, +$("add-match").value].sort((a, b) => b - a);
     const good = ends.every((at) => Number.isInteger(at) && at >= 0 && at < stamps.length) && ends[0] - ends[1] > 1;
     $("added").textContent = good ? "Added " + ends.join(" to ") + "." : "Give two keyframes of 0 to " + (stamps.length - 1) + " that are not neighbours.";
-    if (good) decide(ends.join(","), "add");
+    if (good) decide([ends.join(",")], "add");
   });
   $("download").addEventListener("click", () => {
     const link = document.createElement("a");

@@ -1,0 +1,198 @@
+"""Questions that a person answers until the map is as good as one that knows every answer.
+
+Asked are those of `vplog ask`, random ones, and those of the lowest score first, three at a time, after which the
+robust solve goes on with the answers; an answer is for all closures of a run, whoever asks. The map is as good where
+its error is at most 5 % above that with every answer, which is taken to be 2 % of the odometry's at least. Of the poses
+without a closure one in 25 is left, joined by the odometry between, so that a solve takes seconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tests.benchmarks.graphs import aligned_error, bicocca_truth, false_by_gps, folder
+from tests.benchmarks.measure import Figure
+from vplog.data import EdgeKind, PoseGraph
+from vplog.geometry import se3
+from vplog.graph.build import AXES
+from vplog.graph.consistency import OdometryChain, odometry_chain
+from vplog.graph.evidence import accidents, log_room
+from vplog.graph.questions import questions
+from vplog.graph.solve import GncSettings, LmSettings, decided
+from vplog.graph.variance_components import claimed_times
+from vplog.results.g2o import read_g2o
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from vplog.data import Bools, Floats, Ints
+
+AT_ONCE = 3
+"""The verb asks ten; fewer tell the ways apart."""
+STRIDE = 25
+MISPLACED_M = (2.0, 6.0)
+WITHIN = 1.05
+LEAST_SHARE = 0.02
+THRESHOLDS = ("0.300", "0.500")
+"""Of Bicocca's files: closures of the first, and of the score that the others pass."""
+WAYS = ("ask", "random", "lowest score")
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A graph whose closures are known to be true or false."""
+
+    name: str
+    graph: PoseGraph
+    false: Bools
+    """(E,)."""
+    score: Floats
+    """(E,) of the recogniser."""
+    truth: Floats
+    """(N, 4, 4), NaN where it is not known."""
+
+    def error_m(self, poses: Floats) -> float:
+        known = np.isfinite(self.truth[:, 0, 3])
+        return aligned_error(poses[known], self.truth[known])
+
+
+def ask(most: int, seeds: int) -> Iterator[Figure]:
+    """Questions needed by `vplog ask` as a share of those by each other way, and the curves of them."""
+    for case in cases(seeds):
+        yield from compared(case, most)
+
+
+def cases(seeds: int) -> Iterator[Case]:
+    """Bicocca 25b with the false closures of its recogniser, and KITTI 00 with places like their neighbours."""
+    place = folder() / "rrr" / "B25b"
+    if place.is_dir():
+        known, places = bicocca_truth(place)
+        first, *others = (read_g2o(place / f"B25b_{one}.g2o").graph for one in THRESHOLDS)
+        loops = np.flatnonzero(~first.odometry)
+        false, score = np.zeros(len(first.a), bool), np.zeros(len(first.a))
+        false[loops] = false_by_gps(first, loops, known, places)
+        for other in others:
+            pairs = set(zip(other.a.tolist(), other.b.tolist(), strict=True))
+            score += [pair in pairs for pair in zip(first.a.tolist(), first.b.tolist(), strict=True)]
+        places[~known] = np.nan
+        yield coarse(Case(f"B25b {THRESHOLDS[0]}", first, false, score, places))
+    path = folder() / "SE-Sync" / "kitti_00.g2o"
+    for seed in range(seeds if path.is_file() else 0):
+        clean = read_g2o(path).graph
+        optimum = LmSettings()(clean).world_from_body
+        graph, false = misplaced(clean, seed)
+        # as of a recogniser whose false answers are alike: half a sigma apart
+        score = np.random.default_rng(seed).normal(size=len(false)) - 0.5 * false
+        yield coarse(Case(f"kitti_00, places misplaced, seed {seed}", graph, false, score, optimum))
+
+
+def misplaced(graph: PoseGraph, seed: int) -> tuple[PoseGraph, Bools]:
+    """The graph with a third of the places taken for one that lies some metres on or back, as facades and aisles are:
+    all closures of a place agree, and the odometry would stand it. Which edges (E,) are."""
+    random, chain = np.random.default_rng(seed), OdometryChain.of(graph)
+    places = list(accidents(graph, np.flatnonzero(~graph.odometry), chain, log_room(graph, chain.poses)))
+    a_from_b, false = graph.a_from_b.copy(), np.zeros(len(graph.a), bool)
+    forward = se3.between(chain.poses[:-1], chain.poses[1:])[:, :3, 3]
+    for at in random.choice(len(places), -(-len(places) // 3), replace=False).tolist():
+        run = places[at]
+        way = forward[np.minimum(graph.a[run], len(forward) - 1)]
+        way = way / np.linalg.norm(way, axis=1, keepdims=True)
+        a_from_b[run, :3, 3] += random.choice([-1.0, 1.0]) * random.uniform(*MISPLACED_M) * way
+        false[run] = True
+    return replace(graph, a_from_b=a_from_b), false
+
+
+def coarse(case: Case) -> Case:
+    """The case with fewer poses: the ends of closures, and one in `STRIDE` of the others."""
+    graph, count = case.graph, len(case.truth)
+    chain, loops = OdometryChain.of(graph), np.flatnonzero(~graph.odometry)
+    rows = np.unique(np.concatenate([np.arange(0, count, STRIDE), [count - 1], graph.a[loops], graph.b[loops]]))
+    a, b = rows[:-1].astype(np.int32), rows[1:].astype(np.int32)
+    axes = np.array(AXES[graph.dimension])
+    information = np.zeros((len(a), 6, 6))
+    information[:, axes[:, None], axes] = np.linalg.inv(chain.covariance(a, b))
+    fewer = replace(
+        graph,
+        world_from_body=chain.poses[rows],
+        a=np.searchsorted(rows, np.concatenate([a, graph.a[loops]])).astype(np.int32),
+        b=np.searchsorted(rows, np.concatenate([b, graph.b[loops]])).astype(np.int32),
+        a_from_b=np.concatenate([se3.between(chain.poses[a], chain.poses[b]), graph.a_from_b[loops]]),
+        information=np.concatenate([information, graph.information[loops]]),
+        kind=[EdgeKind.ODOMETRY] * len(a) + [EdgeKind.LOOP] * len(loops),
+    )
+    none = np.zeros(len(a))
+    false, score = (np.concatenate([none, one[loops]]) for one in (case.false, case.score))
+    return replace(case, graph=fewer, false=false > 0, score=score, truth=case.truth[rows])
+
+
+def compared(case: Case, most: int) -> Iterator[Figure]:
+    """The figures of a case, each way asking at most so many questions."""
+    odometry = case.error_m(odometry_chain(case.graph)[0])
+    everything = np.where(case.graph.odometry, 0, np.where(case.false, -1, 1))
+    goal = WITHIN * max(case.error_m(_solved(case.graph, everything)[0].world_from_body), LEAST_SHARE * odometry)
+    unasked = _solved(case.graph, np.zeros(len(everything), np.int64))
+    curves = {way: curve(case, way, most, goal, unasked) for way in WAYS}
+    needed = {way: _needed(one, goal) for way, one in curves.items()}
+    facts: dict[str, Any] = {"odometry_m": round(odometry, 3), "goal_m": round(goal, 3), "false": int(case.false.sum())}
+    facts |= {"closures": int((~case.graph.odometry).sum()), "needed": needed, "curves_m": curves}
+    count = {way: 2 * most if one is None else max(one, 1) for way, one in needed.items()}
+    for way in WAYS[1:]:
+        ratio = count[WAYS[0]] / count[way]
+        yield Figure(f"{case.name}: questions of {WAYS[0]} to those of {way}", ratio, 1.0, True, facts)
+
+
+def _needed(errors: list[float], goal: float) -> int | None:
+    """Questions after which the error first is at the goal; None where it never is."""
+    return next((AT_ONCE * at for at, error in enumerate(errors) if error <= goal), None)
+
+
+def curve(case: Case, way: str, most: int, goal: float, unasked: tuple[PoseGraph, Floats]) -> list[float]:
+    """Errors in m after none, three, six .. questions, up to the goal; `unasked` is solved without answers."""
+    answer = np.zeros(len(case.graph.a), np.int64)  # 1 true, -1 false
+    random = np.random.default_rng(0)
+    errors: list[float] = []
+    while True:
+        graph, weight = _solved(case.graph, answer) if errors else unasked
+        errors.append(round(case.error_m(graph.world_from_body), 4))
+        if errors[-1] <= goal or AT_ONCE * len(errors) > most:
+            return errors
+        runs = _runs(case, way, graph, weight, answer, random)
+        if not runs:
+            return errors
+        for run in runs[:AT_ONCE]:
+            answer[run] = -1 if case.false[run].mean() > 0.5 else 1
+
+
+def _runs(
+    case: Case, way: str, graph: PoseGraph, weight: Floats, answer: Ints, random: np.random.Generator
+) -> list[Ints]:
+    """The runs of closures in the order in which they are asked about."""
+    if way == "ask":
+        return [one.edges for one in questions(graph, weight, np.zeros(len(weight)), answer != 0)]
+    chain = OdometryChain.of(graph)
+    loops = np.flatnonzero(~graph.odometry)
+    runs = [run for run in accidents(graph, loops, chain, log_room(graph, chain.poses)) if not answer[run].any()]
+    runs = [runs[at] for at in random.permutation(len(runs))]
+    return runs if way == "random" else sorted(runs, key=lambda run: float(case.score[run].mean()))
+
+
+def _solved(graph: PoseGraph, answer: Ints) -> tuple[PoseGraph, Floats]:
+    """The graph at the robust solution with these answers, with the noise that it found, and the weights (E,)."""
+    kind = [EdgeKind.KNOWN_LOOP if one > 0 else was for one, was in zip(answer.tolist(), graph.kind, strict=True)]
+    asked = np.flatnonzero(answer >= 0)
+    some = replace(
+        graph,
+        a=graph.a[asked],
+        b=graph.b[asked],
+        a_from_b=graph.a_from_b[asked],
+        information=graph.information[asked],
+        kind=[kind[edge] for edge in asked.tolist()],
+    )
+    found = decided(some, GncSettings())
+    weight = np.zeros(len(answer))
+    weight[asked] = found.solution.weight > 0.5
+    solved = claimed_times(replace(graph, kind=kind), found.sigmas)
+    return replace(solved, world_from_body=found.solution.world_from_body), weight
