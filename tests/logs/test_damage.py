@@ -178,13 +178,13 @@ def test_claims_beyond_what_the_bytes_justify_are_refused() -> None:
 
 def test_types_and_encodings_that_vplog_does_not_know_are_listed(tmp_path: Path) -> None:
     path = write_raw(tmp_path / "a.mcap", [
-        ("/points", "sensor_msgs/msg/PointCloud2", "cdr", 5, b"1234"),
+        ("/scan", "sensor_msgs/msg/LaserScan", "cdr", 5, b"1234"),
         ("/image", "foxglove.CompressedImage", "cbor", 6, b"1234"),
         ("/odom", "nav_msgs/msg/Odometry", "cdr", 7, b"1"),
     ])  # fmt: skip
     log = logs.open(path)
     info = log.info()
-    assert [(t.name, t.role) for t in info.topics] == [("/image", ""), ("/odom", "odometry"), ("/points", "")]
+    assert [(t.name, t.role) for t in info.topics] == [("/image", ""), ("/odom", "odometry"), ("/scan", "")]
     assert (info.start_ns, info.end_ns) == (5, 7)
     assert log.odometry() is None
     assert "Lost: 1 message that cannot be decoded, at t=0.000 s: /odom 1 of 1." in info.warnings
