@@ -119,13 +119,13 @@ def test_a_server_that_is_overloaded_is_asked_again_and_not_for_ever() -> None:
 
     def answer(said: str) -> bytes:
         asked.append(said)
-        return b"HTTP/1.1 503 Busy\r\nContent-Length: 0\r\n\r\n" if len(asked) in (1, 2, 4, 5, 6, 7) else FOUND
+        return b"HTTP/1.1 503 Busy\r\nContent-Length: 0\r\n\r\n" if len(asked) != 3 else FOUND
 
     with saying(answer) as url:
         assert located(url).stat().st_size == len(DATA)
         with pytest.raises(OSError, match="answers 503"):
             located(url).exists()
-    assert len(asked) == 7
+    assert 4 < len(asked) <= 7  # waits between them grow at random, and end after some seconds
 
 
 def test_a_link_that_allows_no_head_is_read() -> None:
