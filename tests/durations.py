@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 FILE = Path(__file__).with_suffix(".json")
 """CPU seconds by test function: all its cases, the processes that they start and have ended, and its share of the
 fixtures that it has in common with others."""
-SLOW_S = 0.5
-"""From here on a test is `slow`: the others together take a minute on two cores."""
+SLOW_S = 0.2
+"""From here on a test is `slow`: the others together take a minute and a half on two cores."""
 _NOTED_S = 0.1
 
 
