@@ -85,6 +85,8 @@ class Fixes:
     warnings: list[str]
     alike: float = 1.0
     """Fixes that tell as much as one: the covariance is multiplied by it, since errors of satellites wander."""
+    innovation: float = 1.0
+    """Variance of an error that the error of the fix before it does not predict, as a share."""
 
     def __len__(self) -> int:
         return len(self.row)
@@ -281,15 +283,16 @@ def with_noise_of(fixes: Fixes, inlier: Floats, poses: Floats, checks: float) ->
     root = np.linalg.cholesky(np.linalg.inv(fixes.covariance[sound]))
     white = (np.swapaxes(root, 1, 2) @ error[:, :, None])[:, :, 0]
     power = max(float((white**2).mean()), 1e-12)
-    alike = 1.0
+    alike, innovation = 1.0, 1.0
     for lag in range(1, len(white) // 4):
         share = float((white[lag:] * white[:-lag]).mean()) / power
         if share < _UNLIKE:
             break
         alike += 2.0 * share
+        innovation = 1.0 - share**2 if lag == 1 else innovation
     checks = min(max(checks, 0.0), 3.0 * len(sound))
     factor = most_likely_variance(power * 3.0 * len(sound) / alike, checks / alike) * alike
-    fixes = replace(fixes, covariance=fixes.covariance * factor, alike=alike)
+    fixes = replace(fixes, covariance=fixes.covariance * factor, alike=alike, innovation=innovation)
     chi2 = chi2_of_fixes(poses, fixes, world) * alike
     inlier = (chi2 <= chi2_quantile(fixes.settings.inlier_probability, 3)).astype(float)
     _check_enough(inlier)
@@ -321,9 +324,9 @@ def cost_of_fixes(factors: Factors, weight: Floats, poses: Floats, fixes: Fixes)
         return most * len(fixes)
     alone, count, alike = Objective(factors, weight), float(inlier.sum()), fixes.alike
     cost = together.cost(se3.between(fit[:1], fit)) - alone.cost(poses) + most * float((1.0 - inlier).sum())
-    # of noise that wanders (autoregressive of first order), a fix tells what the one before it does not
-    surprise = max(factor, 1.0) / alike * 4.0 * alike / (1.0 + alike) ** 2
-    cost += 1.5 * count * (math.log(surprise) + 1.0 - 1.0 / alike)
+    # of noise that wanders, a fix tells what the one before it does not
+    innovation = max(factor, 1.0) / alike * fixes.innovation
+    cost += 1.5 * count * (math.log(innovation) + 1.0 - 1.0 / alike)
     return cost + 0.5 * (together.information(fit).log_determinant() - _log_determinant(alone, poses))
 
 
