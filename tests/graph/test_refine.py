@@ -239,11 +239,13 @@ def test_closures_that_lead_away_from_gps_are_not_believed() -> None:
     assert kept(poisoned, jumped) == 0
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_false_closures_are_not_excused_by_errors_of_fixes_that_they_make_alike(seed: int) -> None:
+@pytest.mark.parametrize(("false", "sigma_m", "seed"), [(4, 1.0, 0), (4, 1.0, 1), (4, 1.0, 2), (1, 2.5, 2), (1, 2.5, 3)])
+def test_false_closures_are_not_excused_by_errors_of_fixes_that_they_make_alike(
+    false: int, sigma_m: float, seed: int
+) -> None:
     """What they bend is smooth, as a receiver's errors that wander are; and fixes that jump are there anyway."""
-    drive = ring(240, loops=0, false=4, seed=seed)
-    fixes = fixes_on(satellites(drive, 1.0), drive.odometry, drive.keyframes, GpsSettings())
+    drive = ring(240, loops=0, false=false, seed=seed)
+    fixes = fixes_on(satellites(drive, sigma_m), drive.odometry, drive.keyframes, GpsSettings())
     jump = np.isin(np.arange(len(fixes)) // 20, [2, 7])
     fixes = replace(fixes, enu_m=fixes.enu_m + np.where(jump, 30.0, 0.0)[:, None] * [1.0, 1.0, 0.5])
     odometry = np.array([kind == EdgeKind.ODOMETRY for kind in drive.graph.kind])
