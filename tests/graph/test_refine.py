@@ -268,6 +268,22 @@ def test_fixes_far_noisier_than_they_claim_outvote_no_closures() -> None:
     assert decided(loose, GncSettings(), cost).solution.weight[loops].sum() >= 39
 
 
+@pytest.mark.parametrize(("seed", "correlation"), [(1, 0.8), (3, 0.9)])
+def test_wandering_fixes_that_claim_too_little_noise_outvote_no_closures(seed: int, correlation: float) -> None:
+    """Errors of first order autoregression; the odometry's noise is claimed large enough to follow them."""
+    drive, random = ring(120, loops=40, seed=1), np.random.default_rng(seed)
+    loops = np.array([kind == EdgeKind.LOOP for kind in drive.graph.kind])
+    loose = replace(drive.graph, information=drive.graph.information / np.where(loops, 1.0, 25.0)[:, None, None])
+    error = random.normal(size=(120, 3))
+    for k in range(1, 120):
+        error[k] = correlation * error[k - 1] + np.sqrt(1.0 - correlation**2) * error[k]
+    exact = satellites(drive, 1e-6)
+    exact = replace(exact, covariance=np.broadcast_to(0.01 * np.eye(3), (120, 3, 3)))
+    fixes = fixes_on(exact, drive.odometry, drive.keyframes, GpsSettings())
+    cost = partial(cost_of_fixes, fixes=replace(fixes, enu_m=fixes.enu_m + error))
+    assert decided(loose, GncSettings(), cost).solution.weight[loops].sum() == 40
+
+
 def test_fixes_whose_errors_wander_count_for_less() -> None:
     drive = ring(240, 40)
     white = satellites(drive, 1.0)

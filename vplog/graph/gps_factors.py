@@ -41,6 +41,11 @@ _MOST_JUMPS = 10
 """Jumps that are tried: each costs a few solves."""
 _TESTS = 5
 """Most tests of the fixes by a solution of those that passed the last one; 2 are usual."""
+_NOISE_ROUNDS = 4
+"""Most rounds of estimating the noise of the fixes and testing them by it: sound ones were left out as outliers where
+it was claimed too small."""
+_STEADY = 0.2
+"""Change of the covariance in a round, as a share, below which it is settled."""
 _UNLIKE = 0.1
 """Autocorrelation below which errors are not alike."""
 
@@ -301,7 +306,12 @@ def with_noise_of(fixes: Fixes, inlier: Floats, poses: Floats, checks: float) ->
 
 def noisier(fixes: Fixes, estimated: Fixes | None) -> Fixes:
     """The fixes with the larger covariance, of two sets that differ by a factor."""
-    return fixes if estimated is None or estimated.covariance[0, 0, 0] <= fixes.covariance[0, 0, 0] else estimated
+    return fixes if estimated is None or _times_noisier(estimated, fixes) <= 1.0 else estimated
+
+
+def _times_noisier(fixes: Fixes, others: Fixes) -> float:
+    """Factor of the covariance, of two sets that differ by one."""
+    return float(fixes.covariance[0, 0, 0] / others.covariance[0, 0, 0])
 
 
 def cost_of_fixes(factors: Factors, weight: Floats, poses: Floats, fixes: Fixes) -> float:
@@ -310,22 +320,27 @@ def cost_of_fixes(factors: Factors, weight: Floats, poses: Floats, fixes: Fixes)
     But for a constant; the fixes' noise is the likeliest where that is more than `fixes` have, and outliers count as at
     the bound of inliers.
     """
-    most = 0.5 * chi2_quantile(fixes.settings.inlier_probability, 3)
+    most, known, change = 0.5 * chi2_quantile(fixes.settings.inlier_probability, 3), fixes, math.inf
     try:
         moved, inlier = inlier_fixes(factors, weight, poses, fixes)
         together = with_fixes(factors, weight, moved, fixes, inlier)
         fit = minimised(together, moved, 20, 1e-4).world_from_body
-        present, inliers, factor = with_noise_of(fixes, inlier, fit, positions_redundancy(together, fit))
-        if factor > 1.0:
+        for _ in range(_NOISE_ROUNDS):
+            present, inliers, factor = with_noise_of(fixes, inlier, fit, positions_redundancy(together, fit))
+            before, change = change, abs(math.log(factor))
+            if _times_noisier(present, known) <= 1.0 or change > 0.5 * before:  # it does not settle
+                break
             fixes, inlier = present, inliers
             together = with_fixes(factors, weight, fit, fixes, inlier)
             fit = minimised(together, fit, 20, 1e-4).world_from_body
+            if change <= _STEADY:
+                break
     except GraphError:
         return most * len(fixes)
     alone, count, alike = Objective(factors, weight), float(inlier.sum()), fixes.alike
     cost = together.cost(se3.between(fit[:1], fit)) - alone.cost(poses) + most * float((1.0 - inlier).sum())
     # of noise that wanders, a fix tells what the one before it does not
-    innovation = max(factor, 1.0) / alike * fixes.innovation
+    innovation = _times_noisier(fixes, known) / alike * fixes.innovation
     cost += 1.5 * count * (math.log(innovation) + 1.0 - 1.0 / alike)
     return cost + 0.5 * (together.information(fit).log_determinant() - _log_determinant(alone, poses))
 
