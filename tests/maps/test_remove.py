@@ -199,7 +199,7 @@ def test_a_removal_on_a_store_that_fails_anywhere_takes_all_or_none(
         with map_store.writing(root):
             pass  # nothing is left to do
         with monkeypatch.context() as patch:
-            for name in ("put", "remove", "send", "copy"):
+            for name in ("put_if", "remove", "send", "copy"):
                 patch.setattr(objects, name, stepping(getattr(objects, name)))
             failed = False
             try:

@@ -295,6 +295,8 @@ def _common_record(pipeline: Pipeline, topics: TopicChoice, library: str) -> dic
 
 
 def _publish(store: Store, task: Task, outcome: Outcome, attempts: int) -> Drive:
+    """Raises ResultError where the map is another writer's now: what is left would be computed for nothing."""
+    store.check_lock()
     error = outcome.error
     if not error:
         try:

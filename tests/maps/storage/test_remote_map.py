@@ -130,8 +130,9 @@ def test_a_writer_stopped_anywhere_leaves_the_old_drive_or_the_new(root: Any, mo
 
                 return asked
 
-            for name in ("send", "put", "copy", "remove"):
+            for name in ("send", "copy", "remove"):
                 patch.setattr(objects, name, stepping(getattr(objects, name)))
+            patch.setattr(remote_map.Mirror, "write", stepping(remote_map.Mirror.write))
             patch.setattr(upload, "_SENT_AT_ONCE", 1)
             with pytest.raises(ResultError, match="killed"):
                 put(store, "one", 9)
@@ -155,7 +156,7 @@ def test_a_writer_stopped_anywhere_leaves_the_old_drive_or_the_new(root: Any, mo
 def test_what_nobody_names_goes_after_a_day(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     make_map(root, {"one": 1, "two": 2})
     left = root / "runs" / "drive=one" / ("0" * 16) / "run.json"
-    objects.put(left, b"{}")
+    left.ask("put", b"{}")
     objects.remove(root / "runs" / "drive=two")
     with map_store.writing(root) as store:
         write_rest(store, "1")
@@ -298,12 +299,48 @@ def test_two_writers(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     assert same_state(root) == {"one": {1}, "two": {2}}
 
 
+def test_a_writer_that_was_stopped_before_its_write_replaces_nothing(
+    root: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its lease ran out meanwhile, which it does not know: the store refuses each of its writes."""
+    make_map(root, {"one": 1})
+    monkeypatch.setattr(lease_lock, "_release", lambda _: None)
+    with map_store.writing(root) as stopped:
+        stopped.write_failures({"bad": {"log": "bad.mcap", "error": "old"}})
+    monkeypatch.setattr(lease_lock, "_started", lambda _: "it has ended")
+    with map_store.writing(root) as store:
+        put(store, "one", 2)
+        write_rest(store, "2")
+        store.write_failures({"bad": {"log": "bad.mcap", "error": "new"}})
+    monkeypatch.setattr(lease_lock.Lock, "check", lambda _: None)
+    stopped.staging.mkdir(parents=True)
+    with pytest.raises(ResultError, match=r"Another writer has replaced .*drive\.json"):
+        put(stopped, "one", 3)
+    with pytest.raises(ResultError, match=r"replaced .*drive\.json"):
+        upload.relocate(stopped.mirror, "one", "elsewhere.mcap")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ResultError, match=r"replaced .*failures\.json"):
+        stopped.write_failures({})
+    write_rest(stopped, "3")
+    with pytest.raises(ResultError, match=r"replaced .*rest\.json"):
+        stopped.flush()
+    monkeypatch.undo()
+    monkeypatch.setattr(lease_lock, "LEASE_S", 0.0)  # it sees that it slept for a lease, and asks
+    with pytest.raises(ResultError, match="taken"):
+        put(stopped, "two", 3)
+    shutil.rmtree(stopped.root)
+    assert same_state(root) == {"one": {2}}
+    with map_store.reading(root) as store:
+        store.mirror.rest()  # pyright: ignore[reportOptionalMemberAccess]
+        assert (store.root / "joint.json").read_text() == "2"
+        assert store.failures()["bad"]["error"] == "new"
+
+
 def test_a_store_that_decides_nothing_is_only_read(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """As one that takes no notice of conditions, or is told to make none."""
     make_map(root, {"one": 1})
 
     def put_anyway(path: Any, data: bytes, _: object) -> dict[str, str]:
-        objects.put(path, data)
+        path.ask("put", data)
         return {"e_tag": "any"}
 
     with pytest.MonkeyPatch.context() as patch:
@@ -362,7 +399,7 @@ def test_a_killed_process_is_followed_at_once(root: Any, tmp_path: Path) -> None
 
 def test_what_is_no_map_is_one_line(root: Any, verb: Callable[..., Said]) -> None:
     assert "is not a map" in verb("map", "info", root).error
-    objects.put(root / "thesis.txt", b"no map")
+    (root / "thesis.txt").ask("put", b"no map")
     with pytest.raises(SettingsError, match=r"thesis\.txt"), map_store.writing(root):
         pass
     with pytest.raises(SettingsError, match="for reading"), map_store.writing(located("http://127.0.0.1:1/map")):
@@ -378,13 +415,13 @@ def test_what_is_no_map_is_one_line(root: Any, verb: Callable[..., Said]) -> Non
         {"generation": "../../.."}, {"files": {"../../up": files["run.json"]}}, {"files": {"/up": files["run.json"]}},
         {"files": {"run.json": {"bytes": "many", "sha256": ""}}}, {"replaces": "../runs"}, {"files": []},
     ):  # fmt: skip
-        upload.put_json(manifest, {**sound, **change})
+        manifest.ask("put", upload._json_of({**sound, **change}))
         assert "not a manifest" in verb("map", "info", place, "--json").json["damaged"]["one"]
     for about in ({"bytes": 3}, {"sha256": "0" * 64}):
         changed = {**files, "run.json": {**files["run.json"], **about}}
-        upload.put_json(manifest, {**sound, "files": changed})
+        manifest.ask("put", upload._json_of({**sound, "files": changed}))
         assert "does not have the length and sha256" in verb("map", "info", place, "--json").json["damaged"]["one"]
-    upload.put_json(manifest, sound)
+    manifest.ask("put", upload._json_of(sound))
     objects.remove(place / "runs" / "drive=one" / sound["generation"])
     assert "has lost files" in verb("map", "info", place, "--json").json["damaged"]["one"]
 
@@ -393,7 +430,7 @@ def _put_back(place: Any, data: bytes | None) -> None:
     if data is None:
         objects.remove(place)
     else:
-        objects.put(place, data)
+        place.ask("put", data)
 
 
 @pytest.mark.parametrize("how", ["flip", "gone", "longer", "manifest", "no manifest"])
@@ -458,11 +495,11 @@ def test_a_damaged_joint_record_stops_no_writer(root: Any, verb: Callable[..., S
     place = root / "rest" / json.loads(manifest)["generation"] / "joint/component=a/poses.parquet"
     match how:
         case "cut":
-            objects.put(root / "rest.json", manifest[:-9])
+            (root / "rest.json").ask("put", manifest[:-9])
         case "flip":
-            objects.put(root / "rest.json", _flipped(manifest))
+            (root / "rest.json").ask("put", _flipped(manifest))
         case "object":
-            objects.put(place, b"other")
+            place.ask("put", b"other")
         case _:
             objects.remove(place)
     damaged = "rest.json" if how in ("cut", "flip") else "poses.parquet"

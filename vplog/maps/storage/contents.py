@@ -12,7 +12,14 @@ from urllib.parse import unquote
 
 from vplog.errors import LibraryError, NewerError, ResultError, nearest_path
 from vplog.maps.geo_bounds import earth_from_record, earth_of_run
-from vplog.maps.storage.damage import DamagedDriveError, check_run_tables, damaged_files, reading_drive, rows_of
+from vplog.maps.storage.damage import (
+    DamagedDriveError,
+    UnreachableError,
+    check_run_tables,
+    damaged_files,
+    reading_drive,
+    rows_of,
+)
 from vplog.maps.storage.layout import FORMAT, HASH, RUN_TABLES, drive_record, folder_name, write_changed
 from vplog.maps.storage.upload import send_rest, write_json
 from vplog.results import run_record
@@ -128,12 +135,17 @@ class Store:
             about = drive_record(self.root / "runs" / folder_name(drive))
             return earth_from_record(about["earth"]) if "earth" in about else earth_of_run(self.full_run(drive))
 
-    def flush(self) -> None:
-        """Upload what was written so far beside drives to a map on an object store; where that fails, later.
-        Raises SettingsError where another writer has the map now."""
+    def check_lock(self) -> None:
+        """Raises ResultError where another writer has the map on a store now."""
         if self.mirror is not None:
             self.mirror.check_lock()
-            with suppress(ResultError):
+
+    def flush(self) -> None:
+        """Upload what was written so far beside drives to a map on an object store; where that fails, later.
+        Raises ResultError where another writer has the map now."""
+        self.check_lock()
+        if self.mirror is not None:
+            with suppress(UnreachableError):
                 send_rest(self.mirror)
 
     def drives(self) -> dict[str, dict[str, Any]]:

@@ -42,10 +42,16 @@ class Lock:
     """Why it is not held any more."""
     version: objects.Version | None = None
     """Of the object as it was last written."""
+    renewed_s: float = field(default_factory=time.monotonic)
+    """When it was last renewed."""
+    writing: threading.Lock = field(default_factory=threading.Lock)
     released: threading.Event = field(default_factory=threading.Event)
 
     def check(self) -> None:
-        """Raises ResultError where another writer has taken the lock over."""
+        """Raises ResultError where another writer has taken the lock over. After a process was stopped for a lease, or
+        its machine slept, the store is asked."""
+        if time.monotonic() - self.renewed_s > LEASE_S:
+            _renew(self)
         if self.lost:
             raise ResultError(f"{self.lost} What was finished is in the map. Run again to go on.")
 
@@ -61,7 +67,7 @@ def held(root: RemotePath) -> Iterator[Lock]:
         _acquire(lock, root)
     except OSError as error:
         raise SettingsError(f"Cannot write to {root}: {reason(error)}. Choose another place with -o.") from None
-    renewing = threading.Thread(target=_renew, args=(lock,), daemon=True)
+    renewing = threading.Thread(target=_keep, args=(lock,), daemon=True)
     renewing.start()
     try:
         yield lock
@@ -150,15 +156,19 @@ def _check_expired(found: objects.Versioned, root: RemotePath) -> None:
     )
 
 
-def _renew(lock: Lock) -> None:
-    last = time.monotonic()
+def _keep(lock: Lock) -> None:
     while not lock.lost and not lock.released.wait(LEASE_S / RENEWALS):
-        lock.renewed += 1
+        _renew(lock)
+
+
+def _renew(lock: Lock) -> None:
+    with lock.writing:
         try:
+            lock.renewed += 1
             _write(lock, _content(lock))
-            last = time.monotonic()
+            lock.renewed_s = time.monotonic()
         except OSError as error:
-            if time.monotonic() - last > LEASE_S:
+            if time.monotonic() - lock.renewed_s > LEASE_S:
                 lock.lost = f"{lock.place} could not be renewed for {LEASE_S:.0f} s: {reason(error)}."
 
 

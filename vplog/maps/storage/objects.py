@@ -31,11 +31,6 @@ class Versioned(NamedTuple):
     """By the store's clock."""
 
 
-def put(path: RemotePath, data: bytes) -> None:
-    """Raises OSError."""
-    path.ask("put", data)
-
-
 def put_if(path: RemotePath, data: bytes, version: Version | None) -> Version | None:
     """Write an object where it is in this state, or where there is none yet (None); its new version, or None where that
     is not so. The store decides, so that of several writers one wins; one without conditional writes raises, or writes

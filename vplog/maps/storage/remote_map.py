@@ -74,6 +74,8 @@ class Mirror:
         store cannot be read."""
         self.remote, self.local, self.lock, self.cache = remote, local, lock, cache
         self.manifests: dict[str, dict[str, Any]] = {}
+        self.versions: dict[str, objects.Version | None] = {}
+        """State of each object as it was read or written last, None where there was none: no other one is replaced."""
         self.damaged: dict[str, str] = {}
         """Drives whose manifest is damaged or missing, and why."""
         self.rest_manifest: dict[str, Any] = {}
@@ -83,12 +85,31 @@ class Mirror:
         self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
         with store_errors(remote):
             for name in ("map.json", "failures.json", "removed.json"):
-                if (data := objects.get(remote / name)) is not None:
+                if (data := self.read(name)) is not None:
                     (local / name).write_bytes(data)
             runs = names_below(remote / "runs")
             folders = sorted(name for name, has_below in runs.items() if has_below and name.startswith("drive="))
             with ThreadPoolExecutor(_REQUESTS) as pool:
                 list(pool.map(self._open, folders))
+
+    def read(self, name: str) -> bytes | None:
+        """An object of the map, None where there is none. Raises OSError."""
+        found = objects.get_with_version(self.remote / name)
+        self.versions[name] = None if found is None else found.version
+        return None if found is None else found.data
+
+    def write(self, name: str, data: bytes) -> None:
+        """Replace an object as it was read or written last. Raises ResultError where another writer has been there, and
+        OSError."""
+        self.check_lock()
+        place = self.remote / name
+        version = objects.put_if(place, data, self.versions.get(name))
+        if version is None:
+            found = objects.get_with_version(place)
+            if found is None or found.data != data:  # else the response was lost, and this is a repetition
+                raise ResultError(f"Another writer has replaced {place}, which stays as it is. Run again.")
+            version = found.version
+        self.versions[name] = version
 
     def check_lock(self) -> None:
         """Raises ResultError where the map is open for reading, or another writer has taken the lock over."""
@@ -214,7 +235,7 @@ class Mirror:
         for _ in range(3):
             try:
                 with store_errors(self.remote):
-                    data = objects.get(self.remote / "rest.json")
+                    data = self.read("rest.json")
                 if data is None:
                     return ""
                 manifest = checked_manifest(data, self.remote / "rest.json")
@@ -266,7 +287,7 @@ class Mirror:
     def read_manifest(self, drive_folder: str) -> dict[str, Any] | None:
         """The current manifest of a drive, None without one. Raises OSError, and ResultError where it is damaged."""
         place = self.remote / "runs" / drive_folder
-        data = objects.get(place / "drive.json")
+        data = self.read(f"runs/{drive_folder}/drive.json")
         return (
             None if data is None else checked_record(checked_manifest(data, place / "drive.json"), cast("Path", place))
         )

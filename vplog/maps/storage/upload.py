@@ -11,7 +11,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from vplog.errors import NewerError, ResultError, SettingsError
+from vplog.errors import SettingsError
 from vplog.maps.storage import objects
 from vplog.maps.storage.damage import rows_of
 from vplog.maps.storage.layout import RUN_TABLES, TABLES, folder_name, sha256_of
@@ -74,20 +74,13 @@ def publish(mirror: Mirror, drive: str, made: Path) -> None:
     rows = {f"{name}.parquet": {"rows": rows_of(made / f"{name}.parquet")} for name in TABLES}
     with store_errors(mirror.remote):
         sent = _send_all(files_in(made), made, place / generation)
-        try:
-            old = mirror.read_manifest(place.name)
-        except NewerError:
-            raise
-        except ResultError:  # damaged
-            old = None
         manifest = {
             **run_record.read_run_json(made / "drive.json"),
             "generation": generation,
-            "replaces": None if old is None else old["generation"],
+            "replaces": mirror.manifests.get(drive, {}).get("generation"),
             "files": {name: {**about, **rows.get(name, {})} for name, about in sent.items()},
         }
-        mirror.check_lock()
-        put_json(place / "drive.json", manifest)
+        mirror.write(f"runs/{place.name}/drive.json", _json_of(manifest))
     for name in sent:
         if name not in (*RUN_TABLES, "drive.json"):  # a batch would fill the disk
             (made / name).unlink()
@@ -98,9 +91,8 @@ def publish(mirror: Mirror, drive: str, made: Path) -> None:
 def relocate(mirror: Mirror, drive: str, log: str) -> None:
     """Write the manifest with another place of the drive's log. Raises ResultError."""
     manifest = {**mirror.manifests[drive], "log": log}
-    mirror.check_lock()
     with store_errors(mirror.remote):
-        put_json(mirror.remote / "runs" / folder_name(drive) / "drive.json", manifest)
+        mirror.write(f"runs/{folder_name(drive)}/drive.json", _json_of(manifest))
     mirror.write_drive_record(manifest)
 
 
@@ -128,19 +120,14 @@ def _finish_publish(mirror: Mirror, drive: str, manifest: dict[str, Any]) -> Non
 
 
 def write_json(mirror: Mirror, name: str) -> None:
-    """Send map.json or failures.json of the local folder. Of several writers of a first map.json one wins."""
-    data, place = (mirror.local / name).read_bytes(), mirror.remote / name
+    """Send map.json or failures.json of the local folder. Raises ResultError where another writer has changed it."""
     with store_errors(mirror.remote):
-        if name != "map.json" or objects.get(place) is not None:
-            objects.put(place, data)
-        elif objects.put_if(place, data, None) is None:
-            raise ResultError(f"Another writer has just made {place}. Run again.")
+        mirror.write(name, (mirror.local / name).read_bytes())
 
 
-def put_json(place: RemotePath, record: dict[str, Any]) -> None:
-    """Write a record with its checksum. Raises OSError."""
-    text = json.dumps(with_checksum(record), ensure_ascii=False, allow_nan=False) + "\n"
-    objects.put(place, text.encode())
+def _json_of(record: dict[str, Any]) -> bytes:
+    """A record with its checksum."""
+    return (json.dumps(with_checksum(record), ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
 def send_library(mirror: Mirror, digest: str) -> None:
@@ -159,6 +146,7 @@ def remove(mirror: Mirror, drive: str) -> None:
     mirror.check_lock()
     with store_errors(remote):
         objects.remove(remote / "runs" / named / "drive.json")
+        mirror.versions.pop(f"runs/{named}/drive.json", None)
         mirror.manifests.pop(drive, None)
         objects.remove(remote / "runs" / named)
         for name, has_below in sorted(names_below(remote).items()):
@@ -185,7 +173,7 @@ def send_rest(mirror: Mirror) -> None:
             objects.copy(remote / "rest" / old["generation"] / name, place / name)
         files = {**same, **_send_all([name for name in now if name not in same], mirror.local, place)}
         manifest = {"generation": generation, "replaces": old.get("generation"), "files": dict(sorted(files.items()))}
-        put_json(remote / "rest.json", manifest)
+        mirror.write("rest.json", _json_of(manifest))
         mirror.rest_manifest = manifest
         _finish_rest(remote, manifest, [name for name in files if name not in same], known)
 
