@@ -23,10 +23,12 @@ from vplog.graph.evidence import accidents, log_room
 from vplog.graph.questions import questions
 from vplog.graph.solve import GncSettings, LmSettings, decided
 from vplog.graph.variance_components import claimed_times
+from vplog.results import tables
 from vplog.results.g2o import read_g2o
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
 
     from vplog.data import Bools, Floats, Ints
 
@@ -36,8 +38,8 @@ STRIDE = 25
 MISPLACED_M = (2.0, 6.0)
 WITHIN = 1.05
 LEAST_SHARE = 0.02
-THRESHOLDS = ("0.300", "0.500")
-"""Of Bicocca's files: closures of the first, and of the score that the others pass."""
+THRESHOLDS = ("0.150", "0.300", "0.500")
+"""Least score of the closures of Bicocca's files; in a file the score of a closure is the last of them that it is in."""
 WAYS = ("ask", "random", "lowest score")
 
 
@@ -59,34 +61,53 @@ class Case:
         return aligned_error(poses[known], self.truth[known])
 
 
-def ask(most: int, seeds: int) -> Iterator[Figure]:
+def ask(most: int, seeds: int, runs: Sequence[Path] = ()) -> Iterator[Figure]:
     """Questions needed by `vplog ask` as a share of those by each other way, and the curves of them."""
-    for case in cases(seeds):
+    for case in cases(seeds, runs):
         yield from compared(case, most)
 
 
-def cases(seeds: int) -> Iterator[Case]:
-    """Bicocca 25b with the false closures of its recogniser, and KITTI 00 with places like their neighbours."""
-    place = folder() / "rrr" / "B25b"
-    if place.is_dir():
-        known, places = bicocca_truth(place)
-        first, *others = (read_g2o(place / f"B25b_{one}.g2o").graph for one in THRESHOLDS)
-        loops = np.flatnonzero(~first.odometry)
-        false, score = np.zeros(len(first.a), bool), np.zeros(len(first.a))
-        false[loops] = false_by_gps(first, loops, known, places)
-        for other in others:
-            pairs = set(zip(other.a.tolist(), other.b.tolist(), strict=True))
-            score += [pair in pairs for pair in zip(first.a.tolist(), first.b.tolist(), strict=True)]
-        places[~known] = np.nan
-        yield coarse(Case(f"B25b {THRESHOLDS[0]}", first, false, score, places))
+def cases(seeds: int, runs: Sequence[Path]) -> Iterator[Case]:
+    """Finished runs and KITTI 00 with places like their neighbours, Bicocca 25b with the false closures of its
+    recogniser."""
+    for run in runs:
+        _, poses = tables.read_keyframes(run / "keyframes.parquet")
+        graph, weight, _ = tables.read_edges(run / "edges.parquet", poses)
+        kept = graph.odometry | (weight > 0.5)
+        graph = replace(
+            graph, a=graph.a[kept], b=graph.b[kept], a_from_b=graph.a_from_b[kept],
+            information=graph.information[kept], kind=[kind for kind, keep in zip(graph.kind, kept, strict=True) if keep],
+        )  # fmt: skip
+        for seed in range(seeds):
+            yield _with_misplaced(run.name, graph, seed)
     path = folder() / "SE-Sync" / "kitti_00.g2o"
     for seed in range(seeds if path.is_file() else 0):
-        clean = read_g2o(path).graph
-        optimum = LmSettings()(clean).world_from_body
-        graph, false = misplaced(clean, seed)
-        # as of a recogniser whose false answers are alike: half a sigma apart
-        score = np.random.default_rng(seed).normal(size=len(false)) - 0.5 * false
-        yield coarse(Case(f"kitti_00, places misplaced, seed {seed}", graph, false, score, optimum))
+        yield _with_misplaced("kitti_00", read_g2o(path).graph, seed)
+    place = folder() / "rrr" / "B25b"
+    if place.is_dir():
+        yield from _bicocca(place)
+
+
+def _with_misplaced(name: str, clean: PoseGraph, seed: int) -> Case:
+    optimum = LmSettings()(clean).world_from_body
+    graph, false = misplaced(clean, seed)
+    # as of a recogniser whose false answers are alike: half a sigma apart
+    score = np.random.default_rng(seed).normal(size=len(false)) - 0.5 * false
+    return coarse(Case(f"{name}, places misplaced, seed {seed}", graph, false, score, optimum))
+
+
+def _bicocca(place: Path) -> Iterator[Case]:
+    known, places = bicocca_truth(place)
+    graphs = [read_g2o(place / f"B25b_{one}.g2o").graph for one in THRESHOLDS]
+    truth = np.where(known[:, None, None], places, np.nan)
+    for at, graph in enumerate(graphs):
+        loops = np.flatnonzero(~graph.odometry)
+        false, score = np.zeros(len(graph.a), bool), np.zeros(len(graph.a))
+        false[loops] = false_by_gps(graph, loops, known, places)
+        for other in graphs[at + 1 :]:
+            pairs = set(zip(other.a.tolist(), other.b.tolist(), strict=True))
+            score += [pair in pairs for pair in zip(graph.a.tolist(), graph.b.tolist(), strict=True)]
+        yield coarse(Case(f"B25b {THRESHOLDS[at]}", graph, false, score, truth))
 
 
 def misplaced(graph: PoseGraph, seed: int) -> tuple[PoseGraph, Bools]:
