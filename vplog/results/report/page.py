@@ -15,7 +15,7 @@ from vplog.results.html import figure, mapping, render
 from vplog.results.report import charts
 
 if TYPE_CHECKING:
-    from vplog.data import Bools, Closures, Floats, Keyframes, Trajectory
+    from vplog.data import Bools, Closures, Floats, Ints, Keyframes, Trajectory
     from vplog.results.geo import Earth
     from vplog.results.mcap_read import McapContent
 
@@ -27,6 +27,8 @@ _MOST_LOSSES = 100
 """Rows of the table of losses; run.json has them all."""
 _MOST_PICTURE_BYTES = 6_000_000
 """Bytes of all pictures together: the page then stays below 10 MB, base64 and table included."""
+_DOUBTFUL_SIGMA = 6.5
+"""Residuals of that much are red."""
 _MOST_SIGMA = 10.0
 """Residuals over time are drawn up to it: those of false closures are often a thousand."""
 _MOST_USED = 6
@@ -64,6 +66,9 @@ class TruthComparison:
     """(C,) candidates whose two frames show one place."""
     error_m: Floats | None = None
     """(N,) distance of each keyframe to the aligned truth, NaN where that does not cover it."""
+    closure_error_m: Floats | None = None
+    """(C,) distance between where a candidate places its query, from its match, and where the truth does; NaN without
+    a pose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +115,8 @@ class Content:
     """Small JPEG of a keyframe by its row."""
     judged: TruthComparison | None = None
     questions: list[Question] = field(default_factory=list)
+    references: Ints | None = None
+    """(N, K) numbers of the references that explain each keyframe, negative for none; None without references."""
 
 
 def page(content: Content) -> str:
@@ -217,7 +224,11 @@ def _over_time(content: Content) -> list[tuple[str, charts.Chart]]:
         ],
         "error of keyframes in m": [] if error_m is None else [("truth", keyframe_s, error_m)],
     }
-    drawn = [(name, charts.over_time(lines, name, float(sample_s[-1]))) for name, lines in series.items() if lines]
+    end_s = float(sample_s[-1])
+    drawn = [(name, charts.over_time(lines, name, end_s)) for name, lines in series.items() if lines]
+    if content.references is not None:
+        name = "references that explain a keyframe, by first use"
+        drawn.append((name, charts.coverage(content.references, keyframe_s, name, end_s)))
     return [(name, chart) for name, chart in drawn if chart is not None]
 
 
@@ -246,7 +257,8 @@ def false_closures(content: Content) -> Bools:
 
 
 def _map(content: Content) -> tuple[list[tuple[str, str]], dict[str, Any]]:
-    """The legend, and paths and keyframes seen along the shortest axis, in m to the right and up."""
+    """The legend, and paths and keyframes in m to the right, up and out of the map, which lies along the shortest
+    axis."""
     closures, judged, position = content.closures, content.judged, content.tracks.world_from_body[:, :3, 3]
     false = false_closures(content)
     groups = [
@@ -265,14 +277,19 @@ def _map(content: Content) -> tuple[list[tuple[str, str]], dict[str, Any]]:
     if gps is not None and earth is not None:
         fixes_m = se3.transform(se3.inverse(earth.enu_from_world), geodesy.local_enu(gps).enu_m)
         paths.insert(0, ("gps", "GPS fixes", fixes_m))
-    view, axes = charts.map_view(np.concatenate([points for _, _, points in paths]))
+    view = charts.map_view(np.concatenate([points for _, _, points in paths]))
+    axes = dict(zip("xyz", view.T.tolist(), strict=True))
+    if earth is not None:
+        axes["N"] = (view @ earth.enu_from_world[1, :3]).tolist()
     legend = [(kind, name) for kind, name, points in paths if len(points)]
     legend += [(f"dot {kind}", name) for kind, name, rows in groups if rows.any()]
     flat = [
         {"kind": kind, "points": np.round(charts.subsampled(points, charts.MOST_POINTS) @ view.T, 3).tolist()}
         for kind, _, points in paths
     ]
-    return legend, {"axes": axes, "paths": flat, "keyframes": np.round(position @ view.T, 3).tolist()}
+    error = None if judged is None or judged.error_m is None else _rounded(judged.error_m, 3)
+    seen = np.round(position @ view.T, 3).tolist()
+    return legend, {"axes": axes, "paths": flat, "keyframes": seen, "error_m": error}
 
 
 def _truth(judged: TruthComparison) -> list[list[str]]:
@@ -305,9 +322,14 @@ def _audit(content: Content, drawn: dict[str, Any], pictures: list[int]) -> dict
     """Data of the page's script; `pictures` are the ledger rows with a picture in the page."""
     closures, log = content.closures, content.record.get("log")
     order = np.lexsort((-closures.score.astype(np.float64), ~closures.of(*USED)))
+    columns = _columns(content, sorted(order[:_MOST_ROWS].tolist()))
+    after, (left, across, top, foot) = content.tracks.after.stamp_ns, charts.PLOT
     command = f"vplog run {shlex.quote(str(log))} -o RUN --decisions decisions.csv"
     return {
-        "columns": _columns(content, sorted(order[:_MOST_ROWS].tolist())),
+        "columns": columns,
+        "scales": _scales(columns, drawn["error_m"]),
+        "time": {"start": str(after[0]), "end_s": (int(after[-1]) - int(after[0])) / 1e9 or 1.0}
+        | {"left": left, "across": across, "top": top, "foot": foot},
         "used": [verdict.value for verdict in USED],
         "sentences": {verdict.value: verdict.sentence for verdict in Verdict},
         "stamps": list(map(str, content.tracks.keyframes.stamp_ns.tolist())),  # beyond 2^53, where JavaScript rounds
@@ -318,6 +340,16 @@ def _audit(content: Content, drawn: dict[str, Any], pictures: list[int]) -> dict
         "explain": "vplog explain RUN --closure ",
         "again": command,
     }
+
+
+def _scales(columns: dict[str, list[Any]], error_m: list[float | None] | None) -> dict[str, tuple[float, float]]:
+    """By what dots or, with `path_error_m`, the path may be coloured: the values of green and red."""
+    found = {"residual_after": (0.0, _DOUBTFUL_SIGMA)}
+    for name, values in (("score", columns["score"]), ("error_m", columns.get("error_m")), ("path_error_m", error_m)):
+        if known := [one for one in values or [] if one is not None]:
+            most = round(float(np.quantile(known, 0.95)), 2) or 1.0
+            found[name] = (most, 0.0) if name == "score" else (0.0, most)
+    return found
 
 
 def _columns(content: Content, rows: list[int]) -> dict[str, list[Any]]:
@@ -334,6 +366,8 @@ def _columns(content: Content, rows: list[int]) -> dict[str, list[Any]]:
     columns |= {name: getattr(closures, name)[rows].tolist() for name in whole}
     columns |= {name: _rounded(getattr(closures, name)[rows], digits) for name, digits in shares.items()}
     columns["metres"] = _rounded(np.linalg.norm(closures.match_from_query[rows, :3, 3], axis=1), 2)
+    if judged is not None and judged.closure_error_m is not None:
+        columns["error_m"] = _rounded(judged.closure_error_m[rows], 2)
     columns["reverse_inliers"] = [value if value >= 0 else None for value in columns["reverse_inliers"]]
     return columns
 
