@@ -166,7 +166,7 @@ def test_lines_over_time_have_gaps_where_values_are_unknown() -> None:
 
 def test_the_drive_over_time(page: str, finished: Path) -> None:
     for name in ("Height, z in m", "Heading, yaw in degrees", "Speed in m/s", "Position, one sigma in m"):
-        assert f"<h3>{name}</h3>" in page
+        assert f"<figcaption>{name}</figcaption>" in page
     closures = tables.read_closures(finished / "closures.parquet")
     dots = re.findall(r'<path class="track dot (yes|no)" d="((?:M[\d. ]+h0){2,})"', page)
     used = closures.of(*USED)
@@ -200,7 +200,7 @@ def test_against_the_truth(verb: Verb, finished: Path, drive: Drive, tmp_path: P
     text = (tmp_path / "r.html").read_text()
     assert found["bytes"] == (tmp_path / "r.html").stat().st_size
     assert "Precision and recall" in text
-    assert "<h3>Error of keyframes in m</h3>" in text
+    assert "<figcaption>Error of keyframes in m</figcaption>" in text
     told = ledger(text)
     evaluation = verb("evaluate", finished, "--truth", drive.truth, "--json").json
     assert f"{evaluation['ate_after']['rmse_m']:.3f}" in text
@@ -444,7 +444,7 @@ def test_closures_are_selected_and_rejected_and_the_next_run_knows(
         executable_path=browser, args=["--no-sandbox", "--disable-gpu"]
     ) as chromium:  # fmt: skip
         page = chromium.new_page(viewport={"width": 1000, "height": 900}, color_scheme="light")
-        page.on("console", lambda message: said.append(message.text))
+        page.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
         page.on("pageerror", lambda error: said.append(str(error)))
         page.goto((run / "report.html").as_uri())
         page.select_option("#filter", "accepted")
