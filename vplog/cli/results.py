@@ -89,7 +89,7 @@ def report(arguments: argparse.Namespace) -> None:
 
 def diff(arguments: argparse.Namespace) -> None:
     """Compare two runs of one drive: settings, closures, trajectories, scores and times."""
-    from vplog.verbs.diff import check_limits, exceeded
+    from vplog.verbs.diff import check_limits, exceeded, write_page
     from vplog.verbs.diff import diff as diff_runs
 
     runs = [*([arguments.baseline] if arguments.baseline else []), *arguments.runs]
@@ -97,7 +97,10 @@ def diff(arguments: argparse.Namespace) -> None:
         arguments.refuse(f"two runs are compared, BASELINE RUN or RUN --baseline BASELINE, and {len(runs)} were given")
     check_limits(arguments.fail_on)
     with one_stage(arguments, "compare"):
-        found = diff_runs(runs[0], runs[1], arguments.truth, parser.topics_of(arguments), _truth_options(arguments))
+        truth = arguments.truth, parser.topics_of(arguments), _truth_options(arguments)
+        found = diff_runs(runs[0], runs[1], *truth)
+        if arguments.output is not None:
+            write_page(arguments.output, found, *truth)
     print_result(arguments, found, printing.print_diff)
     if sentences := exceeded(found, arguments.fail_on):
         raise ResultError(" ".join(sentences))
@@ -193,6 +196,8 @@ def add_results(
     option(sub, "--baseline", place, "RUN", "the run to compare with (default: the first of two)")
     option(sub, "--truth", str, "FILE.tum|gps|auto", _TRUTH)
     _add_truth_options(sub)
+    text = "also write the report of RUN with what changed: closures gained and lost, both trajectories"
+    option(sub, "-o --output", parser.output_file, "FILE.html", text)
     text = "exit status 1 where a change fails this, as 'recall<-0.01' or 'seconds>20%%'; repeatable"
     option(sub, "--fail-on", str, "LIMIT", text, action="append", default=[])
     sub = add("export", export, threads)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Ints
-    from vplog.results.report.page import Question, TruthComparison
+    from vplog.results.report.page import Changes, Question, TruthComparison
 
 _log = logging.getLogger(__name__)
 
@@ -41,13 +41,14 @@ def write_report(
     path: Path | None = None,
     judged: TruthComparison | None = None,
     pictures: dict[int, bytes] | None = None,
+    changes: Changes | None = None,
 ) -> Path:
     """Write the page of the run in `folder`, whose run.json holds `record`, as `path` (report.html in it where None).
 
     `pictures` are JPEGs of closures by row, where result.mcap has none. Raises ResultError.
     """
     path = path or folder / "report.html"
-    text = page(gather(folder, record, judged, pictures))
+    text = page(replace(gather(folder, record, judged, pictures), changes=changes))
     with replacing(path) as stream:
         stream.write(text.encode())
     return path

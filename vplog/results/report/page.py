@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog.data import USED, Verdict
+from vplog.errors import plural
 from vplog.geometry import geodesy, se3
 from vplog.results.html import figure, mapping, render
 from vplog.results.report import charts
@@ -100,6 +101,18 @@ class Question:
 
 
 @dataclass(frozen=True, eq=False)
+class Changes:
+    """A run compared with another one of its drive, the baseline."""
+
+    found: dict[str, Any]
+    """The record of `vplog diff --json`."""
+    path: Floats
+    """(T, 3) m, the baseline's in the frame of the run."""
+    change: list[str | None]
+    """By row of the ledger: `gained` or `lost`, None for what did not change."""
+
+
+@dataclass(frozen=True, eq=False)
 class Content:
     """A finished run."""
 
@@ -114,6 +127,7 @@ class Content:
     thumbnails: dict[int, bytes] = field(default_factory=dict)
     """Small JPEG of a keyframe by its row."""
     judged: TruthComparison | None = None
+    changes: Changes | None = None
     questions: list[Question] = field(default_factory=list)
     references: Ints | None = None
     """(N, K) numbers of the references that explain each keyframe, negative for none; None without references."""
@@ -135,6 +149,7 @@ def page(content: Content) -> str:
         losses=[_loss(one, content) for one in _list(record.get("losses")) if isinstance(one, dict)][:_MOST_LOSSES],
         map_lines=legend,
         judged=judged,
+        changes=content.changes and _changes(content.changes),
         questions=_questions(content),
         truth=_truth(judged) if judged else [],
         curves=charts.curves(judged.curves) if judged and judged.curves else None,
@@ -163,6 +178,21 @@ def _tiles(content: Content) -> list[tuple[str, str]]:
         (f"{figure(totals.get('seconds'))} s", "to compute"),
         (f"{figure(totals.get('peak_memory_mb'), 0)} MB", "peak memory"),
     ]
+
+
+def _changes(changes: Changes) -> dict[str, Any]:
+    """Tables of settings, figures and seconds of stages, and sentences on the closures."""
+    found, rows = changes.found, changes.change
+    lost = len(found["closures"]["lost"])
+    gone = lost - rows.count("lost")
+    return {
+        "baseline": found["baseline"],
+        "closures": f"{plural(len(found['closures']['gained']), 'closure')} gained, {lost} lost"
+        + (f", {gone} of which are no candidates of this run" if gone else ""),
+        "settings": [(name, *map(str, pair)) for name, pair in found["settings"].items()],
+        "figures": [(name, *(figure(one, 3) for one in triple)) for name, triple in found["figures"].items()],
+        "seconds": [(name, *map(figure, pair)) for name, pair in found["seconds"].items()],
+    }
 
 
 def _questions(content: Content) -> list[list[Any]]:
@@ -273,6 +303,8 @@ def _map(content: Content) -> tuple[list[tuple[str, str]], dict[str, Any]]:
     ]
     if judged is not None and judged.path is not None:
         paths.insert(0, ("truth", "truth", judged.path))
+    if content.changes is not None:
+        paths.insert(0, ("other", "baseline, optimised", content.changes.path))
     gps, earth = content.tracks.found.gps, content.tracks.earth
     if gps is not None and earth is not None:
         fixes_m = se3.transform(se3.inverse(earth.enu_from_world), geodesy.local_enu(gps).enu_m)
@@ -361,6 +393,8 @@ def _columns(content: Content, rows: list[int]) -> dict[str, list[Any]]:
         columns["true"] = [one if known else None for one, known in zip(true, judged.known[rows], strict=True)]
         if judged.at_place is not None:
             columns["same_place"] = ["yes" if one else None for one in judged.at_place[rows].tolist()]
+    if content.changes is not None:
+        columns["change"] = [content.changes.change[row] for row in rows]
     whole = ("query", "match", "rank", "matches", "inliers", "reverse_inliers", "support")
     shares = {"residual_before": 2, "residual_after": 2, "p_false": 4, "weight": 3, "score": 4, "spread": 3}
     columns |= {name: getattr(closures, name)[rows].tolist() for name in whole}

@@ -37,7 +37,7 @@
     const [, name, operator, number] = /^([a-z_]+)(<=|>=|<|>|=)(-?[\d.]+)$/.exec(term) ?? [];
     const of = (aliases[name] ?? [name]).filter((one) => columns[one]);
     if (of.length) return (row) => of.some((one) => columns[one][row] !== null && compare[operator](columns[one][row], +number));
-    return (row) => (columns.verdict[row] + " " + (decisions.get(pairOf(row))?.decision ?? "") + " true:" + columns.true?.[row]).includes(term);
+    return (row) => (columns.verdict[row] + " " + (decisions.get(pairOf(row))?.decision ?? "") + " true:" + columns.true?.[row] + " " + columns.change?.[row]).includes(term);
   };
   const order = () => {
     const wanted = $("filter").value, terms = $("search").value.toLowerCase().split(/\s+/).filter(Boolean).map(test);
@@ -182,7 +182,7 @@
     const size = clear(layer), by = $("colour").value, error = by === "path_error_m" ? data.map.error_m : null;
     for (const { kind, points } of paths) {
       if (kind === "gps") points.forEach((point) => disc(place(point), 2, colour("gps")));
-      else if (kind !== "after" || !error) trace(points, colour(kind), { before: [6, 4], truth: [2, 3] }[kind] ?? [], 2);
+      else if (kind !== "after" || !error) trace(points, colour(kind), { before: [6, 4], truth: [2, 3], other: [6, 3] }[kind] ?? [], 2);
       else for (let at = 0; at < last; at++) trace(spots.slice(at, at + 2), scaled(by, error[at]), [], 4);
     }
     drawAxes(...size);
