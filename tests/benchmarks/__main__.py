@@ -110,6 +110,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--set", nargs="+", default=[], metavar="A.B=C", help="settings of the drives of `batch`")
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=[], help="of `localize`")
     parser.add_argument("--questions", type=int, default=60, help="that `ask` asks at most, of each graph")
+    parser.add_argument("--runs", type=Path, nargs="+", default=[], help="finished runs that `ask` misplaces places of")
     arguments = parser.parse_args()
     unknown = sorted(set(arguments.what) - set(kinds))
     if unknown:
@@ -157,7 +158,7 @@ def _long(arguments: argparse.Namespace) -> Iterator[Figure]:
         with tempfile.TemporaryDirectory() as made:
             yield from condense(arguments.folder or Path(made))
     if "ask" in arguments.what:
-        yield from ask(arguments.questions, arguments.seeds)
+        yield from ask(arguments.questions, arguments.seeds, arguments.runs)
     if "localize" in arguments.what:
         with tempfile.TemporaryDirectory() as made:
             yield from localize(arguments.scenes, Path(made))

@@ -58,7 +58,8 @@ def test_options_that_verbs_share_stand_in_groups() -> None:
         for group in one._action_groups
     }
     assert {"--mask", "--start"} <= groups["the log"]
-    assert {"--threads", "--events"} == groups["execution"]
+    assert {"--threads"} == groups["execution"]
+    assert {"--json", "--debug", "--events"} == groups["output and errors"]
     assert {"--pipeline", "--set"} == groups["settings"]
     assert {"--jobs", "--engine"} <= groups["workers"]
     assert {"--library", "--map"} <= groups["options"]

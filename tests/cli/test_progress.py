@@ -63,6 +63,15 @@ def test_the_last_event_of_a_verb_that_fails_is_its_error(verb: Verb, tmp_path: 
     assert "Choose another with --events" in verb("demo", "-o", tmp_path, "--events", tmp_path / "no" / "e").error
 
 
+def test_work_of_one_stage_has_its_begin_and_end(verb: Verb, tmp_path: Path) -> None:
+    graph, path = tmp_path / "g.g2o", tmp_path / "events.jsonl"
+    graph.write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
+    assert verb("optimize", graph, "-o", tmp_path / "out.g2o", "--events", path).code == 0
+    assert [(one["event"], one.get("stage")) for one in told(path)] == [
+        ("started", None), ("stage_started", "solve"), ("stage_finished", "solve"), ("finished", None),
+    ]  # fmt: skip
+
+
 def test_rate_and_time_left_are_those_of_the_items(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress, "_EVENT_EVERY_S", 0.0)
     with Progress(namespace(tmp_path / "e")) as shown:

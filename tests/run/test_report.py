@@ -166,7 +166,7 @@ def test_lines_over_time_have_gaps_where_values_are_unknown() -> None:
 
 def test_the_drive_over_time(page: str, finished: Path) -> None:
     for name in ("Height, z in m", "Heading, yaw in degrees", "Speed in m/s", "Position, one sigma in m"):
-        assert f"<h3>{name}</h3>" in page
+        assert f"<figcaption>{name}</figcaption>" in page
     closures = tables.read_closures(finished / "closures.parquet")
     dots = re.findall(r'<path class="track dot (yes|no)" d="((?:M[\d. ]+h0){2,})"', page)
     used = closures.of(*USED)
@@ -200,7 +200,7 @@ def test_against_the_truth(verb: Verb, finished: Path, drive: Drive, tmp_path: P
     text = (tmp_path / "r.html").read_text()
     assert found["bytes"] == (tmp_path / "r.html").stat().st_size
     assert "Precision and recall" in text
-    assert "<h3>Error of keyframes in m</h3>" in text
+    assert "<figcaption>Error of keyframes in m</figcaption>" in text
     told = ledger(text)
     evaluation = verb("evaluate", finished, "--truth", drive.truth, "--json").json
     assert f"{evaluation['ate_after']['rmse_m']:.3f}" in text
@@ -420,51 +420,87 @@ def test_a_browser_fills_sorts_and_filters_the_ledger(browser: str, finished: Pa
     assert abs(found[5]) < 4  # the last row ends where the box does
 
 
-def test_a_closure_is_selected_from_map_and_ledger_and_decisions_are_downloaded(
-    browser: str, finished: Path, page: str, tmp_path: Path
+INNER_DOT = """() => {
+  const { width, height } = document.getElementById("map"), row = 4 * width;
+  const { data } = document.getElementById("map").getContext("2d").getImageData(0, 0, width, height);
+  const green = (at) => data[at] === 26 && data[at + 1] === 138 && data[at + 2] === 60;
+  for (let at = 3 * row; at < data.length - 3 * row; at += 4)
+    if ([0, 8, -8, 2 * row, -2 * row].every((by) => green(at + by)))
+      return { x: at % row / 4, y: Math.floor(at / row) };
+}"""
+"""Where on the map a dot of an accepted closure is."""
+
+
+def test_closures_are_selected_and_rejected_and_the_next_run_knows(
+    browser: str, finished: Path, drive: Drive, verb: Verb, tmp_path: Path
 ) -> None:
-    """The map finds a dot after it was moved and zoomed, keys decide, and a run reads the file that is downloaded."""
-    found = driven(
-        browser, page, tmp_path,
-        f"""{HELPERS} let text = null;
-        window.Blob = class extends Blob {{ constructor(parts, about) {{ super(parts, about); text = parts[0]; }} }};
-        set("filter", "accepted"); $("who").value = 'Jo "J", Doe'; $("reason").value = "a\\nb";
-        const first = values("row").slice(0, 4).map(Number);
-        shown()[0].click();
-        const fromLedger = $("closure-title").textContent, command = $("command").value, pictures = !$("query").hidden;
-        press("r"); press("j"); press("r"); press("j"); press("r"); press("u"); press("j"); press("a");
-        pointer("pointerdown", 5, 5); pointer("pointermove", 60, 45); pointer("pointerup", 60, 45);
-        $("map").dispatchEvent(new WheelEvent("wheel", {{ deltaY: -100, cancelable: true }}));
-        let fromMap = "";
-        for (let y = 0; y < 560 && !fromMap; y += 6) for (let x = 0; x < 900 && !fromMap; x += 6) {{
-          pointer("pointermove", x, y);
-          if (!$("tip").hidden) {{
-            const told = $("tip").textContent;
-            pointer("pointerdown", x, y); pointer("pointerup", x, y);
-            fromMap = [told, $("closure-title").textContent];
-          }}
-        }}
-        $("add-query").value = "40"; $("add-match").value = "2"; $("add").click();
-        $("download").click();
-        return [fromLedger, command, pictures, fromMap, $("decided").textContent, text, first,
-          document.documentElement.scrollWidth <= window.innerWidth];""",
-        "--window-size=1000,900",
-    )  # fmt: skip
-    ledger_title, command, pictures, (tip, map_title), decided, text, first, fits = found
-    numbers = re.fullmatch(r"Closure (\d+): keyframe (\d+) as a return to (\d+)", ledger_title)
-    assert numbers is not None
-    assert command.endswith(f"--closure {numbers[2]}:{numbers[3]}")
-    assert pictures
-    query, match = re.findall(r"\d+", tip)[:2]
-    assert f"keyframe {query} as a return to {match}" in map_title
-    assert decided == "4 decisions"
-    (tmp_path / "decisions.csv").write_text(text)
-    closures = tables.read_closures(finished / "closures.parquet")
-    pairs = [(int(closures.query[row]), int(closures.match[row])) for row in first]
-    decisions = read_decisions(tmp_path / "decisions.csv", tables.read_keyframes(finished / "keyframes.parquet")[0])
-    assert decisions.rejected == sorted(pairs[:2])
-    assert decisions.accepted == sorted([pairs[3], (40, 2)])
-    assert fits
+    """By mouse and keys as a person would: pan, filter, select from map, matrix, chart and ledger, reject, download."""
+    sync_api = pytest.importorskip("playwright.sync_api")
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    before = tables.read_closures(run / "closures.parquet")
+    said: list[str] = []
+    with sync_api.sync_playwright() as playwright, playwright.chromium.launch(
+        executable_path=browser, args=["--no-sandbox", "--disable-gpu"]
+    ) as chromium:  # fmt: skip
+        page = chromium.new_page(viewport={"width": 1000, "height": 900}, color_scheme="light")
+        page.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.goto((run / "report.html").as_uri())
+        page.select_option("#filter", "accepted")
+        page.fill("#search", "inliers>10")
+        at = before.of(Verdict.ACCEPTED) & (before.inliers > 10)
+        assert page.inner_text("#count") == f"{at.sum()} of {len(before)} candidates"
+        fitted = page.evaluate(INNER_DOT)
+        page.locator("#map").drag_to(
+            page.locator("#map"), source_position={"x": 5, "y": 5}, target_position={"x": 35, "y": 25}
+        )
+        moved = page.evaluate(INNER_DOT)
+        assert (moved["x"] - fitted["x"], moved["y"] - fitted["y"]) == (30, 20)
+        titles = []
+        for view in ("map", "3D", "time", "matrix"):
+            page.select_option("#view", view)
+            page.locator("#map").click(position=page.evaluate(INNER_DOT))
+            titles.append(page.inner_text("#closure-title"))
+            page.keyboard.press("j")
+            assert page.inner_text("#closure-title") != titles[-1]
+        chart = page.locator("svg.time").first
+        chart.click()
+        titles.append(page.inner_text("#closure-title"))
+        assert (chart.locator(".mark").get_attribute("d") or "").count("M") == 3  # pointer, query and match
+        page.locator("#rows tr[data-row]").first.click()
+        titles.append(page.inner_text("#closure-title"))
+        pairs = [tuple(map(int, re.findall(r"\d+", one))) for one in titles]
+        assert all(at[row] and [before.query[row], before.match[row]] == ends for row, *ends in pairs)
+        assert page.input_value("#command").endswith(f"--closure {pairs[-1][1]}:{pairs[-1][2]}")
+        assert page.is_visible("#query")
+        page.fill("#who", 'Jo "J", Doe')
+        page.fill("#reason", "another door")
+        page.locator("#closure-title").click()
+        wrong = []
+        for key in "rjrjrjru":
+            if key == "r":
+                wrong.append(re.findall(r"\d+", page.inner_text("#closure-title")))
+            page.keyboard.press(key)
+        page.fill("#add-query", "40")
+        page.fill("#add-match", "2")
+        page.click("#add")
+        assert page.inner_text("#decided") == "4 decisions"
+        with page.expect_download() as download:
+            page.click("#download")
+        download.value.save_as(tmp_path / "decisions.csv")
+        rejected = sorted((int(query), int(match)) for _, query, match in wrong[:3])
+        decisions = read_decisions(tmp_path / "decisions.csv", tables.read_keyframes(run / "keyframes.parquet")[0])
+        assert (decisions.accepted, decisions.rejected) == ([(40, 2)], rejected)
+        assert verb("run", drive.log, "-o", run, "--decisions", tmp_path / "decisions.csv").code == 0
+        page.goto((run / "report.html").as_uri())
+        page.select_option("#filter", "rejected_by_decision")
+        cells = page.locator("#rows tr[data-row]").all_inner_texts()
+        names = page.locator("#closures th").all_inner_texts()
+        column = {name: [line.split("\t")[names.index(name)] for line in cells] for name in names}
+        found = sorted(zip(map(int, column["query"]), map(int, column["match"]), strict=True))
+        assert (found, set(column["decision"])) == (rejected, {"reject"})
+    assert not said
 
 
 def test_an_answer_to_a_question_is_for_all_of_its_run(browser: str, page: str, tmp_path: Path) -> None:

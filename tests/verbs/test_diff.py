@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from typing import TYPE_CHECKING, Any
 
@@ -64,6 +65,20 @@ def test_what_differs_is_named_with_its_size(finished: Path, changed: Path) -> N
     back = diff(changed, finished)
     assert back["closures"]["gained"] == lost
     assert back["figures"]["seconds"][2] == pytest.approx(-found["figures"]["seconds"][2])
+
+
+def test_the_page_has_both_trajectories_and_what_changed(
+    finished: Path, changed: Path, verb: Callable[..., Said], tmp_path: Path
+) -> None:
+    assert verb("diff", changed, finished, "-o", tmp_path / "diff.html").code == 0
+    text = (tmp_path / "diff.html").read_text(encoding="utf-8")
+    assert "verify.min_matches" in text
+    audit = json.loads(text.partition('id="audit">')[2].partition("</script>")[0])
+    gained = diff(changed, finished)["closures"]["gained"]
+    assert audit["columns"]["change"].count("gained") == len(gained)
+    path = next(one["points"] for one in audit["map"]["paths"] if one["kind"] == "other")
+    apart = np.array(path) - next(one["points"] for one in audit["map"]["paths"] if one["kind"] == "after")
+    assert 0.5 < np.sqrt((apart**2).sum(1).mean()) < 2.0  # aligned: the step alone is left
 
 
 def test_a_limit_sets_the_exit_status(finished: Path, changed: Path, verb: Callable[..., Said]) -> None:

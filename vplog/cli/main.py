@@ -320,11 +320,11 @@ def _parser() -> argparse.ArgumentParser:
     said = common.add_argument_group("output and errors")
     flag(said, "--json", "print one JSON object")
     flag(said, "--debug", "show the traceback of an error")
+    option(said, "--events", parser.output_file, "FILE", "write progress as JSON lines, each as it happens")
     topics = parser.topic_options()
     threads = argparse.ArgumentParser(add_help=False)
     work = threads.add_argument_group("execution")
     option(work, "--threads", parser.at_least_one, "N", "threads (default: all cores)", default=available())
-    option(work, "--events", parser.output_file, "FILE", "write progress as JSON lines, each as it happens")
     settings = parser.settings_options("default", "default")
     verbs = root.add_subparsers(title="verbs", required=True, metavar="VERB")
 

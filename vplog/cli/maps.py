@@ -11,7 +11,7 @@ from vplog import api
 from vplog.cli import parser, printing
 from vplog.cli.parser import call, flag, option, place
 from vplog.cli.printing import print_result
-from vplog.cli.progress import Progress
+from vplog.cli.progress import Progress, one_stage
 from vplog.errors import plural
 from vplog.execution.execution import Execution
 
@@ -51,7 +51,9 @@ def remove_drives(arguments: argparse.Namespace) -> None:
     """Remove drives from a map."""
     from vplog.maps.remove import remove_drives as remove
 
-    print_result(arguments, remove(arguments.map, arguments.drives), printing.print_removed)
+    with one_stage(arguments, "remove"):
+        found = remove(arguments.map, arguments.drives)
+    print_result(arguments, found, printing.print_removed)
 
 
 def condense_map(arguments: argparse.Namespace) -> None:
@@ -107,7 +109,8 @@ def info_map(arguments: argparse.Namespace) -> None:
     from vplog.errors import ResultError
     from vplog.maps.info import describe_map
 
-    found = describe_map(arguments.map, check=arguments.check)
+    with one_stage(arguments, "check" if arguments.check else "read"):
+        found = describe_map(arguments.map, check=arguments.check)
     print_result(arguments, found, printing.print_map)
     if wrong := found["damaged_files"]:
         raise ResultError(

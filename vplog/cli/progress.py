@@ -228,6 +228,15 @@ class Progress:
             )
 
 
+@contextmanager
+def one_stage(arguments: argparse.Namespace, name: str) -> Iterator[None]:
+    """The progress of work that is one stage, of which only begin and end are known."""
+    with Progress(arguments) as progress:
+        progress(name, 0, 1)
+        yield
+        progress(name, 1, 1)
+
+
 def _minutes(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 99.5 else f"{seconds / 60:.0f} min"
 

@@ -14,7 +14,7 @@ from vplog import api
 from vplog.cli import parser, printing
 from vplog.cli.parser import call, flag, option, place
 from vplog.cli.printing import print_json, print_result
-from vplog.cli.progress import Progress
+from vplog.cli.progress import Progress, one_stage
 from vplog.errors import ResultError, SettingsError
 from vplog.execution.execution import Execution
 
@@ -41,16 +41,19 @@ _BINARY = ("geoparquet", "rrd")
 
 def evaluate(arguments: argparse.Namespace) -> None:
     """Evaluate a run, of one or several drives, against ground truth."""
-    print_result(arguments, call(api.evaluate, arguments), printing.print_evaluation)
+    with one_stage(arguments, "evaluate"):
+        found = call(api.evaluate, arguments)
+    print_result(arguments, found, printing.print_evaluation)
 
 
 def explain(arguments: argparse.Namespace) -> None:
     """Explain one candidate closure of a run in words and a picture of both frames."""
     from vplog.verbs.explain import explain as explain_closure
 
-    found = explain_closure(
-        arguments.run, arguments.closure, arguments.output, arguments.log, words_only=arguments.no_picture
-    )
+    with one_stage(arguments, "explain"):
+        found = explain_closure(
+            arguments.run, arguments.closure, arguments.output, arguments.log, words_only=arguments.no_picture
+        )
     print_result(arguments, found, printing.print_explanation)
 
 
@@ -58,14 +61,17 @@ def ask(arguments: argparse.Namespace) -> None:
     """Ask about the closures of a run whose verdicts are doubtful and would move its map most."""
     from vplog.verbs.ask import ask as ask_about
 
-    print_result(arguments, ask_about(arguments.run, arguments.count, arguments.output), printing.print_questions)
+    with one_stage(arguments, "ask"):
+        found = ask_about(arguments.run, arguments.count, arguments.output)
+    print_result(arguments, found, printing.print_questions)
 
 
 def optimize(arguments: argparse.Namespace) -> None:
     """Solve a pose graph from a g2o file, planar or spatial, robust against false loop closures."""
     from vplog.verbs.optimize import optimize as optimize_graph
 
-    done = optimize_graph(arguments.graph, arguments.output, arguments.method, arguments.certify)
+    with one_stage(arguments, "solve"):
+        done = optimize_graph(arguments.graph, arguments.output, arguments.method, arguments.certify)
     print_result(arguments, done.record, printing.print_optimised)
 
 
@@ -73,23 +79,28 @@ def report(arguments: argparse.Namespace) -> None:
     """Write the report of a finished run again, against a truth where one is given."""
     from vplog.verbs.report import report as write_report
 
-    found = write_report(
-        arguments.run, arguments.output, arguments.truth, arguments.log, parser.topics_of(arguments),
-        _truth_options(arguments), Execution(arguments.threads),
-    )  # fmt: skip
+    with one_stage(arguments, "report"):
+        found = write_report(
+            arguments.run, arguments.output, arguments.truth, arguments.log, parser.topics_of(arguments),
+            _truth_options(arguments), Execution(arguments.threads),
+        )  # fmt: skip
     print_result(arguments, found, lambda found: print(found["report"]))
 
 
 def diff(arguments: argparse.Namespace) -> None:
     """Compare two runs of one drive: settings, closures, trajectories, scores and times."""
-    from vplog.verbs.diff import check_limits, exceeded
+    from vplog.verbs.diff import check_limits, exceeded, write_page
     from vplog.verbs.diff import diff as diff_runs
 
     runs = [*([arguments.baseline] if arguments.baseline else []), *arguments.runs]
     if len(runs) != 2:
         arguments.refuse(f"two runs are compared, BASELINE RUN or RUN --baseline BASELINE, and {len(runs)} were given")
     check_limits(arguments.fail_on)
-    found = diff_runs(runs[0], runs[1], arguments.truth, parser.topics_of(arguments), _truth_options(arguments))
+    with one_stage(arguments, "compare"):
+        truth = arguments.truth, parser.topics_of(arguments), _truth_options(arguments)
+        found = diff_runs(runs[0], runs[1], *truth)
+        if arguments.output is not None:
+            write_page(arguments.output, found, *truth)
     print_result(arguments, found, printing.print_diff)
     if sentences := exceeded(found, arguments.fail_on):
         raise ResultError(" ".join(sentences))
@@ -185,6 +196,8 @@ def add_results(
     option(sub, "--baseline", place, "RUN", "the run to compare with (default: the first of two)")
     option(sub, "--truth", str, "FILE.tum|gps|auto", _TRUTH)
     _add_truth_options(sub)
+    text = "also write the report of RUN with what changed: closures gained and lost, both trajectories"
+    option(sub, "-o --output", parser.output_file, "FILE.html", text)
     text = "exit status 1 where a change fails this, as 'recall<-0.01' or 'seconds>20%%'; repeatable"
     option(sub, "--fail-on", str, "LIMIT", text, action="append", default=[])
     sub = add("export", export, threads)

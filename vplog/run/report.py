@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
 
 from vplog.data import USED, Trajectory
 from vplog.errors import GraphError, ResultError
 from vplog.geometry import se3
 from vplog.graph.joint import spaced_apart
 from vplog.results import mcap_read, tables
+from vplog.results.html import mapping
 from vplog.results.previews import jpeg, shrink
 from vplog.results.report.page import Content, Tracks, false_closures, page
 from vplog.run.figures.run_figures import earth_of
@@ -23,7 +25,8 @@ from vplog.storage.scratch import replacing
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.results.report.page import Question, TruthComparison
+    from vplog.data import Ints
+    from vplog.results.report.page import Changes, Question, TruthComparison
 
 _log = logging.getLogger(__name__)
 
@@ -38,13 +41,14 @@ def write_report(
     path: Path | None = None,
     judged: TruthComparison | None = None,
     pictures: dict[int, bytes] | None = None,
+    changes: Changes | None = None,
 ) -> Path:
     """Write the page of the run in `folder`, whose run.json holds `record`, as `path` (report.html in it where None).
 
     `pictures` are JPEGs of closures by row, where result.mcap has none. Raises ResultError.
     """
     path = path or folder / "report.html"
-    text = page(gather(folder, record, judged, pictures))
+    text = page(replace(gather(folder, record, judged, pictures), changes=changes))
     with replacing(path) as stream:
         stream.write(text.encode())
     return path
@@ -94,7 +98,7 @@ def gather(
     covariance = tables.read_keyframe_covariance(folder / "keyframes.parquet")
     closures = tables.read_closures(folder / "closures.parquet")
     content = Content(record, tracks, covariance, closures, tracks.found.pictures or pictures or {}, judged=judged)
-    content = replace(content, questions=_questions(folder, content))
+    content = replace(content, questions=_questions(folder, content), references=_references(folder, content))
     return replace(content, thumbnails=_thumbnails(folder, content))
 
 
@@ -106,6 +110,20 @@ def _questions(folder: Path, content: Content) -> list[Question]:
     except (GraphError, ResultError) as error:
         _log.warning("No questions are asked: %s", error)
         return []
+
+
+def _references(folder: Path, content: Content) -> Ints | None:
+    """Numbers (N, K) of the references of each keyframe, as descriptors.parquet has them; None of other recognisers."""
+    column, _ = tables.read_descriptors(folder / "descriptors.parquet")
+    count = mapping(content.record.get("library")).get("references")
+    at = column.type.get_field_index("references") if pa.types.is_struct(column.type) else -1
+    if at < 0 or not isinstance(count, int) or len(column) != len(content.tracks.keyframes.stamp_ns):
+        return None
+    found = column.field(at)
+    if found.null_count or not pa.types.is_fixed_size_list(found.type):
+        return None
+    numbers = found.flatten().to_numpy().reshape(len(column), -1).astype(np.int64)
+    return np.where(numbers < count, numbers, -1)
 
 
 def _thumbnails(folder: Path, content: Content) -> dict[int, bytes]:

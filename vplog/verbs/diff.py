@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,13 +13,16 @@ from vplog.errors import ResultError, SettingsError, nearest
 from vplog.geometry import se3
 from vplog.results import run_record, tables
 from vplog.results.html import mapping
+from vplog.results.report.page import Changes
+from vplog.run.report import write_report
 from vplog.verbs.evaluate_run import TruthOptions, evaluate
+from vplog.verbs.report import judge
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from vplog import logs
+    from vplog.data import Floats
 
 _LIMIT = re.compile(r"([a-z_]+)([<>]=?)([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d{1,2})?)(%?)")
 _SCORES = {
@@ -86,6 +90,30 @@ def diff(
     }
 
 
+def write_page(
+    path: Path,
+    found: dict[str, Any],
+    truth: str | None = None,
+    topics: logs.TopicChoice | None = None,
+    options: TruthOptions | None = None,
+) -> None:
+    """The report of the run that `diff` has compared, with the baseline's trajectory and what it says.
+
+    Raises ResultError or TruthError.
+    """
+    baseline, run = Path(found["baseline"]), Path(found["run"])
+    record = run_record.read_single_run(run)
+    known, poses, everything = _same_stamps((baseline, run))
+    run_from_baseline, _ = se3.umeyama(known[:, :3, 3], poses[:, :3, 3])
+    changes = {tuple(pair): kind for kind in ("gained", "lost") for pair in found["closures"][kind]}
+    closures = tables.read_closures(run / "closures.parquet")
+    stamps = tables.read_keyframes(run / "keyframes.parquet")[0].stamp_ns
+    pairs = zip(stamps[closures.query].tolist(), stamps[closures.match].tolist(), strict=True)
+    at = se3.transform(run_from_baseline, everything[:, :3, 3])
+    judged = judge(run, record, truth, topics, options or TruthOptions()) if truth is not None else None
+    write_report(run, record, path, judged, changes=Changes(found, at, [changes.get(pair) for pair in pairs]))
+
+
 def check_limits(limits: Sequence[str]) -> None:
     """Raises SettingsError for the first limit that is none: a figure, < <= > or >=, and a number or percentage."""
     for limit in limits:
@@ -127,17 +155,22 @@ def _closures(folder: Path) -> dict[tuple[int, int], None]:
 
 def _moved(folders: Sequence[Path]) -> dict[str, float | int]:
     """Distance and angle between the trajectories of two runs where they have the same stamps."""
+    known, poses, _ = _same_stamps(folders)
+    aligned, _ = se3.umeyama(poses[:, :3, 3], known[:, :3, 3])
+    apart = se3.between(known, aligned @ poses)
+    found: dict[str, float | int] = {"samples": len(known)}
+    for unit, values in (("m", np.linalg.norm(apart[:, :3, 3], axis=1)), ("deg", np.degrees(se3.angle(apart)))):
+        found |= {f"rmse_{unit}": float(np.sqrt((values**2).mean())), f"max_{unit}": float(values.max())}
+    return found
+
+
+def _same_stamps(folders: Sequence[Path]) -> tuple[Floats, Floats, Floats]:
+    """Poses (S, 4, 4) of the trajectories of two runs where they have the same stamps, and all of the first."""
     baseline, run = (tables.read_trajectory(folder / "trajectory.parquet")[0] for folder in folders)
     stamps, one, other = np.intersect1d(baseline.stamp_ns, run.stamp_ns, return_indices=True)
     if len(stamps) < 3:
         raise ResultError(f"{folders[0]} and {folders[1]} share {len(stamps)} stamps. Give two runs of one drive.")
-    known, poses = baseline.world_from_body[one], run.world_from_body[other]
-    aligned, _ = se3.umeyama(poses[:, :3, 3], known[:, :3, 3])
-    apart = se3.between(known, aligned @ poses)
-    found: dict[str, float | int] = {"samples": len(stamps)}
-    for unit, values in (("m", np.linalg.norm(apart[:, :3, 3], axis=1)), ("deg", np.degrees(se3.angle(apart)))):
-        found |= {f"rmse_{unit}": float(np.sqrt((values**2).mean())), f"max_{unit}": float(values.max())}
-    return found
+    return baseline.world_from_body[one], run.world_from_body[other], baseline.world_from_body
 
 
 def _change(before: Any, after: Any) -> float | None:

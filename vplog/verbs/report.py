@@ -76,6 +76,9 @@ def judge(
     path = se3.transform(world_from_truth, known.world_from_body[during][:, :3, 3])
     error_m = np.full(len(keyframes.stamp_ns), np.nan)
     error_m[at.known] = np.linalg.norm(se3.transform(world_from_truth, true) - solved, axis=1)
+    closures = tables.read_closures(folder / "closures.parquet")
+    seen = se3.between(at.world_from_body[closures.match], at.world_from_body[closures.query])
+    apart_m = np.linalg.norm((seen - closures.match_from_query)[:, :3, 3], axis=1)
     return TruthComparison(
         Path(shown(truth)).name,
         found.record,
@@ -86,6 +89,7 @@ def judge(
         judged.curves,
         judged.at_place,
         error_m,
+        np.where(at.known[closures.match] & at.known[closures.query], apart_m, np.nan),
     )
 
 

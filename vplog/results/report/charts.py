@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from vplog.data import Floats
+    from vplog.data import Floats, Ints
 
     Label = tuple[str, str, str, str]
 
@@ -23,6 +23,9 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 52.0, 12.0, 28.0, 44.0
 _ACROSS, _DOWN = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
 _BINS, _QUANTILE = 40, 0.995
 """Bins of a distribution; values above that quantile stand in the last one."""
+PLOT = (_LEFT, _ACROSS, _TOP, _TOP + _DOWN)
+"""Left end, width, top and foot of the plot in a chart."""
+_SECONDS = "seconds into the drive"
 MOST_POINTS = 2000
 """Points of a path: more than a screen has pixels across adds nothing but bytes."""
 
@@ -45,20 +48,17 @@ def subsampled(rows: NDArray[Any], most: int) -> NDArray[Any]:
     return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]
 
 
-def map_view(points: Floats) -> tuple[Floats, str]:
-    """(2, 3) from the world to the right and up of the map, and its axes in words.
+def map_view(points: Floats) -> Floats:
+    """(3, 3) from the world to the right, up and out of the map.
 
-    From above where the ground is flat, else without the shortest axis; the longer of both goes to the right, which
-    turns the map by 90 degrees and never mirrors it.
+    From above where the ground is flat, else along the shortest axis; the longer of both others goes to the right,
+    which turns the map by 90 degrees and never mirrors it.
     """
     size = np.ptp(points, axis=0)
     gone = 2 if size[2] <= 1.2 * size.min() else int(np.argmin(size))
     # against the axis left out: (x, y) from above, (y, z) from the front, (z, x) from the side
-    right, up = (gone + 1) % 3, (gone + 2) % 3
-    axes, names = np.eye(3), "xyz"
-    if size[right] >= size[up]:
-        return axes[[right, up]], f"{names[right]} to the right, {names[up]} up"
-    return np.stack([axes[up], -axes[right]]), f"{names[up]} to the right, {names[right]} down"
+    right, up, out = np.eye(3)[[(gone + 1) % 3, (gone + 2) % 3, gone]]
+    return np.stack([right, up, out] if size @ right >= size @ up else [up, -right, out])
 
 
 def histogram(above: Floats, below: Floats, label: str, thresholds: Sequence[tuple[str, float]] = ()) -> Chart | None:
@@ -110,7 +110,26 @@ def over_time(lines: Sequence[tuple[str, Floats, Floats]], label: str, end_s: fl
         return None
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     named = [(kind, np.column_stack([times, values])) for kind, times, values in lines]
-    return _lines(named, label, (0.0, end_s), "seconds into the drive", (low, high if high > low else low + 1.0), "")
+    return _lines(named, label, (0.0, end_s), _SECONDS, (low, high if high > low else low + 1.0), "")
+
+
+def coverage(references: Ints, times: Floats, label: str, end_s: float) -> Chart:
+    """Stretches of the drive that each reference explains, those used first at the bottom.
+
+    `references` (N, K) are their numbers, negative for none, at `times` (N,) s.
+    """
+    rows = subsampled(np.arange(len(times)), MOST_POINTS)
+    used, first = np.unique(references[rows], return_index=True)
+    used = used[np.argsort(first, kind="stable")]
+    used, ends = used[used >= 0], np.append(times[rows[1:]], end_s)
+    lines = []
+    for at, one in enumerate(used.tolist()):
+        has = np.concatenate([[False], (references[rows] == one).any(1), [False]])
+        starts, stops = np.flatnonzero(has[1:] & ~has[:-1]), np.flatnonzero(has[:-1] & ~has[1:]) - 1
+        y = _TOP + _DOWN * (1.0 - (at + 0.5) / len(used))
+        for x, to in (np.column_stack([times[rows[starts]], ends[stops]]) / end_s * _ACROSS + _LEFT).tolist():
+            lines.append(f"M{x:.1f} {y:.1f}H{to:.1f}")
+    return _with_axes(label, [("after", "".join(lines))], [], (0.0, end_s), _SECONDS, (0.0, float(len(used))))
 
 
 def _lines(

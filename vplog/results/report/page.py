@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog.data import USED, Verdict
+from vplog.errors import plural
 from vplog.geometry import geodesy, se3
 from vplog.results.html import figure, mapping, render
 from vplog.results.report import charts
 
 if TYPE_CHECKING:
-    from vplog.data import Bools, Closures, Floats, Keyframes, Trajectory
+    from vplog.data import Bools, Closures, Floats, Ints, Keyframes, Trajectory
     from vplog.results.geo import Earth
     from vplog.results.mcap_read import McapContent
 
@@ -27,6 +28,8 @@ _MOST_LOSSES = 100
 """Rows of the table of losses; run.json has them all."""
 _MOST_PICTURE_BYTES = 6_000_000
 """Bytes of all pictures together: the page then stays below 10 MB, base64 and table included."""
+_DOUBTFUL_SIGMA = 6.5
+"""Residuals of that much are red."""
 _MOST_SIGMA = 10.0
 """Residuals over time are drawn up to it: those of false closures are often a thousand."""
 _MOST_USED = 6
@@ -64,6 +67,9 @@ class TruthComparison:
     """(C,) candidates whose two frames show one place."""
     error_m: Floats | None = None
     """(N,) distance of each keyframe to the aligned truth, NaN where that does not cover it."""
+    closure_error_m: Floats | None = None
+    """(C,) distance between where a candidate places its query, from its match, and where the truth does; NaN without
+    a pose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +101,18 @@ class Question:
 
 
 @dataclass(frozen=True, eq=False)
+class Changes:
+    """A run compared with another one of its drive, the baseline."""
+
+    found: dict[str, Any]
+    """The record of `vplog diff --json`."""
+    path: Floats
+    """(T, 3) m, the baseline's in the frame of the run."""
+    change: list[str | None]
+    """By row of the ledger: `gained` or `lost`, None for what did not change."""
+
+
+@dataclass(frozen=True, eq=False)
 class Content:
     """A finished run."""
 
@@ -109,7 +127,10 @@ class Content:
     thumbnails: dict[int, bytes] = field(default_factory=dict)
     """Small JPEG of a keyframe by its row."""
     judged: TruthComparison | None = None
+    changes: Changes | None = None
     questions: list[Question] = field(default_factory=list)
+    references: Ints | None = None
+    """(N, K) numbers of the references that explain each keyframe, negative for none; None without references."""
 
 
 def page(content: Content) -> str:
@@ -128,6 +149,7 @@ def page(content: Content) -> str:
         losses=[_loss(one, content) for one in _list(record.get("losses")) if isinstance(one, dict)][:_MOST_LOSSES],
         map_lines=legend,
         judged=judged,
+        changes=content.changes and _changes(content.changes),
         questions=_questions(content),
         truth=_truth(judged) if judged else [],
         curves=charts.curves(judged.curves) if judged and judged.curves else None,
@@ -156,6 +178,21 @@ def _tiles(content: Content) -> list[tuple[str, str]]:
         (f"{figure(totals.get('seconds'))} s", "to compute"),
         (f"{figure(totals.get('peak_memory_mb'), 0)} MB", "peak memory"),
     ]
+
+
+def _changes(changes: Changes) -> dict[str, Any]:
+    """Tables of settings, figures and seconds of stages, and sentences on the closures."""
+    found, rows = changes.found, changes.change
+    lost = len(found["closures"]["lost"])
+    gone = lost - rows.count("lost")
+    return {
+        "baseline": found["baseline"],
+        "closures": f"{plural(len(found['closures']['gained']), 'closure')} gained, {lost} lost"
+        + (f", {gone} of which are no candidates of this run" if gone else ""),
+        "settings": [(name, *map(str, pair)) for name, pair in found["settings"].items()],
+        "figures": [(name, *(figure(one, 3) for one in triple)) for name, triple in found["figures"].items()],
+        "seconds": [(name, *map(figure, pair)) for name, pair in found["seconds"].items()],
+    }
 
 
 def _questions(content: Content) -> list[list[Any]]:
@@ -217,7 +254,11 @@ def _over_time(content: Content) -> list[tuple[str, charts.Chart]]:
         ],
         "error of keyframes in m": [] if error_m is None else [("truth", keyframe_s, error_m)],
     }
-    drawn = [(name, charts.over_time(lines, name, float(sample_s[-1]))) for name, lines in series.items() if lines]
+    end_s = float(sample_s[-1])
+    drawn = [(name, charts.over_time(lines, name, end_s)) for name, lines in series.items() if lines]
+    if content.references is not None:
+        name = "references that explain a keyframe, by first use"
+        drawn.append((name, charts.coverage(content.references, keyframe_s, name, end_s)))
     return [(name, chart) for name, chart in drawn if chart is not None]
 
 
@@ -246,7 +287,8 @@ def false_closures(content: Content) -> Bools:
 
 
 def _map(content: Content) -> tuple[list[tuple[str, str]], dict[str, Any]]:
-    """The legend, and paths and keyframes seen along the shortest axis, in m to the right and up."""
+    """The legend, and paths and keyframes in m to the right, up and out of the map, which lies along the shortest
+    axis."""
     closures, judged, position = content.closures, content.judged, content.tracks.world_from_body[:, :3, 3]
     false = false_closures(content)
     groups = [
@@ -261,18 +303,25 @@ def _map(content: Content) -> tuple[list[tuple[str, str]], dict[str, Any]]:
     ]
     if judged is not None and judged.path is not None:
         paths.insert(0, ("truth", "truth", judged.path))
+    if content.changes is not None:
+        paths.insert(0, ("other", "baseline, optimised", content.changes.path))
     gps, earth = content.tracks.found.gps, content.tracks.earth
     if gps is not None and earth is not None:
         fixes_m = se3.transform(se3.inverse(earth.enu_from_world), geodesy.local_enu(gps).enu_m)
         paths.insert(0, ("gps", "GPS fixes", fixes_m))
-    view, axes = charts.map_view(np.concatenate([points for _, _, points in paths]))
+    view = charts.map_view(np.concatenate([points for _, _, points in paths]))
+    axes = dict(zip("xyz", view.T.tolist(), strict=True))
+    if earth is not None:
+        axes["N"] = (view @ earth.enu_from_world[1, :3]).tolist()
     legend = [(kind, name) for kind, name, points in paths if len(points)]
     legend += [(f"dot {kind}", name) for kind, name, rows in groups if rows.any()]
     flat = [
         {"kind": kind, "points": np.round(charts.subsampled(points, charts.MOST_POINTS) @ view.T, 3).tolist()}
         for kind, _, points in paths
     ]
-    return legend, {"axes": axes, "paths": flat, "keyframes": np.round(position @ view.T, 3).tolist()}
+    error = None if judged is None or judged.error_m is None else _rounded(judged.error_m, 3)
+    seen = np.round(position @ view.T, 3).tolist()
+    return legend, {"axes": axes, "paths": flat, "keyframes": seen, "error_m": error}
 
 
 def _truth(judged: TruthComparison) -> list[list[str]]:
@@ -305,9 +354,14 @@ def _audit(content: Content, drawn: dict[str, Any], pictures: list[int]) -> dict
     """Data of the page's script; `pictures` are the ledger rows with a picture in the page."""
     closures, log = content.closures, content.record.get("log")
     order = np.lexsort((-closures.score.astype(np.float64), ~closures.of(*USED)))
+    columns = _columns(content, sorted(order[:_MOST_ROWS].tolist()))
+    after, (left, across, top, foot) = content.tracks.after.stamp_ns, charts.PLOT
     command = f"vplog run {shlex.quote(str(log))} -o RUN --decisions decisions.csv"
     return {
-        "columns": _columns(content, sorted(order[:_MOST_ROWS].tolist())),
+        "columns": columns,
+        "scales": _scales(columns, drawn["error_m"]),
+        "time": {"start": str(after[0]), "end_s": (int(after[-1]) - int(after[0])) / 1e9 or 1.0}
+        | {"left": left, "across": across, "top": top, "foot": foot},
         "used": [verdict.value for verdict in USED],
         "sentences": {verdict.value: verdict.sentence for verdict in Verdict},
         "stamps": list(map(str, content.tracks.keyframes.stamp_ns.tolist())),  # beyond 2^53, where JavaScript rounds
@@ -320,6 +374,16 @@ def _audit(content: Content, drawn: dict[str, Any], pictures: list[int]) -> dict
     }
 
 
+def _scales(columns: dict[str, list[Any]], error_m: list[float | None] | None) -> dict[str, tuple[float, float]]:
+    """By what dots or, with `path_error_m`, the path may be coloured: the values of green and red."""
+    found = {"residual_after": (0.0, _DOUBTFUL_SIGMA)}
+    for name, values in (("score", columns["score"]), ("error_m", columns.get("error_m")), ("path_error_m", error_m)):
+        if known := [one for one in values or [] if one is not None]:
+            most = round(float(np.quantile(known, 0.95)), 2) or 1.0
+            found[name] = (most, 0.0) if name == "score" else (0.0, most)
+    return found
+
+
 def _columns(content: Content, rows: list[int]) -> dict[str, list[Any]]:
     """Values of these rows by the name of their column; those of the truth beside the verdict, in view on a phone."""
     closures, judged = content.closures, content.judged
@@ -329,11 +393,15 @@ def _columns(content: Content, rows: list[int]) -> dict[str, list[Any]]:
         columns["true"] = [one if known else None for one, known in zip(true, judged.known[rows], strict=True)]
         if judged.at_place is not None:
             columns["same_place"] = ["yes" if one else None for one in judged.at_place[rows].tolist()]
+    if content.changes is not None:
+        columns["change"] = [content.changes.change[row] for row in rows]
     whole = ("query", "match", "rank", "matches", "inliers", "reverse_inliers", "support")
     shares = {"residual_before": 2, "residual_after": 2, "p_false": 4, "weight": 3, "score": 4, "spread": 3}
     columns |= {name: getattr(closures, name)[rows].tolist() for name in whole}
     columns |= {name: _rounded(getattr(closures, name)[rows], digits) for name, digits in shares.items()}
     columns["metres"] = _rounded(np.linalg.norm(closures.match_from_query[rows, :3, 3], axis=1), 2)
+    if judged is not None and judged.closure_error_m is not None:
+        columns["error_m"] = _rounded(judged.closure_error_m[rows], 2)
     columns["reverse_inliers"] = [value if value >= 0 else None for value in columns["reverse_inliers"]]
     return columns
 

@@ -37,7 +37,7 @@
     const [, name, operator, number] = /^([a-z_]+)(<=|>=|<|>|=)(-?[\d.]+)$/.exec(term) ?? [];
     const of = (aliases[name] ?? [name]).filter((one) => columns[one]);
     if (of.length) return (row) => of.some((one) => columns[one][row] !== null && compare[operator](columns[one][row], +number));
-    return (row) => (columns.verdict[row] + " " + (decisions.get(pairOf(row))?.decision ?? "") + " true:" + columns.true?.[row]).includes(term);
+    return (row) => (columns.verdict[row] + " " + (decisions.get(pairOf(row))?.decision ?? "") + " true:" + columns.true?.[row] + " " + columns.change?.[row]).includes(term);
   };
   const order = () => {
     const wanted = $("filter").value, terms = $("search").value.toLowerCase().split(/\s+/).filter(Boolean).map(test);
@@ -80,75 +80,124 @@
     if (last > first && is > 0 && Math.abs(is - tall) > .01) { tall = is; drawLedger(); }
   };
 
-  // The map: metres to px by `view`; every closure is a dot of constant size at its query
-  const canvas = $("map"), layer = document.createElement("canvas"), tip = $("tip"), xy = data.map.keyframes;
-  let view = null, fitted = true, hovered = -1, pen = null;
-  const place = ([x, y]) => [view.x + x * view.scale, view.y - y * view.scale];
+  // The stage: points in m to the right, up and out of the map, turned about their middle and seen from straight ahead.
+  // Every closure is a dot of constant size, at its query; in the matrix at both of its keyframes
+  const canvas = $("map"), layer = document.createElement("canvas"), tip = $("tip"), last = stamps.length - 1;
+  let view = null, spots = [], paths = [], fitted = true, hovered = -1, moment = -1, pen = null;
+  const is = (kind) => $("view").value === kind, flat = () => is("map") || is("matrix");
+  const place = ([x, y, z]) => {
+    const right = x - view.middle[0], up = y - view.middle[1], [c, s] = [Math.cos(view.turn), Math.sin(view.turn)];
+    const away = Math.sin(view.tilt) * (s * right + c * up) + Math.cos(view.tilt) * (z - view.middle[2]);
+    return [view.x + view.scale * (c * right - s * up), view.y - view.scale * away];
+  };
+  const range = (points, at) => points.reduce(([low, high], p) => [Math.min(low, p[at]), Math.max(high, p[at])], [Infinity, -Infinity]);
   const fit = () => {
     fitted = true;
-    const all = data.map.paths.flatMap((path) => path.points), width = canvas.clientWidth, height = canvas.clientHeight;
-    const low = [0, 1].map((at) => all.reduce((least, p) => Math.min(least, p[at]), Infinity));
-    const high = [0, 1].map((at) => all.reduce((most, p) => Math.max(most, p[at]), -Infinity));
-    const scale = Math.min((width - 60) / Math.max(high[0] - low[0], 1e-6), (height - 80) / Math.max(high[1] - low[1], 1e-6));
-    view = { scale, x: width / 2 - scale * (low[0] + high[0]) / 2, y: height / 2 + scale * (low[1] + high[1]) / 2 };
+    const all = [...spots, ...paths.flatMap((path) => path.points)], width = canvas.clientWidth, height = canvas.clientHeight;
+    Object.assign(view, { scale: 1, x: 0, y: 0 });
+    const seen = all.map(place), [low, high] = range(seen, 0), [top, foot] = range(seen, 1);
+    view.scale = Math.min((width - 80) / Math.max(high - low, 1e-6), (height - 90) / Math.max(foot - top, 1e-6));
+    view.x = width / 2 - view.scale * (low + high) / 2; view.y = height / 2 - view.scale * (top + foot) / 2;
+  };
+  const look = () => {
+    const known = data.map.keyframes, extent = Math.max(...[0, 1].map((at) => { const [low, high] = range(known, at); return high - low; }));
+    spots = is("matrix") ? known.map((_, at) => [at, at, 0])
+      : is("time") ? known.map(([x, y], at) => [x, y, .7 * extent * at / Math.max(last, 1)]) : known;
+    paths = is("matrix") ? [] : is("time") ? [{ kind: "after", points: spots }] : data.map.paths;
+    const middle = [0, 1, 2].map((at) => { const [low, high] = range(spots, at); return (low + high) / 2; });
+    view = { middle, ...(flat() ? { turn: 0, tilt: Math.PI / 2 } : { turn: .5, tilt: .6 }) };
+    fit();
   };
   const zoom = (factor, x, y) => {
     fitted = false;
-    view = { scale: view.scale * factor, x: x + (view.x - x) * factor, y: y + (view.y - y) * factor };
+    view.scale *= factor; view.x = x + (view.x - x) * factor; view.y = y + (view.y - y) * factor;
     drawMap();
   };
-  const dotOf = (row) => place(xy[columns.query[row]]);
+  const dotOf = (row) => place(is("matrix") ? [columns.query[row], columns.match[row], 0] : spots[columns.query[row]]);
   const style = getComputedStyle(document.documentElement), colour = (name) => style.getPropertyValue("--" + name);
-  const trace = (points, name, dashes, wide) => {
+  const trace = (points, paint, dashes, wide) => {
     pen.beginPath(); points.forEach((point) => pen.lineTo(...place(point)));
-    pen.strokeStyle = colour(name); pen.setLineDash(dashes); pen.lineWidth = wide; pen.stroke(); pen.setLineDash([]);
+    pen.strokeStyle = paint; pen.setLineDash(dashes); pen.lineWidth = wide; pen.stroke(); pen.setLineDash([]);
   };
-  const disc = ([x, y], radius, name) => {
-    pen.beginPath(); pen.arc(x, y, radius, 0, 7); pen.fillStyle = colour(name); pen.fill();
+  const disc = ([x, y], radius, paint) => {
+    pen.beginPath(); pen.arc(x, y, radius, 0, 7); pen.fillStyle = paint; pen.fill();
+  };
+  const word = (text, x, y) => {
+    pen.strokeStyle = colour("paper"); pen.lineWidth = 4; pen.strokeText(text, x, y);
+    pen.fillStyle = colour("ink"); pen.fillText(text, x, y);
+  };
+  const scaled = (name, value) => {
+    const [good, bad] = data.scales[name], share = Math.min(Math.max((value - good) / (bad - good), 0), 1);
+    return value === null || value === undefined ? colour("before") : "hsl(" + 130 * (1 - share) + " 75% 45%)";
   };
   const clear = (onto) => {
     const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
-    onto.width = width * ratio; onto.height = height * ratio;
-    pen = onto.getContext("2d"); pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    onto.width = Math.max(width * ratio, 1); onto.height = Math.max(height * ratio, 1);
+    pen = onto.getContext("2d"); pen.setTransform(ratio, 0, 0, ratio, 0, 0); pen.font = "13px system-ui";
     return [width, height];
   };
-  const highlight = () => {  // what is hovered and selected, on the map as it was drawn
-    const size = clear(canvas);
+  const highlight = () => {  // what is hovered and selected, on the map as it was drawn, and on the charts
+    const size = clear(canvas), ink = colour("ink");
     pen.drawImage(layer, 0, 0, ...size);
+    if (moment >= 0) disc(place(spots[moment]), 6, colour("truth"));
     for (const row of [hovered, selected]) if (row >= 0) {
-      trace([xy[columns.match[row]], xy[columns.query[row]]], "ink", [], 2);
-      for (const end of ["match", "query"]) disc(place(xy[columns[end][row]]), 6, "ink");
+      const ends = ["match", "query"].map((end) => spots[columns[end][row]]);
+      trace(is("matrix") ? [ends[0], [columns.query[row], columns.match[row], 0], ends[1]] : ends, ink, [], 2);
+      for (const at of is("matrix") ? [dotOf(row)] : ends.map(place)) disc(at, 6, ink);
+    }
+    const at = [moment, ...["query", "match"].map((end) => columns[end][selected] ?? -1)].filter((keyframe) => keyframe >= 0);
+    for (const one of marks) one.setAttribute("d", at.map((keyframe) => "M" + (left + across * seconds[keyframe] / end_s) + " " + top + "V" + foot).join(""));
+  };
+  const round = (most) => {  // the largest 1, 2 or 5 times a power of ten up to it
+    const power = 10 ** Math.floor(Math.log10(most));
+    return [5, 2, 1].find((one) => one * power <= most) * power;
+  };
+  const drawAxes = (width, height) => {
+    if (is("matrix")) {
+      trace([[0, 0, 0], [last, last, 0]], colour("before"), [6, 4], 1);
+      const step = Math.max(round(100 / view.scale), 1);
+      for (let at = 0; at <= last; at += step) {
+        const [x, y] = place([at, at, 0]);
+        if (x > 60) word(at, x - 8, height - 8);
+        if (y < height - 30) word(at, 8, y + 4);
+      }
+      word("query to the right, match up", 8, 18);
+      return;
+    }
+    const metres = round(120 / view.scale);
+    pen.fillStyle = colour("ink"); pen.fillRect(16, height - 16, metres * view.scale, 2);
+    word(+metres.toPrecision(1) + " m", 16, height - 22);
+    const origin = place(view.middle), foot = [width - 60, height - 60];
+    for (const [name, axis] of Object.entries(data.map.axes)) {
+      const long = name === "N" ? 38 : 26, tip = place(axis.map((value, at) => view.middle[at] + value));
+      const [x, y] = [0, 1].map((at) => long * (tip[at] - origin[at]) / view.scale);
+      if (Math.hypot(x, y) < 8 || (is("time") && axis[2] > .5)) continue;
+      pen.beginPath(); pen.moveTo(...foot); pen.lineTo(foot[0] + x, foot[1] + y);
+      pen.strokeStyle = colour(name === "N" ? "no" : "quiet"); pen.lineWidth = 1.5; pen.stroke();
+      word(name, foot[0] + 1.3 * x - 4, foot[1] + 1.3 * y + 4);
     }
   };
   const drawMap = () => {
-    if (!view) fit();
-    const [, height] = clear(layer);
-    for (const { kind, points } of data.map.paths) {
-      if (kind === "gps") points.forEach((point) => disc(place(point), 2, "gps"));
-      else trace(points, kind, { before: [6, 4], truth: [2, 3] }[kind] ?? [], 2);
+    if (!view) look();
+    const size = clear(layer), by = $("colour").value, error = by === "path_error_m" ? data.map.error_m : null;
+    for (const { kind, points } of paths) {
+      if (kind === "gps") points.forEach((point) => disc(place(point), 2, colour("gps")));
+      else if (kind !== "after" || !error) trace(points, colour(kind), { before: [6, 4], truth: [2, 3], other: [6, 3] }[kind] ?? [], 2);
+      else for (let at = 0; at < last; at++) trace(spots.slice(at, at + 2), scaled(by, error[at]), [], 4);
     }
-    const residual = (row) => "hsl(" + Math.max(0, 130 - 20 * columns.residual_after[row]) + " 75% 45%)";
+    drawAxes(...size);
     for (const kind of ["before", "yes", "no", "false"]) for (const row of rows) {
       if (kindOf(row) !== kind) continue;
-      const ends = [xy[columns.match[row]], xy[columns.query[row]]], name = { false: "no" }[kind] ?? kind;
+      const paint = colour({ false: "no" }[kind] ?? kind);
       pen.globalAlpha = kind === "yes" || kind === "before" ? .35 : 1;
-      trace(ends, name, kind === "no" ? [3, 2] : [], kind === "false" ? 3 : 1);
+      if (!is("matrix")) trace([spots[columns.match[row]], spots[columns.query[row]]], paint, kind === "no" ? [3, 2] : [], kind === "false" ? 3 : 1);
       pen.globalAlpha = 1;
-      disc(dotOf(row), kind === "before" ? 2.5 : 4, name);
-      if ($("colour").value === "residual" && columns.residual_after[row] !== null) {
-        pen.fillStyle = residual(row); pen.fill();
-      }
+      disc(dotOf(row), kind === "before" ? 2.5 : 4, columns[by] && by !== "verdict" ? scaled(by, columns[by][row]) : paint);
     }
-    pen.fillStyle = colour("ink"); pen.font = "13px system-ui";
-    for (const [at, word] of [[0, "start"], [xy.length - 1, "end"]]) {
-      const [x, y] = place(xy[at]);
-      disc([x, y], 5, "after");
-      pen.strokeStyle = colour("paper"); pen.lineWidth = 4; pen.strokeText(word, x + 8, y - 8);
-      pen.fillStyle = colour("ink"); pen.fillText(word, x + 8, y - 8);
+    for (const [at, text] of is("matrix") ? [] : [[0, "start"], [last, "end"]]) {
+      const [x, y] = place(spots[at]);
+      disc([x, y], 5, colour("after")); word(text, x + 8, y - 8);
     }
-    const most = 120 / view.scale, power = 10 ** Math.floor(Math.log10(most)), metres = [5, 2, 1].find((one) => one * power <= most) * power;
-    pen.fillStyle = colour("ink"); pen.fillRect(16, height - 16, metres * view.scale, 2);
-    pen.fillText(+metres.toPrecision(1) + " m (" + data.map.axes + ")", 16, height - 22);
     highlight();
   };
   const nearest = (event, after = -1) => {  // of several under the pointer the one behind `after`
@@ -186,7 +235,11 @@
       const apart = (one) => Math.hypot(one.clientX - other.clientX, one.clientY - other.clientY);
       zoom(apart(event) / Math.max(apart(before), 1), other.clientX - left, other.clientY - top);
     } else if (moved > 4) {
-      fitted = false; view.x += event.clientX - before.clientX; view.y += event.clientY - before.clientY; drawMap();
+      const [x, y] = [event.clientX - before.clientX, event.clientY - before.clientY];
+      fitted = false;
+      if (flat() || event.shiftKey) { view.x += x; view.y += y; }
+      else { view.turn += x / 150; view.tilt = Math.min(Math.max(view.tilt + y / 150, 0), Math.PI / 2); }
+      drawMap();
     }
   });
   const lifted = (event) => {
@@ -197,6 +250,24 @@
   canvas.addEventListener("wheel", (event) => {
     event.preventDefault(); zoom(Math.exp(-event.deltaY / 400), event.offsetX, event.offsetY);
   }, { passive: false });
+
+  // Charts over time: the pointer's moment is shown on all of them and on the map, a click selects the closure nearest
+  const { start, end_s, left, across, top, foot } = data.time, seconds = stamps.map((stamp) => Number(BigInt(stamp) - BigInt(start)) / 1e9);
+  const marks = [...document.querySelectorAll("svg.time")].map((svg) => {
+    const mark = document.createElementNS(svg.namespaceURI, "path"), apart = (row) => Math.abs(columns.query[row] - moment);
+    mark.setAttribute("class", "mark"); svg.append(mark);
+    svg.addEventListener("pointermove", (event) => {
+      const box = svg.getBoundingClientRect(), share = ((event.clientX - box.left) / box.width * svg.viewBox.baseVal.width - left) / across;
+      const after = seconds.findIndex((one) => one >= share * end_s);
+      moment = after < 0 ? last : after; highlight();
+    });
+    svg.addEventListener("pointerleave", () => { moment = -1; highlight(); });
+    svg.addEventListener("click", () => {
+      const least = rows.reduce((most, row) => Math.min(most, apart(row)), Infinity), near = rows.filter((row) => apart(row) === least);
+      if (near.length) select(near[(near.indexOf(selected) + 1) % near.length]);
+    });
+    return mark;
+  });
 
   // The selected closure
   const show = () => {
@@ -218,6 +289,9 @@
     $("no-picture").hidden = [columns.query[row], columns.match[row]].every((at) => thumbnails[at]);
     $("full").hidden = !pictures.includes(columns.row[row]); $("full").href = "#closure-" + columns.row[row];
   };
+  $("query").addEventListener("load", (event) => {  // wide pictures one above the other
+    event.target.parentElement.classList.toggle("stacked", event.target.naturalWidth > 2 * event.target.naturalHeight);
+  });
   const select = (row, run = [row]) => {  // an answer is for all of a run where a question was selected
     selected = row; answered = run;
     const at = rows.indexOf(row);
@@ -269,6 +343,7 @@
     order();
   }));
   $("filter").addEventListener("change", order); $("search").addEventListener("input", order); $("colour").addEventListener("change", drawMap);
+  $("view").addEventListener("change", () => { look(); drawMap(); });
   for (const [id, factor] of [["zoom-in", 1.5], ["zoom-out", 1 / 1.5]]) $(id).addEventListener("click", () => zoom(factor, canvas.clientWidth / 2, canvas.clientHeight / 2));
   $("fit").addEventListener("click", () => { fit(); drawMap(); });
   window.addEventListener("resize", () => { if (fitted) fit(); drawMap(); drawLedger(); });
