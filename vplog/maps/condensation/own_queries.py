@@ -15,7 +15,7 @@ from vplog.errors import ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.maps.condensation.redundancy import OwnQueries
-from vplog.maps.joining.frames import joint_components, keyframe_poses
+from vplog.maps.joining.joint_record import joint_components, keyframe_poses
 from vplog.maps.search.exact import Answers, best_places, merge, no_answers
 from vplog.maps.search.index import place_keyframes, read_column, update_index
 from vplog.maps.storage.layout import PICTURES
