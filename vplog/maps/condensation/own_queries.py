@@ -107,11 +107,8 @@ def search_of(
     """The search for single views in a map, by its index where the recogniser has one, and warnings."""
     if isinstance(state, CodedState):
         parts, warnings = update_index(store, {drive: about[drive] for drive in places.drives}, state, execution)
-
-        def by_index(views: Sequence[Any], top: int) -> Answers:
-            return best_places(parts, state, views, top, Execution(execution.threads))
-
-        return by_index, warnings
+        threads = Execution(execution.threads)
+        return lambda views, top: best_places(parts, state, views, top, threads), warnings
     return search_in_memory(places, state), []
 
 
