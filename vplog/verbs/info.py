@@ -153,7 +153,7 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
 
 
 def _computed(log: Log, topics: TopicChoice) -> str:
-    """What a run computes the odometry from, as `source_of`; empty where it cannot."""
+    """Source of a run's odometry, as `source_of`; empty without one."""
     with suppress(LogError):
         return source_of(log, topics)
     return ""

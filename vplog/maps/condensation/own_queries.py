@@ -131,8 +131,8 @@ def search_in_memory(places: OwnPlaces, state: PlaceState) -> Search:
 
 
 @dataclass(frozen=True, eq=False)
-class AskedPlaces:
-    """Places that ask for themselves, and what the answers say of the others."""
+class OwnAnswers:
+    """Answers of a map to its own places as queries."""
 
     place: Ints
     """(Q,) places that are answered rightly."""
@@ -141,9 +141,9 @@ class AskedPlaces:
     """(N,) places that `PASSES` later drives came by, of which none has it among its best."""
 
 
-def ask(
+def query_own_places(
     places: OwnPlaces, search: Search, state: PlaceState, distance_m: float, execution: Execution = Execution()
-) -> AskedPlaces:
+) -> OwnAnswers:
     """Look for every place among the others; an answer within the distance is right."""
     first, same = places.first, places.same_place(distance_m)
     matched, best = np.zeros(len(places.drive), np.bool_), dict[int, Ranking]()
@@ -174,7 +174,7 @@ def ask(
         lambda query, top: looked_for(place[query : query + 1], top)[0],
         lambda query, others: same(int(place[query]), others),
     )
-    return AskedPlaces(place, queries, (later_passes(places, distance_m) >= PASSES) & ~matched)
+    return OwnAnswers(place, queries, (later_passes(places, distance_m) >= PASSES) & ~matched)
 
 
 def later_passes(places: OwnPlaces, distance_m: float) -> Ints:
