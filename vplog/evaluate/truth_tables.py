@@ -37,37 +37,43 @@ def read_table(path: Path) -> tuple[list[str], list[tuple[str, str, str]]]:
 
     Raises TruthError with the number of the first line that does not fit.
     """
-    header, rows = list[str](), list[tuple[str, str, str]]()
-    for where, fields in read_lines(path):
-        if not header:
-            header = fields
-            if header not in (["query", "match"], ["image", "label"]):
-                raise TruthError(f"{where} is not the header. {_CSV}")
-        elif len(fields) != 2 or not fields[0]:
-            raise TruthError(f"{where} does not hold two fields. {_CSV}")
-        else:
-            rows.append((fields[0], fields[1], where))
+    lines = read_lines(path, (["query", "match"], ["image", "label"]))
+    _, header = next(lines, ("", []))
+    rows = [(first, second, where) for where, (first, second) in lines]
+    for first, _, where in rows:
+        if not first:
+            raise TruthError(f"{where} has an empty first field. {_CSV}")
     if not rows:
         raise TruthError(f"{path} holds no pair. {_CSV}")
     return header, rows
 
 
-def read_lines(path: Path, form: str = _CSV, error: type[VplogError] = TruthError) -> Iterator[tuple[str, list[str]]]:
-    """The place in the file and the cells of each line of a CSV that is not blank; `form` ends each message.
+def read_lines(
+    path: Path, headers: Sequence[list[str]], form: str = _CSV, error: type[VplogError] = TruthError
+) -> Iterator[tuple[str, list[str]]]:
+    """The place in the file and the cells of each line of a CSV that is not blank: its header, one of these, and others
+    as long. `form` ends each message.
 
-    Raises `error` with the first line that is too long, or where the file cannot be read.
+    Raises `error` with the first line that does not fit, or where the file cannot be read.
     """
+    number, width = 0, 0
     try:
         if path.stat().st_size > _FILE_BYTES:
             raise error(f"{path} is larger than {_FILE_BYTES // 2**20} MB, so it is no table of pairs. {form}")
         with path.open(encoding="utf-8-sig", newline="") as lines:
-            number = 0
             while line := lines.readline(_LINE_LIMIT):
                 number += 1
                 if len(line) >= _LINE_LIMIT:
                     raise error(f"{path}:{number} is longer than {_LINE_LIMIT} characters. {form}")
-                if line.strip():
-                    yield f"{path}:{number}", [cell.strip() for cell in next(csv.reader([line]))]
+                if not line.strip():
+                    continue
+                cells = [cell.strip() for cell in next(csv.reader([line]))]
+                if not width and cells not in headers:
+                    raise error(f"{path}:{number} is not the header. {form}")
+                if width and len(cells) != width:
+                    raise error(f"{path}:{number} does not hold {width} fields. {form}")
+                width = len(cells)
+                yield f"{path}:{number}", cells
     except OSError as fault:
         raise error(f"Cannot read {path}: {fault.strerror}. {form}{nearest_path(path)}") from None
     except (UnicodeDecodeError, csv.Error):
