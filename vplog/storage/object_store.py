@@ -144,9 +144,9 @@ def plain_errors() -> Iterator[None]:
 
 
 def _why(text: str) -> str:
-    for pattern, said in _WHY:
+    for pattern, message in _WHY:
         if found := re.search(pattern, text):
-            line = said.format(*(one or "" for one in found.groups()))
+            line = message.format(*(one or "" for one in found.groups()))
             printable = "".join(one if one.isprintable() else " " for one in without_secrets(line))
             return printable[:400].rstrip(". ") or "it is refused"
     return text
