@@ -41,7 +41,7 @@ class Lock:
     lost: str = ""
     """Why it is not held any more."""
     version: objects.Version | None = None
-    """ETag or generation of the object as it was last written."""
+    """Of the object as it was last written."""
     released: threading.Event = field(default_factory=threading.Event)
 
     def check(self) -> None:
