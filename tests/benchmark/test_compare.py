@@ -603,7 +603,7 @@ def test_answers_of_a_file_stand_beside_the_methods(traversals: tuple[Path, Path
         (None, "No such file"),
         ("", "answers none of 16 frames"),
         ("a,b\n1,2\n", r":1 is not the header"),
-        ("query,match\n1\n", r":2 has 1 cells"),
+        ("query,match\n1\n", r":2 does not hold 2 fields"),
         ("query,match\n1,16\n", r":2: '16' is no frame of dusk, which has 16"),
         ("query,match\n-1,2\n", r"'-1' is no frame of day"),
         ("query,match\nx.png,2\n", r"'x.png' is no frame of day"),

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from tests.benchmarks.measure import Figure
 from vplog import logs
 from vplog.execution.execution import Execution
-from vplog.maps.condensation.own_queries import OwnPlaces, ask, search_in_memory
+from vplog.maps.condensation.own_queries import OwnPlaces, query_own_places, search_in_memory
 from vplog.maps.condensation.redundancy import remove_redundant
 from vplog.maps.search.query import describe_log
 from vplog.pipeline import load_pipeline
@@ -88,7 +88,7 @@ def _curves(state: PlaceState, columns: list[pa.Array], frames: list[Ints], aski
     """R@1 of one walk in a map of the others, by how the map was thinned and the share that stays."""
     own = [number for number in range(len(columns)) if number != asking]
     places = _places([WALKS[number] for number in own], [columns[number] for number in own], [frames[n] for n in own])
-    asked = ask(places, search_in_memory(places, state), state, TOLERANCE)
+    asked = query_own_places(places, search_in_memory(places, state), state, TOLERANCE)
     count = len(places.drive)
     removable = np.isin(np.arange(count), asked.place)
     removal = remove_redundant(asked.queries, places.drive, np.cumsum(places.steps_m()), removable, asked.faded, count)

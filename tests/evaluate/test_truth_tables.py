@@ -99,8 +99,8 @@ def test_a_table_of_names(tmp_path: Path) -> None:
     [
         ("0,1\n", ":1 is not the header"),
         ("query;match\n0;1\n", ":1 is not the header"),
-        ("query,match\n0,1\n2\n", ":3 does not hold two fields"),
-        ("query,match\n0,1\n,2\n", ":3 does not hold two fields"),
+        ("query,match\n0,1\n2\n", ":3 does not hold 2 fields"),
+        ("query,match\n0,1\n,2\n", ":3 has an empty first field"),
         ("query,match\n\n0,1.5\n", ":3: '1.5' is neither a frame number nor an image of the map night"),
         ("query,match\n-1,1\n", ":2: '-1' is neither a frame number nor an image of the query day"),
         ("query,match\n²,1\n", ":2: '²' is neither"),
@@ -205,7 +205,7 @@ class _Attack:
     ("values", "said"),
     [
         (ragged((_Attack(), [1])), "asks for 'open'"),
-        (ragged((0, [0.5])), "BINFLOAT"),
+        (ragged((0, [0.5])), "does not hold whole numbers alone"),
         (ragged((0, ["a"])), "does not hold whole numbers alone"),
         (ragged((0, [4])), "4 is not a frame of the map, whose 4 frames"),
         (ragged((-1, [0])), "-1 is not a frame of the query"),

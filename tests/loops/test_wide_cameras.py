@@ -50,7 +50,7 @@ def verified(camera: Camera, half_view_deg: float, seed: int) -> tuple[Pose, flo
     distance, _ = pose_refinement.agreement(pose.match_from_query, matches)
     error = se3.log(se3.between(truth, pose.match_from_query))
     off_axis = np.degrees(np.arctan(np.hypot(*there[rows].T)))
-    return pose, float(error @ np.linalg.solve(pose.covariance, error)), off_axis, distance < verify_metric._CHI2_2
+    return pose, float(error @ np.linalg.solve(pose.covariance, error)), off_axis, distance < verify_metric.CHI2_2
 
 
 @pytest.mark.parametrize(("model", "half_view_deg"), [("none", 40.0), ("equidistant", 40.0), ("equidistant", 85.0)])

@@ -52,7 +52,7 @@ def test_pairs_are_named_by_row_or_stamp_in_either_order(tmp_path: Path) -> None
         ("", "is empty"),
         ("a,b\n", ":1 is not the header"),
         (f"{HEADER}30,2,reject\n", ":2 does not hold 6 fields"),
-        (f"{HEADER}30,2,perhaps,,,\n", ":2 does not hold 6 fields with a decision"),
+        (f"{HEADER}30,2,perhaps,,,\n", ":2 does not hold a decision in the third field"),
         (f"{HEADER}30,40,reject,,,\n", ":2: '40' is no keyframe of ring. Its rows are 0..39"),
         (f"{HEADER}-1,2,reject,,,\n", "'-1' is no keyframe"),
         (f"{HEADER}2.0,9,reject,,,\n", "'2.0' is no keyframe"),

@@ -433,7 +433,7 @@ def test_nothing_to_resume_is_one_line(log: Path, whole: Path, tmp_path: Path, v
         log=str(tmp_path / "gone")
     )
     assert "lacks log" in resume(log=None)
-    assert "without --resume" in resume(topics=None)
+    assert "lacks topics" in resume(topics=None)
     assert "lacks library.from" in resume(library={})
     assert "no_such_setting" in resume(settings={"no_such_setting": 1})
     assert "is not a library" in resume(library={"from": str(tmp_path / "lost")})

@@ -11,7 +11,7 @@ come best first.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -45,7 +45,8 @@ def fill_scores(settings: AnswersSettings, query: Traversal, other: Traversal, s
     does not fit. Frames that are not compared are passed over."""
     scores[:] = np.nan
     sides, ranks, count = (_Frames(query), _Frames(other)), dict[int, int](), 0
-    for where, line in _lines(Path(settings.file)):
+    headers = ["query", "match"], ["query", "match", "score"]
+    for where, line in islice(read_lines(Path(settings.file), headers, _FORMAT, SettingsError), 1, None):
         rows = [side.row(cell, where) for side, cell in zip(sides, line, strict=False)]
         if rows[0] is None or rows[1] is None:
             continue
@@ -57,20 +58,6 @@ def fill_scores(settings: AnswersSettings, query: Traversal, other: Traversal, s
     if not count:
         raise SettingsError(f"{settings.file} answers none of {len(query)} frames. {_FORMAT}")
     return count
-
-
-def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Place and cells of each line behind the header."""
-    width = 0
-    for where, cells in read_lines(path, _FORMAT, SettingsError):
-        if not width:
-            if cells not in (["query", "match"], ["query", "match", "score"]):
-                raise SettingsError(f"{where} is not the header. {_FORMAT}")
-            width = len(cells)
-        elif len(cells) != width:
-            raise SettingsError(f"{where} has {len(cells)} cells. {_FORMAT}")
-        else:
-            yield where, cells
 
 
 class _Frames:

@@ -531,7 +531,7 @@ def print_comparison(found: dict[str, Any]) -> None:
             scores = method["sequence"]
             rows.append((f"  L={scores['length']}", *_shares(scores, shares, nowhere), "", "", ""))
     print_table(("method", *titles, "encode\nms", "query\nms"), rows)
-    print_protocol(found["protocol"])
+    print_line("protocol", found["protocol"]["text"])
     warn(found["warnings"])
 
 
@@ -541,10 +541,6 @@ def _shares(scores: dict[str, Any], names: Iterable[str], nowhere: bool) -> list
     if found and nowhere:
         found += [scores["open_set"][name] for name in ("auroc", "recall_at_1_percent_false_alarms")]
     return [f"{value:.3f}" for value in found]
-
-
-def print_protocol(protocol: dict[str, Any]) -> None:
-    print_line("protocol", protocol["text"])
 
 
 def _print_best_answers(answers: list[dict[str, Any]] | str) -> None:
@@ -586,8 +582,8 @@ def print_study(out: Path, found: dict[str, Any]) -> None:
         rows = done["ablations"]["rows"]
         table = [(row["name"], row["setting"], *(f"{row[f'{score}_change']:+.3f}" for score in scores)) for row in rows]
         print_table(("bobb without", "setting", *titles), table)
-    for protocol in {one["text"]: one for one in found["protocol"]}.values():
-        print_protocol(protocol)
+    for text in dict.fromkeys(one["text"] for one in found["protocol"]):
+        print_line("protocol", text)
     warn(found["warnings"])
     figures = sum(len(one["figures"]) for one in done.values()) // 2
     print_line(f"{out}:", f"study.json, and {figures} figures as PNG and SVG")

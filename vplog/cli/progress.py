@@ -82,7 +82,7 @@ class _Stage:
     done: int = 0
     seconds: float | None = None
     """s that it took, None until it is finished."""
-    told_s: float = 0.0
+    reported_s: float = 0.0
 
     def rate(self) -> float:
         """Items a second, 0 where unknown."""
@@ -93,7 +93,8 @@ class _Stage:
 
 
 class Progress:
-    """What is called with (stage, items done, items in all), from any thread, within `with`."""
+    """Progress on a terminal or as JSON lines: called with (stage, items done, items in all), from any thread, within
+    `with`."""
 
     def __init__(
         self, arguments: argparse.Namespace, stages: tuple[str, ...] = (), earlier: Path | None = None
@@ -118,7 +119,7 @@ class Progress:
 
     def __enter__(self) -> Progress:
         self._bars.start()
-        threading.Thread(target=self._tell, daemon=True).start()
+        threading.Thread(target=self._heartbeat, daemon=True).start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
@@ -149,7 +150,7 @@ class Progress:
         stage.done, stage.total = done, total
         if done >= total and not step:
             self._finish(stage)
-        elif done and time.monotonic() - stage.told_s >= _EVENT_EVERY_S:
+        elif done and time.monotonic() - stage.reported_s >= _EVENT_EVERY_S:
             self._write_progress(stage)
 
     def _finish_steps(self) -> None:
@@ -167,7 +168,7 @@ class Progress:
         self._events.write(event, stage=stage.name, number=number, of=of, **fields)
 
     def _write_progress(self, stage: _Stage) -> None:
-        stage.told_s = time.monotonic()
+        stage.reported_s = time.monotonic()
         eta = {"eta_s": stage.eta_s(), "total_eta_s": self._total_eta_s(stage)}
         rounded = {name: None if value is None else round(value, 1) for name, value in eta.items()}
         rate = round(stage.rate(), 3)
@@ -194,7 +195,7 @@ class Progress:
             left = max(faster * self._earlier.get(stage.name, 0.0) - (time.monotonic() - stage.began_s), 0.0)
         return left + faster * sum(self._earlier.get(name, 0.0) for name in later)
 
-    def _tell(self) -> None:
+    def _heartbeat(self) -> None:
         """Events where a stage has been silent, and lines where there are no bars, until the end."""
         lines_s = time.monotonic()
         while not self._end.wait(min(_HEARTBEAT_S, LINE_EVERY_S)):
@@ -202,7 +203,7 @@ class Progress:
                 running = [stage for stage in self._stages.values() if stage.seconds is None]
                 now = time.monotonic()
                 for stage in running:
-                    if now - stage.told_s >= _HEARTBEAT_S:
+                    if now - stage.reported_s >= _HEARTBEAT_S:
                         self._write_progress(stage)
                 if running and self._line_by_line and now - lines_s >= LINE_EVERY_S:
                     lines_s = now

@@ -35,7 +35,7 @@ _FOLDERS = ("colmap", "nerfstudio")
 _FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd", "foxglove-layout", *_FOLDERS)
 """Formats of export.py, here too since that imports numpy."""
 _VIEWERS = ("rerun", "report", "foxglove")
-"""Those of open_run.py, here too since that imports numpy."""
+"""Viewers of open_run.py, here too since that imports numpy."""
 _BINARY = ("geoparquet", "rrd")
 
 

@@ -277,7 +277,7 @@ def descend(problem: Problem, start: Floats, tolerance: float = _CONVERGED) -> t
     for _ in range(_STEPS):
         gradient, hessian, gauss_newton = _derivatives(problem, point)
         while damping <= _MOST_DAMPING:
-            step, promised = _step(_damped(hessian, damping), gradient, problem.order)
+            step, promised = _step(hessian + sparse.diags_array(damping * hessian.diagonal()), gradient, problem.order)
             if promised <= 0 and hessian is not gauss_newton:
                 hessian = gauss_newton
                 continue
@@ -316,10 +316,6 @@ def _derivatives(problem: Problem, point: Floats) -> tuple[Floats, sparse.csr_ar
         for A in (problem.certificate_matrix(point), problem.M)
     )
     return stacked.T @ by_X.T.ravel(), newton, gauss_newton
-
-
-def _damped(hessian: sparse.csr_array, damping: float) -> sparse.csr_array:
-    return hessian + sparse.diags_array(damping * hessian.diagonal())
 
 
 def _step(hessian: sparse.csr_array, gradient: Floats, order: Ints) -> tuple[Floats, float]:

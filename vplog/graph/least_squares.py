@@ -10,8 +10,7 @@ import numpy as np
 from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.normal_equations import edge_costs, normal_equations
-from vplog.graph.sparse.cholesky import OPEN
-from vplog.graph.sparse.linear import Supernodes
+from vplog.graph.sparse.cholesky import OPEN, Cholesky
 from vplog.graph.sparse.workers import Workers
 
 if TYPE_CHECKING:
@@ -131,16 +130,16 @@ class Objective:
     def _measured(self) -> list[Positions]:
         return [one for one in (self.positions, self.verticals) if one is not None]
 
-    def factorised(self, matrix: Blocks, damping: float) -> Supernodes:
+    def factorised(self, matrix: Blocks, damping: float) -> Cholesky:
         """Pose 0 is held, and the first pose of each part that no edge of positive weight joins to it."""
         diagonal, axes = matrix.diagonal.copy(), np.arange(matrix.diagonal.shape[1])
         held = np.concatenate([[0], self.factors.loose(self.weight)]).astype(np.int64)
         diagonal[:, axes, axes] += damping
         sigma = GAUGE_SIGMA if self.positions is None else _FREE_SIGMA
         diagonal[held[:, None], axes, axes] += 1.0 / sigma**2
-        return Supernodes.of(self.factors.elimination(self.weight > 0), matrix._replace(diagonal=diagonal))
+        return Cholesky.of(self.factors.elimination(self.weight > 0), matrix._replace(diagonal=diagonal))
 
-    def information(self, poses: Floats) -> Supernodes:
+    def information(self, poses: Floats) -> Cholesky:
         """The information matrix at `poses` (N, 4, 4). Raises GraphError where these are not determined."""
         return self.factorised(self.linearised(se3.between(poses[:1], poses))[0], 0.0)
 

@@ -21,7 +21,7 @@ from vplog.graph.marginals import edge_covariances, joint_covariance
 if TYPE_CHECKING:
     from vplog.data import Floats, Int32s, Ints, PoseGraph
     from vplog.graph.factors import Factors
-    from vplog.graph.sparse.linear import Supernodes
+    from vplog.graph.sparse.cholesky import Cholesky
 
 _ALONE = 1e-9
 """Least redundancy of a closure, so that no quotient is infinite."""
@@ -68,7 +68,7 @@ def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Ten
     )
 
 
-def cost_together(factors: Factors, weight: Floats, poses: Floats, tree: Supernodes, loops: Ints) -> float:
+def cost_together(factors: Factors, weight: Floats, poses: Floats, tree: Cholesky, loops: Ints) -> float:
     """By how much chi-square falls without all of a few closures, to first order; `tree` of Objective.information()."""
     size = len(AXES[factors.graph.dimension])
     error, Jr_inv = _errors(factors.graph, poses, loops)

@@ -10,6 +10,7 @@ import numpy as np
 from vplog.geometry import se3
 from vplog.graph.build import AXES, parts
 from vplog.graph.normal_equations import normal_equations
+from vplog.graph.sparse.selected_inversion import inverse_blocks, joint_inverse
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from vplog.data import Bools, Floats, Ints
     from vplog.graph.factors import Factors
     from vplog.graph.least_squares import Objective
-    from vplog.graph.sparse.linear import Supernodes
+    from vplog.graph.sparse.cholesky import Cholesky
 
 _STEP = 1e-4
 """Step of a scale for differences: far above rounding, and errors of edges are linear in it."""
@@ -39,7 +40,7 @@ def edge_covariances(objective: Objective, poses: Floats, edges: Ints) -> Floats
     cost about as much as two steps of its solution. Raises GraphError where the poses are not determined.
     """
     graph = objective.factors.graph
-    aa, ab, bb = objective.information(poses).inverse_blocks(graph.a[edges], graph.b[edges])
+    aa, ab, bb = inverse_blocks(objective.information(poses), graph.a[edges], graph.b[edges])
     axes = AXES[graph.dimension]
     Ad = se3.adjoint(se3.between(poses[graph.b[edges]], poses[graph.a[edges]]))[:, axes][:, :, axes]
     mixed = Ad @ ab
@@ -57,7 +58,7 @@ def pose_covariances(objective: Objective, poses: Floats, scales: Sequence[Share
     a, b = graph.a[on], graph.b[on]
     ends = np.concatenate([a, b])
     information = objective.information(poses)
-    aa, _, bb = information.inverse_blocks(a, b)
+    aa, _, bb = inverse_blocks(information, a, b)
     result = np.full((len(poses), *aa.shape[1:]), np.nan)
     result[ends] = np.concatenate([aa, bb])
     if scales:
@@ -99,14 +100,14 @@ def positions_redundancy(objective: Objective, poses: Floats) -> float:
     return 3.0 * float(used.sum()) - float(np.einsum("fij,fji->", positions.Omega[used], spread))
 
 
-def joint_covariance(factors: Factors, information: Supernodes, poses: Floats, edges: Ints) -> Floats:
+def joint_covariance(factors: Factors, information: Cholesky, poses: Floats, edges: Ints) -> Floats:
     """Covariance (K d, K d) of a_from_b of a few edges together, each in the frame of its b."""
     graph = factors.graph
     axes = AXES[graph.dimension]
     size = len(axes)
     ends = np.stack([graph.a[edges], graph.b[edges]], axis=1)
     nodes = np.unique(ends).astype(np.int64)
-    covariance = information.joint_inverse(nodes)
+    covariance = joint_inverse(information, nodes)
     Ad = se3.adjoint(se3.between(poses[ends[:, 1]], poses[ends[:, 0]]))[:, axes][:, :, axes]
     jacobian = np.zeros((len(edges) * size, len(covariance)))
     for row, (a, b) in enumerate(np.searchsorted(nodes, ends).tolist()):

@@ -32,7 +32,7 @@ _FAMILIES = 8
 _LEAST, _POSES = 4, 40_000
 """Fewer are turned, but so many at least, where the graph has so many poses that each takes long."""
 _POWER = 0.1
-"""Of the evidence: the closures of a run, some ten, see the same things and err together."""
+"""Power of the evidence: the closures of a run, some ten, see the same things and err together."""
 _KEPT = 0.005
 """Least probability that what is in the solution is false, whatever the evidence says: false closures that agree with
 each other make it. The share of false ones kept that the back end is held to on random worlds."""
@@ -64,7 +64,7 @@ def questions(graph: PoseGraph, weight: Floats, log_odds: Floats, decided: Bools
     chain, claimed = OdometryChain.of(graph), Factors.of(graph)
     now = hypothesis_of(claimed, weight, graph.world_from_body, Sigmas())
     best: dict[int, Question] = {}
-    for asked, turned in _sets(graph, weight, decided, chain):
+    for closures, turned in _sets(graph, weight, decided, chain):
         other = np.array(weight)
         other[turned] = 1.0 - weight[turned]
         start = now.poses if other[~graph.odometry].any() else chain.poses
@@ -73,8 +73,9 @@ def questions(graph: PoseGraph, weight: Floats, log_odds: Floats, decided: Bools
             odds = _POWER * (then.log_evidence - now.log_evidence)
             odds += float(log_odds[turned].mean()) * (1.0 if used else -1.0)
             p_wrong = max(1.0 / (1.0 + math.exp(min(-odds, 700.0))), _KEPT if used else 0.0)
-            one = Question(asked, p_wrong, _moved_m(now.poses, then.poses))
-            best[int(asked[0])] = max(best.get(int(asked[0]), one), one, key=lambda one: one.expected_m)
+            one = Question(closures, p_wrong, _moved_m(now.poses, then.poses))
+            first = int(closures[0])
+            best[first] = max(best.get(first, one), one, key=lambda one: one.expected_m)
     return sorted(best.values(), key=lambda one: (-one.expected_m, int(one.edges[0])))
 
 

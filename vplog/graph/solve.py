@@ -23,17 +23,6 @@ if TYPE_CHECKING:
     from vplog.data import Floats, PoseGraph
     from vplog.stages import Optimiser
 
-__all__ = [
-    "CauchySettings",
-    "DcsSettings",
-    "GemanMcClureSettings",
-    "GncSettings",
-    "LmSettings",
-    "OptimiserSettings",
-    "PcmSettings",
-    "decided",
-]
-
 OptimiserSettings = Annotated[
     GncSettings | PcmSettings | DcsSettings | CauchySettings | GemanMcClureSettings | LmSettings,
     Field(discriminator="kind"),

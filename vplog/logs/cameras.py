@@ -27,7 +27,7 @@ _COUNTS = {
     "equidistant": {4: "equidistant"},
 }
 """Numbers of coefficients that OpenCV takes of each lens, and the model that they make."""
-_BODY = "base_link"
+BODY = "base_link"
 """The body's frame where the odometry names none: ROS REP 105."""
 _AHEAD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """body_from_camera of a camera that looks along the body's x, upright: ROS REP 103."""
@@ -124,19 +124,14 @@ def _fit(camera: Camera, matrix: Floats, calibration: CalibrationMessage, notes:
     return replace(camera, matrix=resized(x, y) @ matrix)
 
 
-def body_of_lidar(tree: FrameTree, lidar: str) -> str:
-    """The body's frame where a lidar in this frame gives the odometry: base_link, else the lidar's own."""
-    return _BODY if _BODY in tree else lidar
-
-
 def body_from_camera(tree: FrameTree, body: str, frame: str, notes: Notes, ahead: bool = False) -> Floats:
     """(4, 4) through the static transforms; without a chain the identity, noted where that is a guess, or, with
     `ahead`, a camera that looks along x. `body` is the odometry's child frame, empty where its type has none; `frame`
     is the image's frame_id."""
-    if not body and _BODY in tree:
-        body = _BODY
+    if not body and BODY in tree:
+        body = BODY
         if not ahead:
-            notes.add(f"The odometry names no body frame; {_BODY} of the static transforms is taken.")
+            notes.add(f"The odometry names no body frame; {BODY} of the static transforms is taken.")
     found = tree.between(body, frame) if body and frame else None
     if found is not None:
         return found

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.data import Lidar
-from vplog.logs.cameras import body_of_lidar
+from vplog.logs.cameras import BODY
 from vplog.logs.messages.clouds import scan_of
 from vplog.logs.messages.decode import decode
 from vplog.logs.messages.records import BadMessageError, CloudMessage
@@ -67,8 +67,8 @@ class ScanReader:
 
     @property
     def body(self) -> str:
-        """Frame of the body where the lidar gives the odometry; empty without a lidar."""
-        return "" if self._channel is None else body_of_lidar(self._content.tree, self._frame)
+        """Frame of the body where the lidar gives the odometry: base_link, else the lidar's own; empty without one."""
+        return "" if self._channel is None else BODY if BODY in self._content.tree else self._frame
 
     @cached_property
     def _frame(self) -> str:

@@ -14,7 +14,7 @@ from vplog.geometry import se3
 from vplog.logs.stamps import NONE, Stamps
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
 
     from vplog.data import Floats, Ints
     from vplog.logs.formats.container import Notes
@@ -43,10 +43,11 @@ class FrameTree:
         """Transforms that were NaN, infinite or without rotation."""
         for transform in transforms:
             parent, child = clean(transform.frame), clean(transform.child)
-            parent_from_child = usable_pose(transform.position, transform.quaternion)
-            if parent_from_child is None or parent == child:
+            pose = np.array([*transform.position, *transform.quaternion], np.float64)
+            if parent == child or not are_usable(pose[None]).all():
                 self.dropped += 1
                 continue
+            parent_from_child = se3.pose(se3.rotation(pose[3:]), pose[:3])
             self.edges.append((parent, child))
             self._from[parent][child], self._from[child][parent] = parent_from_child, se3.inverse(parent_from_child)
 
@@ -75,14 +76,9 @@ def clean(frame: str) -> str:
     return frame.lstrip("/")
 
 
-def usable_pose(position: Sequence[float], quaternion: Sequence[float]) -> Floats | None:
-    """(4, 4), or None where nothing on earth is there (NaN, infinite, beyond _FARTHEST_M) or no rotation is set."""
-    pose = np.array([*position, *quaternion], np.float64)
-    return se3.pose(se3.rotation(pose[3:]), pose[:3]) if are_usable(pose[None]).all() else None
-
-
 def are_usable(poses: Floats) -> np.ndarray:
-    """(K,) bool: whether `usable_pose` of x y z, x y z w in each row of (K, 7) is one."""
+    """(K,) bool: whether each row of (K, 7), x y z, x y z w, is on earth (not NaN, infinite or beyond _FARTHEST_M) and
+    has a rotation."""
     sizes = np.abs(poses)
     placed, largest = (sizes[:, :3] < _FARTHEST_M).all(1), sizes[:, 3:].max(1)  # NaN where one is
     return placed & (largest > _SMALLEST) & (largest < 1 / _SMALLEST)

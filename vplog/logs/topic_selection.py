@@ -204,12 +204,12 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
             right_info = _calibration(right, usable) if right is not None else None
             calibration = _calibration(image, usable) if choice.camera_info is None else pick("camera_info")
     mask = pick("mask", "depth", image=image) if choice.mask else None
-    asked = choice.odometry if choice.odometry_file is None else ""
+    requested_name = choice.odometry if choice.odometry_file is None else ""
     clouds = [c for c in usable if c.role == "lidar"]
-    scanned = [c for c in clouds if c.channel.topic == asked]
-    named = bool(scanned) or (asked in SOURCES and all(c.channel.topic != asked for c in candidates))
-    kind = "lidar" if scanned else "" if asked is None else asked if named else "topic"
-    requested = pick("odometry", "tf") if asked and not named else None
+    scanned = [c for c in clouds if c.channel.topic == requested_name]
+    named = bool(scanned) or (requested_name in SOURCES and all(c.channel.topic != requested_name for c in candidates))
+    kind = "lidar" if scanned else "" if requested_name is None else requested_name if named else "topic"
+    requested = pick("odometry", "tf") if requested_name and not named else None
     geometry = {c.channel: factors for c in candidates if (factors := _geometry(c, choice))}
     sources = _sources(usable, kind, requested, geometry)
     turned = kind == "twist" or all(short_type(c.channel.type) in (*TWISTS, *GEOMETRY) for c in sources)

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     _Agreeing = tuple[Floats, Floats, Ints]
     """Landmarks (A, 3), their covariance (A, 3, 3), and the picture's features (A,) that match them."""
 
-_CHI2_2 = 9.210
-"""Mahalanobis^2 of a 2D error that 1 % of right matches exceed: chi-square, 2 degrees of freedom, 99 %."""
 _RIVAL_SIGMA = 3.0
 """Standard deviations, of a count of matches, by which a pose must have more inliers than another one elsewhere."""
 _PROGRESS = (
@@ -200,7 +198,7 @@ def _agreeing(query: _Query, fit: _Fit, place: KeyframeLandmarks, anchor: Floats
     by_pixel = undistort.noise_of_rays(query.camera, rays, query.settings.landmarks.pixel_sigma)
     unknown = np.full(len(rays), np.nan)
     squared, _ = pose_refinement.agreement(pose, Matches(points, covariance, rays, by_pixel, unknown, unknown))
-    agrees = squared < _CHI2_2
+    agrees = squared < verify_metric.CHI2_2
     return points[agrees], covariance[agrees], fit.mine[agrees]
 
 

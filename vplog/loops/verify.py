@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from vplog.loops.landmarks import FeaturesOf
     from vplog.loops.propose import Proposals
 
-__all__ = ["Drive", "VerifySettings", "calibration_share", "drive_of", "verify_between"]
 _LOG = logging.getLogger(__name__)
 _WARNED_SHARE = 0.05
 """Relative disagreement of camera and odometry that is warned of: five times a careful calibration's error."""

@@ -7,7 +7,7 @@ has no wheel for Linux on ARM.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import lgamma, log, log10
+from math import comb, log10
 from typing import TYPE_CHECKING
 
 import cv2
@@ -30,7 +30,7 @@ _MODELS = 4
 """Poses that three points allow: Gao et al. 2003."""
 _CONFIDENCE = 0.99
 """RANSAC ends when three right matches would have been drawn with this probability."""
-_CHI2_2 = 9.210
+CHI2_2 = 9.210
 """Mahalanobis^2 of a 2D error that 1 % of right matches exceed: chi-square, 2 degrees of freedom, 99 %."""
 _ROUNDS = 8
 """Most rounds of refitting the pose to its inliers and selecting inliers by the pose."""
@@ -167,7 +167,7 @@ def refit(
             break
         match_from_query, hessian, excess = pose_refinement.fit(match_from_query, matches.rows(inlier))
         distance, alone = pose_refinement.agreement(match_from_query, matches)
-        before, inlier = inlier, (distance < _CHI2_2) & (alone < most_sigmas**2)
+        before, inlier = inlier, (distance < CHI2_2) & (alone < most_sigmas**2)
         if np.array_equal(inlier, before):
             break
     return match_from_query, hessian, excess, inlier
@@ -214,11 +214,7 @@ def log10_false_alarms(matches: int, inliers: int, sample: int, models: int, sha
     return (
         log10(models)
         + log10(max(matches - sample, 1))
-        + _log10_binomial(matches, inliers)
-        + _log10_binomial(inliers, sample)
+        + log10(comb(matches, inliers))
+        + log10(comb(inliers, sample))
         + (inliers - sample) * log10(min(max(share, 1e-300), 1.0))
     )
-
-
-def _log10_binomial(n: int, k: int) -> float:
-    return (lgamma(n + 1) - lgamma(k + 1) - lgamma(n - k + 1)) / log(10)

@@ -26,8 +26,10 @@ def foxglove_layout(topics: Collection[str], positions_m: Floats) -> dict[str, A
     pictures = [*images.items(), *((topic.removesuffix("/image"), topic) for topic in (PICTURES, REFERENCE))]
     panels |= {f"Image!{base.strip('/')}": _image(base, one, topics) for base, one in pictures if one in topics}
     beside = [name for name in panels if name.startswith("Image!")]
-    panels["Plot!residuals"] = _plot("Residual of closures in sigma", _of_accepted("residual_before", "residual_after"))
-    panels["Plot!inliers"] = _plot("Inliers of closures", {"inliers": '/loop_closures{verdict=="accepted"}.inliers'})
+    accepted = '/loop_closures{verdict=="accepted"}'
+    sigmas = {name: f"{accepted}.{name}_sigma" for name in ("residual_before", "residual_after")}
+    panels["Plot!residuals"] = _plot("Residual of closures in sigma", sigmas)
+    panels["Plot!inliers"] = _plot("Inliers of closures", {"inliers": f"{accepted}.inliers"})
     upper = _split("row", "3D!map", _stack(beside), 60) if beside else "3D!map"
     lower = _split("row", "Plot!residuals", "Plot!inliers", 50)
     return {
@@ -75,10 +77,6 @@ def _plot(title: str, series: dict[str, str]) -> dict[str, Any]:
         for label, path in series.items()
     ]
     return {"foxglovePanelTitle": title, "paths": paths, "xAxisVal": "timestamp", "isSynced": True, "showLegend": True}
-
-
-def _of_accepted(*names: str) -> dict[str, str]:
-    return {name: f'/loop_closures{{verdict=="accepted"}}.{name}_sigma' for name in names}
 
 
 def _split(direction: str, first: Any, second: Any, percentage: int) -> dict[str, Any]:

@@ -94,15 +94,12 @@ def read_decisions(path: Path, keyframes: Keyframes) -> Decisions:
 
 def decided_lines(path: Path, keyframes: Keyframes) -> Iterator[Decided]:
     """The lines of a CSV that decide on a pair. Raises SettingsError with the place of the first that does not fit."""
-    header, before = list[str](), ""
-    for where, cells in read_lines(path, _FORM, SettingsError):
-        if not header:
-            header = cells
-            if header not in (_COLUMNS, _COLUMNS[:_REQUIRED]):
-                raise SettingsError(f"{where} is not the header. {_FORM}")
-            continue
-        if len(cells) != len(header) or cells[2] not in _CHOICES:
-            raise SettingsError(f"{where} does not hold {len(header)} fields with a decision in the third. {_FORM}")
+    lines, before = read_lines(path, (_COLUMNS, _COLUMNS[:_REQUIRED]), _FORM, SettingsError), ""
+    if next(lines, None) is None:
+        raise SettingsError(f"{path} is empty. {_FORM}")
+    for where, cells in lines:
+        if cells[2] not in _CHOICES:
+            raise SettingsError(f"{where} does not hold a decision in the third field. {_FORM}")
         rows = [row_of(keyframes, cell) for cell in cells[:2]]
         if None in rows:
             raise SettingsError(
@@ -115,8 +112,6 @@ def decided_lines(path: Path, keyframes: Keyframes) -> Iterator[Decided]:
         before = before if cells[2] == "same" else cells[2]
         if before:
             yield Decided((query, match), before, cells[_REQUIRED:], where)
-    if not header:
-        raise SettingsError(f"{path} is empty. {_FORM}")
 
 
 def write_decisions(path: Path, keyframes: Keyframes, lines: Iterable[Sequence[Any]]) -> None:

@@ -61,7 +61,7 @@ class _Scan(NamedTuple):
 
 
 class _Residuals(NamedTuple):
-    """What residuals tell of a motion."""
+    """A motion by its residuals."""
 
     covariance: Floats
     """(6, 6) in the frame that it leads to."""
@@ -84,7 +84,7 @@ class _Tracker:
     icp: Any = None
     """KISS-ICP's map, thresholds and registration of this piece."""
     surface: KDTree | None = None
-    """Of the last scan's points, in its frame."""
+    """The last scan's points, in its frame."""
     step: Floats = field(default_factory=lambda: np.eye(4))
     """Motion in a period, as KISS-ICP's last_delta."""
     period_ns: int = 0
@@ -195,7 +195,7 @@ def new_registration(range_m: float) -> Any:
 
 
 def step_residuals(surface: KDTree | None, points: Floats, moved: Floats, voxel_m: float) -> _Residuals | None:
-    """Those of the motion `moved` (4, 4) from the last scan, whose points are `surface`, to one with (K, 3) `points`.
+    """Residuals of the motion `moved` (4, 4) from the last scan, with points `surface`, to one with (K, 3) `points`.
     The noise is that from point to point, as it is minimised; a surface holds what moves off its plane. None where too
     few points have a neighbour."""
     if surface is None:

@@ -58,7 +58,7 @@ def gives_visual(log: Log) -> bool:
 
 
 def source_of(log: Log, topics: TopicChoice) -> Literal["log", "visual", "lidar"]:
-    """What the odometry is of. Raises LogError where there is none at all.
+    """The source of the odometry. Raises LogError where there is none at all.
 
     Unasked, images come before a lidar: they need no transforms to a second sensor and no extra to be installed, so
     that a log gives one result everywhere; and a cloud may be a depth camera's, which registers worse.

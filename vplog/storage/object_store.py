@@ -54,7 +54,8 @@ _WHY = (
     (r"Requested (\d+)\.\.\d+, got (\d+)", "the server sent from byte {1} on, not from byte {0}"),
     (r"(?:Generic \w+ error: )?(.*)", "{0}"),
 )  # fmt: skip
-"""Of an error of obstore, which has the innermost one in its last lines, what is said; the first that is found."""
+"""Patterns of errors of obstore, whose innermost one is in their last lines, and the message; the first that matches
+counts."""
 _NO_BUCKET = re.compile("NoSuchBucket|ContainerNotFound|bucket does not exist")
 
 
@@ -143,9 +144,9 @@ def plain_errors() -> Iterator[None]:
 
 
 def _why(text: str) -> str:
-    for pattern, said in _WHY:
+    for pattern, message in _WHY:
         if found := re.search(pattern, text):
-            line = said.format(*(one or "" for one in found.groups()))
+            line = message.format(*(one or "" for one in found.groups()))
             printable = "".join(one if one.isprintable() else " " for one in without_secrets(line))
             return printable[:400].rstrip(". ") or "it is refused"
     return text

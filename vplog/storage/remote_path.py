@@ -190,11 +190,11 @@ class RemotePath:
 
     @property
     def prefix_length(self) -> int:
-        """Of the names below in a listing."""
+        """Length of the prefix of the names in a listing."""
         return len(f"{self.place[1]}/".lstrip("/"))
 
     def ask(self, verb: str, *given: Any, upload: bool = False, **options: Any) -> Any:
-        """What the method of this name of obstore's stores answers for this object or prefix. Raises OSError."""
+        """Call obstore's method `verb` for this object or prefix. Raises OSError."""
         store, name = self._place(upload)
         with plain_errors():
             return getattr(store, verb)(name, *given, **options)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from vplog.results.report.page import Question
 
 _QUALITY = 80
-"""Of the JPEGs."""
+"""JPEG quality."""
 _BY_DECISION = {Verdict.ACCEPTED_BY_DECISION: "accept", Verdict.REJECTED_BY_DECISION: "reject"}
 
 
@@ -44,14 +44,14 @@ def ask(folder: Path, count: int = 10, output: Path | None = None) -> dict[str, 
     row_at = {pair: row for row, pair in enumerate(zip(closures.query.tolist(), closures.match.tolist(), strict=True))}
     answers = {row_at[q, m]: one != "reject" for q, m, one, *_ in lines if (q, m) in row_at}
     found = ask_ledger(graph, weight, closures, answers)
-    asked = found[:count]
-    write_decisions(path, keyframes, lines + [line for one in asked for line in _open(one, closures)])
-    pictures = _pictures(asked, folder, output, keyframes, closures)
+    chosen = found[:count]
+    write_decisions(path, keyframes, lines + [line for one in chosen for line in _open(one, closures)])
+    pictures = _pictures(chosen, folder, output, keyframes, closures)
     return {
         "run": str(folder),
-        "questions": [_described(one, pictures, keyframes, closures) for one in asked],
+        "questions": [_described(one, pictures, keyframes, closures) for one in chosen],
         "decided": len(lines),
-        "left": len(found) - len(asked),
+        "left": len(found) - len(chosen),
         "decisions": str(path),
         "command": f"vplog run {shlex.quote(str(record.get('log')))} -o {shlex.quote(str(folder))} "
         f"--decisions {shlex.quote(str(path))}",
@@ -96,10 +96,10 @@ def _described(
 
 
 def _pictures(
-    asked: list[Question], folder: Path, output: Path, keyframes: Keyframes, closures: Closures
+    chosen: list[Question], folder: Path, output: Path, keyframes: Keyframes, closures: Closures
 ) -> dict[int, Path]:
     """Files closure-ROW.jpg by row: as the report draws it, else both frames; none where result.mcap has no images."""
-    rows = [one.rows[0] for one in asked]
+    rows = [one.rows[0] for one in chosen]
     drawn = mcap_read.read_pictures(folder / "result.mcap").pictures
     wanted = {int(keyframes.stamp_ns[end[row]]) for row in rows for end in (closures.query, closures.match)}
     images = {

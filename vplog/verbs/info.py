@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -109,7 +109,10 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
     log = logs.open(path, topics)
     found = log.info()
     problems: list[str] = []
-    camera, odometry, gps = _camera(log, problems), log.odometry(), log.gps()
+    camera = None
+    with _noted(problems):
+        camera = log.camera()
+    odometry, gps = log.odometry(), log.gps()
     stamp_ns = log.stamps() if camera is not None else np.zeros(0, np.int64)
     sampled, decoded = _sampled(log, stamp_ns, problems)
     computed = _computed(log, topics) if camera is not None and odometry is None else ""
@@ -117,7 +120,8 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
     if computed == "visual" and camera is not None:
         _check_moves(log.name, sampled, camera, problems)
     elif computed == "lidar":
-        _check_registers(problems)
+        with _noted(problems):
+            new_registration(1.0)
     else:
         keyframes, missing = _keyframes(log, stamp_ns, odometry, problems)
     warnings = [line for line in dict.fromkeys(found.warnings + log.warnings + missing) if line not in problems]
@@ -153,7 +157,7 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
 
 
 def _computed(log: Log, topics: TopicChoice) -> str:
-    """What a run computes the odometry from, as `source_of`; empty where it cannot."""
+    """Source of a run's odometry, as `source_of`; empty without one."""
     with suppress(LogError):
         return source_of(log, topics)
     return ""
@@ -172,12 +176,13 @@ def command(path: Path, topics: TopicChoice) -> str:
     return " ".join(["vplog run", log, "-o OUT", *options])
 
 
-def _camera(log: Log, problems: list[str]) -> Camera | None:
+@contextmanager
+def _noted(problems: list[str]) -> Iterator[None]:
+    """Put a LogError of the block among the problems."""
     try:
-        return log.camera()
+        yield
     except LogError as error:
         problems.append(str(error))
-        return None
 
 
 def _sampled(log: Log, stamp_ns: Ints, problems: list[str]) -> tuple[list[Frame], int]:
@@ -213,17 +218,15 @@ def _keyframes(
     if odometry is None or len(odometry.stamp_ns) < 2:
         problems.append(f"There is no odometry, and a trajectory is built on it. {log.without_odometry()}")
         return None, []
-    try:
+    with _noted(problems):
         keyframes, missing = select_keyframes(log.name, stamp_ns, odometry, KeyframeSettings())
-    except LogError as error:
-        problems.append(str(error))
-        return None, []
-    if len(keyframes.stamp_ns) < 2:
-        problems.append(
-            "By the odometry nothing moves far enough for a second keyframe, and a graph needs two. Choose another "
-            "odometry with --odometry-topic or --odometry-file."
-        )
-    return len(keyframes.stamp_ns), missing
+        if len(keyframes.stamp_ns) < 2:
+            problems.append(
+                "By the odometry nothing moves far enough for a second keyframe, and a graph needs two. Choose another "
+                "odometry with --odometry-topic or --odometry-file."
+            )
+        return len(keyframes.stamp_ns), missing
+    return None, []
 
 
 def _check_moves(drive: str, frames: list[Frame], camera: Camera, problems: list[str]) -> None:
@@ -244,13 +247,6 @@ def _check_moves(drive: str, frames: list[Frame], camera: Camera, problems: list
             f"The camera stands: by visual odometry it moves {most_m:.1g} m between {len(frames)} frames spread over "
             "the drive, and a graph needs two keyframes. Give a longer part of it, or poses with --odometry-file."
         )
-
-
-def _check_registers(problems: list[str]) -> None:
-    try:
-        new_registration(1.0)
-    except LogError as error:
-        problems.append(str(error))
 
 
 def _why(topic: Topic, found: LogInfo, topics: TopicChoice) -> str:

@@ -25,7 +25,7 @@ _FOXGLOVE = ("foxglove-studio", "foxglove")
 
 @dataclass(frozen=True)
 class Opening:
-    """What is to be opened, and how."""
+    """A viewer, and the file that it shows."""
 
     viewer: str
     """One of `VIEWERS`."""

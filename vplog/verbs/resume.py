@@ -41,17 +41,12 @@ def resume_request(out: Path, given: Sequence[Path] = ()) -> ResumeRequest:
     check_regular(out, "run.json")
     check_regular(out / CACHE)
     recover(out)
-    file = out / REQUEST if (out / REQUEST).is_file() else out / "run.json"  # there older versions had it
+    file = out / REQUEST if (out / REQUEST).is_file() else out / "run.json"
     if not file.is_file():
         raise ResultError(f"Nothing to resume: {out} has no run.json. Start a run: vplog run LOG -o {out}")
     account = run_record.read_run_json(file)
     if account.get("finished") is not False:
         raise ResultError(f"Nothing to resume: the run in {out} is finished. Without --resume it is run again.")
-    if not isinstance(account.get("topics"), dict):  # of an older version
-        raise ResultError(
-            f"{out}/run.json lacks options of its run. Give the full command without --resume: finished stages are "
-            "reused."
-        )
     known = [str(located(text).resolve()) for text in _recorded_logs(account, file)]
     paths = sorted(given, key=lambda path: _place(known, path))  # a URL that is given has its query
     if not given:
@@ -70,7 +65,7 @@ def resume_request(out: Path, given: Sequence[Path] = ()) -> ResumeRequest:
         "logs" in account,
         pipeline,
         None if library == OWN_LIBRARY else located(library),
-        logs.TopicChoice.read(account["topics"], where),
+        logs.TopicChoice.read(recorded(account, file, dict, "topics"), where),
     )
 
 
@@ -78,7 +73,7 @@ def _check_unchanged(paths: Sequence[Path], account: dict[str, Any], out: Path) 
     """Raises LogError where a log is not what it was when the run began, by its stat, or by its content if known."""
     about = account.get("log_stat")
     if not isinstance(about, dict) or not all(path.exists() for path in paths) or stat_of(paths) == about:
-        return  # of an older version; or the run reports what is missing
+        return  # the run reports what is missing
     now = inputs_of(paths, out / CACHE)
     if now.token == key_of(now.signature):  # the cache does not know it either: nothing of it would be found
         given = shlex.join(map(str, paths))

@@ -25,7 +25,6 @@ from vplog.graph.normal_equations import normal_equations
 from vplog.graph.sparse import dense_front, frontal_inversion, subtrees
 from vplog.graph.sparse.cholesky import Cholesky
 from vplog.graph.sparse.frontal import Blocks
-from vplog.graph.sparse.linear import Supernodes
 from vplog.graph.sparse.selected_inversion import inverse_blocks, joint_inverse
 from vplog.graph.sparse.symbolic import Elimination
 
@@ -77,7 +76,7 @@ def test_solutions_and_inverses_are_those_of_the_dense_matrix(nodes: int, chords
     random = np.random.default_rng(seed)
     shape = Elimination.of(nodes, matrix.a, matrix.b)
     assert sorted(shape.place.tolist()) == list(range(nodes))
-    factor = Supernodes.of(shape, matrix)
+    factor = Cholesky.of(shape, matrix)
     assert factor.log_determinant() == pytest.approx(np.linalg.slogdet(whole)[1])
     right = random.normal(size=(nodes, size, 2))
     np.testing.assert_allclose(whole @ factor.solve(right).reshape(-1, 2), right.reshape(-1, 2), atol=1e-9)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
-from itertools import permutations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -191,8 +190,3 @@ def _is_whole(entry: Any) -> bool:
     if not isinstance(entry, dict) or not isinstance(entry.get("p_match_error", ""), float | int | None):
         return False
     return all(isinstance(entry.get(name), (int, float)) for name in numbers)
-
-
-def all_pairs(count: int) -> list[tuple[int, int]]:
-    """(query, map) of every two of `count` drives, each way; a single drive with itself."""
-    return [(0, 0)] if count == 1 else [(query, other) for other, query in permutations(range(count), 2)]

@@ -21,7 +21,7 @@ from vplog.benchmark.compare import check_truth, every_image, protocol, same_dri
 from vplog.benchmark.feature_cache import FeatureFolder
 from vplog.benchmark.recogniser_specs import read_methods
 from vplog.benchmark.study.charts import CHARTS
-from vplog.benchmark.study.evaluation_store import Bench, all_pairs
+from vplog.benchmark.study.evaluation_store import Bench
 from vplog.benchmark.study.example_figures import PICTURES
 from vplog.benchmark.study.experiments import NUMBERS, StudyOptions
 from vplog.benchmark.traversals import candidate_stops
@@ -78,7 +78,7 @@ def study(
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=made)))
         names = short_names([log.name for log in opened])
         known, protocols = {}, []
-        for query, other in all_pairs(len(drives)):
+        for other, query in [(0, 0)] if len(drives) == 1 else itertools.permutations(range(len(drives)), 2):
             of_pair = truth_of_pair(truth, query, other, len(drives))
             known[query, other] = open_truth(of_pair, opened[query], opened[other])
             warnings += check_truth(known[query, other], opened[query], opened[other], min_gap)

@@ -4,6 +4,10 @@ Multifrontal (Duff and Reid 1983; Davis, Direct Methods for Sparse Linear System
 columns and what its children hand on in one dense front, eliminates its columns, and hands on the rest. Subtrees are
 worked on side by side, then what is above them front by front, each by all threads. What is added to a number is added
 in one fixed order, whatever the threads.
+
+It is compiled on first use, some twenty seconds, and then takes a seventh to a twelfth of GTSAM's time for
+a step (HessianFactors built from Python): 1.9 ms for 14 at 800 poses, 6 for 51 at 2761, 18 for 243 at 8358.
+Levenberg-Marquardt takes 14.9 s at 100 000 poses where GTSAM takes 25.8, and GNC 33.8 s at 30 000 for 168.
 """
 
 from __future__ import annotations
@@ -94,3 +98,12 @@ class Cholesky:
                 back_run(node, node + 1, *root)
             workers.each(back_run, [(low, end, *root) for low, end in subtrees.runs])
         return moved[shape.place]
+
+    def log_determinant(self) -> float:
+        """Log of the determinant of the matrix."""
+        wide = np.diff(self.shape.first) * self.size
+        below = np.diff(self.shape.start) * self.size
+        # the diagonal of each supernode's rows of R, (wide, wide + below) one after the other
+        node = np.repeat(np.arange(len(wide)), wide)
+        column = np.arange(len(node)) - np.repeat(np.cumsum(wide) - wide, wide)
+        return 2.0 * float(np.log(self.values[self.begin[node] + column * (wide + below + 1)[node]]).sum())

@@ -54,7 +54,7 @@ def read(path: Path) -> DataSet:
 
 def _truth(path: Path, stamp_ns: Ints) -> tuple[Trajectory | None, list[str]]:
     """poses/NN.txt beside the sequences: rows of world_from_camera (3, 4), one for each image; those without a pose are
-    left out. And what is to be said of it."""
+    left out; and remarks."""
     file = path.parent.parent / "poses" / f"{path.resolve().name}.txt"
     if not file.is_file():
         return None, []

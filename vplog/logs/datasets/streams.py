@@ -10,6 +10,7 @@ import numpy as np
 
 from vplog.errors import LogError
 from vplog.geometry import se3
+from vplog.logs.cameras import BODY
 from vplog.logs.datasets.tables import numbers_of, rows_of, stamps_ns
 from vplog.logs.formats.container import BRIEF, Channel, Contents, Message, by_topic
 from vplog.logs.messages.pixels import scaled_depth_m
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
     from vplog.logs.formats.container import Notes, Place
     from vplog.logs.messages.records import CalibrationMessage, Record
 
-BODY = "base_link"
-"""Frame of the body, by its name in ROS REP 105."""
 _LATEST_NS = 2**32 * 10**9
 """ns; stamps of ROS 1 end in 2106."""
 
@@ -140,10 +139,8 @@ def depth_stream(topic: str, stamp_ns: Ints, files: Sequence[Path], per_m: float
             metres = np.zeros((0, 0), np.float32)
         return raw_image(int(stamp_ns[row]), frame, "32FC1", metres)
 
-    def length(row: int) -> int:
-        return _length_of(files[row])
-
-    return Stream(Channel(topic, "sensor_msgs/Image", "ros1"), stamp_ns, message, length)
+    channel = Channel(topic, "sensor_msgs/Image", "ros1")
+    return Stream(channel, stamp_ns, message, lambda row: _length_of(files[row]))
 
 
 def imu_stream(topic: str, table: Path) -> Stream:

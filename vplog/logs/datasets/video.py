@@ -102,7 +102,7 @@ class VideoFrames:
         if not 0 < len(self._ticks) <= _MOST_FRAMES:
             raise LogError(f"{path} holds no picture with a time stamp. Give another video.")
         self._turn = self._first_turn()
-        self._decoder()  # what it lacks is said at once
+        self._decoder()  # raises here where the file cannot be decoded
         order = self._decoded_order() if slots else range(len(packets))
         places = {int(tick): row for row, tick in enumerate(self._ticks)}
         rows = [-1] * len(packets)  # of those that are not shown

@@ -148,16 +148,16 @@ class SqliteBag:
     def _salvaged(self, number: int) -> Iterator[tuple]:
         """Whole rows behind this number, each once: as far as the pages of their table are sound, then from the next
         number that is found, as recorders number rows without a gap."""
-        seen: set[int] = set()
+        yielded: set[int] = set()
         left, last = _MOST_TRIED, self._last_row()
         while left > 0:
             try:
                 for row in self._db.execute(f"{_ROWS} NOT INDEXED WHERE rowid > ?", [number]):
-                    left -= row[0] in seen
+                    left -= row[0] in yielded
                     if left <= 0:
                         return
-                    if row[0] not in seen and _is_whole(row):
-                        seen.add(row[0])
+                    if row[0] not in yielded and _is_whole(row):
+                        yielded.add(row[0])
                         yield row
                 return
             except _DAMAGE:
@@ -165,12 +165,12 @@ class SqliteBag:
             found = None
             while found is None and left > 0 and number < last:
                 number += 1
-                if number not in seen:
+                if number not in yielded:
                     left -= 1
                     found = self._row(number)
             if found is None:
                 return
-            seen.add(number)
+            yielded.add(number)
             yield found
 
     def _last_row(self) -> int:

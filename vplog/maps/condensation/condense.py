@@ -18,8 +18,8 @@ import numpy as np
 
 from vplog.errors import SettingsError
 from vplog.execution.execution import Execution
-from vplog.maps.condensation.own_queries import AskedPlaces, OwnPlaces, ask, read_own_places, search_of
-from vplog.maps.condensation.redundancy import kept_after, remove_redundant
+from vplog.maps.condensation.own_queries import OwnAnswers, OwnPlaces, query_own_places, read_own_places, search_of
+from vplog.maps.condensation.redundancy import remove_redundant
 from vplog.maps.merge import copy_library
 from vplog.maps.search.query import open_map
 from vplog.maps.storage import layout, map_store
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from vplog.stages import PlaceState
 
 LOSS = 0.01
-"""Of recall at rank one, by the map's own queries."""
+"""Loss of recall at rank one of the map's own queries."""
 _SPACINGS = 3.0
 """Right is within so many times the distance of keyframes that follow each other: 3 m of keyframes a metre apart."""
 
@@ -45,10 +45,10 @@ class Condensed:
     """The places of a map that stay."""
 
     places: OwnPlaces
-    asked: AskedPlaces
+    answers: OwnAnswers
     distance_m: float
-    kept: Bools
-    """(N,)."""
+    retained: Bools
+    """(N,) places that the new map has."""
     lost: int
     """Queries that are not answered rightly any more."""
 
@@ -57,7 +57,7 @@ def condense_map(
     root: Path, target: Path, loss: float = LOSS, distance_m: float | None = None, execution: Execution = Execution()
 ) -> dict[str, Any]:
     """Write the map `target`: the drives of a map with the places that still decide something, as long as the recall at
-    rank one of the map's own queries falls by no more than `loss`; what was removed.
+    rank one of the map's own queries falls by no more than `loss`. Returns an account of it.
 
     A place is right within `distance_m` of the query, which None sets by the spacing of places. Raises VplogError, as
     where the target is a map already.
@@ -73,8 +73,8 @@ def condense_map(
             places = read_own_places(store, drives, state)
             search, warnings = search_of(store, drives, places, state, execution)
             within = distance_m or _SPACINGS * places.spacing_m
-            asked = ask(places, search, state, within, execution)
-            return choose_places(places, asked, within, loss, execution), state, warnings
+            answers = query_own_places(places, search, state, within, execution)
+            return choose_places(places, answers, within, loss, execution), state, warnings
 
         found, state, warnings = skip_damaged(store, attempt)
         _write(store, target, found)
@@ -83,21 +83,21 @@ def condense_map(
 
 
 def choose_places(
-    places: OwnPlaces, asked: AskedPlaces, distance_m: float, loss: float, execution: Execution = Execution()
+    places: OwnPlaces, answers: OwnAnswers, distance_m: float, loss: float, execution: Execution = Execution()
 ) -> Condensed:
     """The places that stay. One that no other shows is among them, unless it has faded, and one of each drive."""
     count = len(places.drive)
     posed = places.frame >= 0
-    answered = ~kept_after(count, asked.place)
-    removable = posed & (answered | asked.faded)
+    answered = np.isin(np.arange(count), answers.place)
+    removable = posed & (answered | answers.faded)
     most_lost = math.floor(loss * int(posed.sum()) + 1e-9)  # .01 of 300 is 3
     total = int(removable.sum())
     removal = remove_redundant(
-        asked.queries, places.drive, np.cumsum(places.steps_m()), removable, asked.faded, most_lost,
+        answers.queries, places.drive, np.cumsum(places.steps_m()), removable, answers.faded, most_lost,
         lambda done: execution.progress("remove", done, total),
     )  # fmt: skip
     lost = int(removal.lost[-1]) if len(removal.lost) else 0
-    return Condensed(places, asked, distance_m, kept_after(count, removal.places), lost)
+    return Condensed(places, answers, distance_m, ~np.isin(np.arange(count), removal.places), lost)
 
 
 def _write(store: Store, target: Path, found: Condensed) -> None:
@@ -108,8 +108,8 @@ def _write(store: Store, target: Path, found: Condensed) -> None:
             raise SettingsError(f"{target} holds a map already. Choose another folder with -o.")
         copy_library(new, store, str(store.head().library))
         for number, drive in enumerate(found.places.drives):
-            kept = np.flatnonzero(found.kept[first[number] : first[number + 1]])
-            _write_drive(store, new, records[drive], kept)
+            retained = np.flatnonzero(found.retained[first[number] : first[number + 1]])
+            _write_drive(store, new, records[drive], retained)
         for name in ("joins", "joint"):  # they name the drives by keys that they still have
             if (store.root / name).is_dir():
                 copy_folder(store.root / name, target / name, f"{name} of {store} to {target}", **_LINKED)
@@ -120,17 +120,17 @@ def _write(store: Store, target: Path, found: Condensed) -> None:
 _LINKED: dict[str, Callable[..., Any]] = {"copy_function": layout.link}
 
 
-def _write_drive(store: Store, new: Store, record: Mapping[str, Any], kept: Any) -> None:
+def _write_drive(store: Store, new: Store, record: Mapping[str, Any], retained: Any) -> None:
     drive, made = record["drive"], new.staging / f"{os.getpid()}-condense"
 
     def copied(run: Path) -> None:
         shutil.rmtree(made, ignore_errors=True)
         ignored = shutil.ignore_patterns("drive.json")  # it comes last: what has it is whole
         copy_folder(run, made, f"{drive} of {store} to {new}", ignore=ignored, **_LINKED)
-        if len(kept) < store.rows("descriptors", drive):
+        if len(retained) < store.rows("descriptors", drive):
             table = made / "descriptors.parquet"
             table.unlink()
-            tables.write_some_descriptors(run / table.name, table, kept)
+            tables.write_some_descriptors(run / table.name, table, retained)
 
     store.read(drive, copied, ())
     run_record.write_run_json(made / "drive.json", dict(record))
@@ -138,20 +138,20 @@ def _write_drive(store: Store, new: Store, record: Mapping[str, Any], kept: Any)
 
 
 def _account(found: Condensed, state: PlaceState, root: Path, target: Path, warnings: list[str]) -> dict[str, Any]:
-    """What was removed, as plain values."""
-    places, asked, kept = found.places, found.asked, found.kept
-    posed, answered = int((places.frame >= 0).sum()), len(asked.place)
-    best = np.array([one.rows[0] for one in asked.queries.best], np.int64)
-    others = int((places.drive[best] != places.drive[asked.place]).sum())
+    """The places removed and what that costs, as plain values."""
+    places, answers, retained = found.places, found.answers, found.retained
+    posed, answered = int((places.frame >= 0).sum()), len(answers.place)
+    best = np.array([one.rows[0] for one in answers.queries.best], np.int64)
+    others = int((places.drive[best] != places.drive[answers.place]).sum())
     drives = []
     for number, drive in enumerate(places.drives):
         own, files = places.drive == number, [f"runs/{layout.folder_name(drive)}/descriptors.parquet"] * 2
         before, after = ((top / file).stat().st_size for top, file in zip((root, target), files, strict=True))
         drives.append({
             "drive": drive,
-            "places": {"before": int(own.sum()), "after": int((own & kept).sum())},
+            "places": {"before": int(own.sum()), "after": int((own & retained).sum())},
             "descriptor_bytes": {"before": before, "after": after},
-            "faded": int((own & asked.faded & ~kept).sum()),
+            "faded": int((own & answers.faded & ~retained).sum()),
         })  # fmt: skip
     recall = [round((answered - lost) / max(posed, 1), 6) for lost in (0, found.lost)]
     if len(set(places.frame.tolist())) == len(places.drives) > 1:
@@ -168,24 +168,24 @@ def _account(found: Condensed, state: PlaceState, root: Path, target: Path, warn
             "alone": posed - answered,
         },
         "recall": {"before": recall[0], "after": recall[1], "loss": round(found.lost / max(posed, 1), 6)},
-        "faded": {"found": int(asked.faded.sum()), "removed": int((asked.faded & ~kept).sum())},
+        "faded": {"found": int(answers.faded.sum()), "removed": int((answers.faded & ~retained).sum())},
         **{
             name: {end: sum(one[name][end] for one in drives) for end in ("before", "after")}
             for name in ("places", "descriptor_bytes")
         },
-        "references": _references(places, kept, state),
+        "references": _references(places, retained, state),
         "drives": drives,
         "warnings": warnings,
     }
 
 
-def _references(places: OwnPlaces, kept: Bools, state: PlaceState) -> dict[str, int] | None:
+def _references(places: OwnPlaces, retained: Bools, state: PlaceState) -> dict[str, int] | None:
     """References that some place names, of the library's; None where places name none."""
     if not isinstance(state, CodedState):
         return None
     named = np.zeros((2, state.shape[0]), np.bool_)
     for number, column in enumerate(places.columns):
-        own = kept[places.drive == number]
+        own = retained[places.drive == number]
         for row, rows in enumerate((np.ones(len(own), np.bool_), own)):
             start = state.lists(column.filter(rows)).start
             named[row] |= start[:, -1] > start[:, 0]

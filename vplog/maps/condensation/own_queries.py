@@ -15,7 +15,7 @@ from vplog.errors import ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.maps.condensation.redundancy import OwnQueries
-from vplog.maps.joining.frames import joint_components, keyframe_poses
+from vplog.maps.joining.joint_record import joint_components, keyframe_poses
 from vplog.maps.search.exact import Answers, best_places, merge, no_answers
 from vplog.maps.search.index import place_keyframes, read_column, update_index
 from vplog.maps.storage.layout import PICTURES
@@ -107,11 +107,8 @@ def search_of(
     """The search for single views in a map, by its index where the recogniser has one, and warnings."""
     if isinstance(state, CodedState):
         parts, warnings = update_index(store, {drive: about[drive] for drive in places.drives}, state, execution)
-
-        def by_index(views: Sequence[Any], top: int) -> Answers:
-            return best_places(parts, state, views, top, Execution(execution.threads))
-
-        return by_index, warnings
+        threads = Execution(execution.threads)
+        return lambda views, top: best_places(parts, state, views, top, threads), warnings
     return search_in_memory(places, state), []
 
 
@@ -134,8 +131,8 @@ def search_in_memory(places: OwnPlaces, state: PlaceState) -> Search:
 
 
 @dataclass(frozen=True, eq=False)
-class AskedPlaces:
-    """Places that ask for themselves, and what the answers say of the others."""
+class OwnAnswers:
+    """Answers of a map to its own places as queries."""
 
     place: Ints
     """(Q,) places that are answered rightly."""
@@ -144,9 +141,9 @@ class AskedPlaces:
     """(N,) places that `PASSES` later drives came by, of which none has it among its best."""
 
 
-def ask(
+def query_own_places(
     places: OwnPlaces, search: Search, state: PlaceState, distance_m: float, execution: Execution = Execution()
-) -> AskedPlaces:
+) -> OwnAnswers:
     """Look for every place among the others; an answer within the distance is right."""
     first, same = places.first, places.same_place(distance_m)
     matched, best = np.zeros(len(places.drive), np.bool_), dict[int, Ranking]()
@@ -177,7 +174,7 @@ def ask(
         lambda query, top: looked_for(place[query : query + 1], top)[0],
         lambda query, others: same(int(place[query]), others),
     )
-    return AskedPlaces(place, queries, (later_passes(places, distance_m) >= PASSES) & ~matched)
+    return OwnAnswers(place, queries, (later_passes(places, distance_m) >= PASSES) & ~matched)
 
 
 def later_passes(places: OwnPlaces, distance_m: float) -> Ints:

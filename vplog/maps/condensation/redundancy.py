@@ -9,7 +9,7 @@ only the best few are evaluated again (Minoux, Accelerated greedy algorithms, 19
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ class OwnQueries:
     """Q queries of a map's own places, each answered rightly by the N places that it is looked for among."""
 
     best: list[Ranking]
-    """Of each, its best places."""
+    """Best places of each."""
     deeper: Callable[[int, int], Ranking]
     """The best so many places of a query; fewer where no more share anything with it."""
     right: Callable[[int, Int32s | Ints], Bools]
@@ -52,7 +52,7 @@ class _Answer(NamedTuple):
     best_right: int
     """The best right place that is known; -1 where none is."""
     score: float
-    """Of that place, 0 without."""
+    """Score of that place; 0 without one."""
 
 
 @dataclass(eq=False)
@@ -60,7 +60,7 @@ class _Remaining:
     """The places that are left, and the answers of all queries among them."""
 
     queries: OwnQueries
-    kept: Bools
+    retained: Bools
     best: list[Ranking] = field(default_factory=list)
     right: list[Bools] = field(default_factory=list)
     answers: list[_Answer] = field(default_factory=list)
@@ -80,7 +80,7 @@ class _Remaining:
         """The answer without one place more; longer lists of places are looked up where all of one are gone."""
         while True:
             found = self.best[query]
-            alive = self.kept[found.rows] & (found.rows != without)
+            alive = self.retained[found.rows] & (found.rows != without)
             if alive.any():
                 break
             if query in self.whole:
@@ -109,7 +109,7 @@ class _Remaining:
         return lost, drop
 
     def remove(self, place: int) -> None:
-        self.kept[place] = False
+        self.retained[place] = False
         for query in dict.fromkeys(self.users.pop(place, ())):
             self._update(query)
 
@@ -180,10 +180,3 @@ def remove_redundant(
         losses.append(lost)
         progress(len(order))
     return Removal(np.array(order, np.int64), np.array(losses, np.int64))
-
-
-def kept_after(count: int, removed: Sequence[int] | Ints) -> Bools:
-    """(N,) whether each of `count` places stays."""
-    kept = np.ones(count, np.bool_)
-    kept[np.asarray(removed, np.int64)] = False
-    return kept

@@ -1,22 +1,29 @@
-"""joint.json of a map: which joint graphs count."""
+"""joint.json of a map: which joint graphs count, and the keyframes of its drives in the frames of those."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from vplog.errors import ResultError
-from vplog.maps.storage.layout import write_changed
-from vplog.results import run_record
+from vplog.maps.storage.damage import reading_drive
+from vplog.maps.storage.layout import folder_name, write_changed
+from vplog.results import run_record, tables
 from vplog.storage.folders import is_below
 from vplog.storage.parquet_limits import check_version
 
 if TYPE_CHECKING:
+    from vplog.data import Floats
     from vplog.maps.storage.map_store import Store
 
-FORMAT = run_record.FORMAT
-"""Version of this record. A reader refuses a newer one."""
+
+class Component(NamedTuple):
+    """Drives that closures join."""
+
+    folder: Path
+    drives: Sequence[str]
+    """In the map's order; the frame is that of the first."""
 
 
 def read_joint(root: Path) -> dict[str, Any]:
@@ -38,7 +45,7 @@ def read_joint(root: Path) -> dict[str, Any]:
         and all(map(_is_component, group["components"]))
         for group in groups
     )
-    check_version(path, record.get("format"), FORMAT)
+    check_version(path, record.get("format"), run_record.FORMAT)
     if not sound:
         raise ResultError(f"{path} is damaged. Write it again: vplog map join {root}")
     return record
@@ -58,6 +65,24 @@ def components_in(store: Store) -> list[dict[str, Any]] | None:
     return groups and [component for group in groups for component in group["components"]]
 
 
+def joint_components(store: Store) -> dict[str, Component]:
+    """The component of each drive that is in one. Raises ResultError where their record is damaged."""
+    found = [Component(store.root / "joint" / one["folder"], one["drives"]) for one in components_in(store) or []]
+    return {drive: one for one in found for drive in one.drives}
+
+
+def keyframe_poses(store: Store, joint: Mapping[str, Component], drive: str) -> Floats:
+    """(N, 4, 4) of a drive, in the frame that it shares with those it is joined with. Raises ResultError."""
+    if drive not in joint:
+        with reading_drive(drive):
+            return tables.read_keyframes(store.file(drive, "keyframes.parquet"))[1]
+    path = joint[drive].folder / folder_name(drive) / "keyframes.parquet"
+    try:
+        return tables.read_keyframes(path)[1]
+    except ResultError:
+        raise ResultError(f"{path} is damaged. Join the drives again: vplog map join {store}") from None
+
+
 def replaced_since(root: Path, drives: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Drives of components in whose place others of that name came, by the records of those that are there."""
     keys = read_joint(root).get("keys")
@@ -67,4 +92,4 @@ def replaced_since(root: Path, drives: Mapping[str, Mapping[str, Any]]) -> list[
 
 def write_joint(root: Path, record: dict[str, Any]) -> None:
     """Write joint.json, unless it holds the record already. Raises ResultError."""
-    write_changed(root / "joint.json", {"format": FORMAT, **record})
+    write_changed(root / "joint.json", {"format": run_record.FORMAT, **record})

@@ -19,7 +19,7 @@ from vplog.geometry import se3
 from vplog.loops.localize import KeyframeLandmarks, landmarks_from
 from vplog.maps.geo_bounds import earth_of_run
 from vplog.maps.joining.drive_pairs import known_camera
-from vplog.maps.joining.frames import Component, joint_components, keyframe_poses
+from vplog.maps.joining.joint_record import Component, joint_components, keyframe_poses
 from vplog.maps.joining.members import CameraTrust, member_of, opened_drive, opened_log
 from vplog.maps.search.exact import NO_SCORE, best_places
 from vplog.maps.search.index import SegmentView, place_keyframes, update_index

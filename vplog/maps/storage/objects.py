@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _BLOCK_BYTES = 1 << 20
 """Bytes copied from the store at once."""
 Version = dict[str, str]
-"""What a store tells the states of an object by: its ETag, on gs:// its generation."""
+"""State of an object: its ETag, on gs:// its generation."""
 
 
 class Versioned(NamedTuple):
