@@ -205,7 +205,7 @@ class _Attack:
     ("values", "said"),
     [
         (ragged((_Attack(), [1])), "asks for 'open'"),
-        (ragged((0, [0.5])), "does not hold whole numbers alone"),
+        (ragged((0, [0.5])), "BINFLOAT"),
         (ragged((0, ["a"])), "does not hold whole numbers alone"),
         (ragged((0, [4])), "4 is not a frame of the map, whose 4 frames"),
         (ragged((-1, [0])), "-1 is not a frame of the query"),

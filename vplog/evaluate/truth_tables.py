@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import csv
-import io
-import math
-import pickle
+import pickletools
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -80,6 +78,13 @@ def read_lines(
         raise error(f"{path} is not text, and so not a CSV file. {form}") from None
 
 
+def _check_size(path: Path) -> None:
+    if path.stat().st_size > _FILE_BYTES:
+        raise TruthError(
+            f"{path} is larger than {_FILE_BYTES // 2**20} MB, so it is no table of true pairs. Give one `query,match`."
+        )
+
+
 def listed_rows(rows: Sequence[tuple[str, str, str]], query: Log, other: Log) -> Ints:
     """(P, 2) rows of the pairs of a table `query,match`; a line with no match names a query that has none.
 
@@ -132,11 +137,10 @@ def read_array(path: Path, queries: int, matches: int) -> Ints:
     """(P, 2) pairs of a NumPy file, frame numbers below `queries` and `matches`: (P, 2) whole numbers, VPR-Bench's rows
     of a query and the list of its matches, a list of matches for each query, or a matrix of queries by matches.
 
-    Pickles are read with restricted globals. Raises TruthError.
+    No pickle is executed. Raises TruthError.
     """
     try:
-        if path.stat().st_size > _FILE_BYTES:
-            raise ValueError(f"it is larger than {_FILE_BYTES // 2**20} MB")
+        _check_size(path)
         with path.open("rb") as stream:
             values = _array(stream)
     except OSError as error:
@@ -160,11 +164,10 @@ def _array(stream: BinaryIO) -> Any:
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, kind = read(stream)
     if kind.hasobject:
-        values = _ArrayReader(io.BytesIO(stream.read())).load()
-        if not isinstance(values, _Array) or len(values) != math.prod(shape):
-            raise ValueError(f"it does not hold an array of shape {shape}")
-        pairs = [values[at : at + 2] for at in range(0, len(values), 2)]
-        return pairs if shape[1:] == (2,) else list(enumerate(values))
+        values = _literals(stream)
+        return (
+            [values[at : at + 2] for at in range(0, len(values), 2)] if shape[1:] == (2,) else list(enumerate(values))
+        )
     stream.seek(0)
     values = np.load(stream, allow_pickle=False)
     if values.dtype.kind not in "iub" or values.ndim != 2:
@@ -188,45 +191,85 @@ def _pairs(values: Any, path: Path) -> Ints:
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
-class _Array(list[Any]):
-    """Values of a pickled array. Called as NumPy's `_reconstruct`, with what makes an empty one."""
+class _Name(str):
+    """A name that a pickle asks for; it is compared, never looked up."""
 
-    def __init__(self, *_: Any) -> None:
-        super().__init__()
-
-    def __setstate__(self, state: tuple[Any, Any, _Type, Any, Any]) -> None:
-        _, _, kind, _, content = state
-        self.extend(np.frombuffer(content, kind.name).tolist() if isinstance(content, bytes) else content)
+    __slots__ = ()
 
 
-class _Type:
-    """A pickled dtype of whole numbers or objects."""
+def _literals(stream: BinaryIO) -> list[Any]:  # noqa: PLR0912 (a case an opcode)
+    """The content of a pickled array of numbers and lists, from the opcodes: nothing is imported or called.
 
-    def __init__(self, name: str, *_: Any) -> None:
-        self.name = name.lstrip("<>=|")
-        if self.name[:1] not in ("i", "u", "O", "b"):
-            raise ValueError(f"it holds {name[:40]!r}")
+    Raises ValueError for anything else.
+    """
+    stack: list[Any] = []
+    marks: list[int] = []
+    memo: dict[int, Any] = {}
+    for opcode, argument, _ in pickletools.genops(stream):
+        match opcode.name:
+            case "PROTO" | "FRAME":
+                pass
+            case "STOP":
+                return stack.pop()
+            case "MARK":
+                marks.append(len(stack))
+            case "GLOBAL":
+                stack.append(_Name(str(argument).rpartition(" ")[2]))
+            case "STACK_GLOBAL":
+                stack[-2:] = [_Name(stack[-1])]
+            case "MEMOIZE":
+                memo[len(memo)] = stack[-1]
+            case "PUT" | "BINPUT" | "LONG_BINPUT":
+                memo[int(str(argument))] = stack[-1]
+            case "GET" | "BINGET" | "LONG_BINGET":
+                stack.append(memo[int(str(argument))])
+            case "NONE" | "NEWTRUE" | "NEWFALSE":
+                stack.append({"NONE": None, "NEWTRUE": True, "NEWFALSE": False}[opcode.name])
+            case "EMPTY_LIST" | "EMPTY_TUPLE":
+                stack.append([])
+            case "APPEND":
+                item = stack.pop()
+                stack[-1].append(item)
+            case "APPENDS" | "LIST" | "TUPLE":
+                at = marks.pop()
+                stack[at:], items = [], stack[at:]
+                stack[-1].extend(items) if opcode.name == "APPENDS" else stack.append(items)
+            case "TUPLE1" | "TUPLE2" | "TUPLE3":
+                count = int(opcode.name[-1])
+                stack[-count:] = [stack[-count:]]
+            case "REDUCE":
+                stack[-2:] = [_called(*stack[-2:])]
+            case "BUILD":
+                state = stack.pop()
+                _build(stack[-1], state)
+            case _ if argument is not None and isinstance(argument, int | str | bytes):
+                stack.append(argument)
+            case name:
+                raise ValueError(f"it has {name}, which no list of numbers needs")
+    raise ValueError("it ends early")
 
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        self.name = (">" if state[1] == ">" else "<") + self.name
+
+def _called(name: Any, given: Any) -> Any:
+    """The value that one of the four calls in a pickled array stands for."""
+    if not isinstance(name, _Name):
+        raise ValueError("it calls what is no name")
+    match str(name):
+        case "_reconstruct":
+            return []
+        case "dtype" if str(given[0]).lstrip("<>=|")[:1] in ("i", "u", "O", "b"):
+            return [str(given[0])]
+        case "scalar":
+            return int(np.frombuffer(given[1], np.dtype(given[0][0]))[0])
+        case "encode":
+            return str(given[0]).encode("latin1")
+    raise ValueError(f"it asks for {str(name)[:40]!r}")
 
 
-def _scalar(kind: _Type, data: bytes) -> int:
-    return int(np.frombuffer(data, kind.name)[0])
-
-
-def _encoded(text: str, _: str) -> bytes:
-    return text.encode("latin1")
-
-
-class _ArrayReader(pickle._Unpickler):  # in C, damaged indices of the memo would allocate gigabytes
-    """Restricted to what stands here for NumPy's names: a pickle imports nothing, and calls nothing else."""
-
-    _NAMES: ClassVar = {
-        "ndarray": _Array, "_reconstruct": _Array, "dtype": _Type, "scalar": _scalar, "encode": _encoded,
-    }  # fmt: skip
-
-    def find_class(self, module: str, name: str) -> Any:
-        if name not in self._NAMES:
-            raise ValueError(f"it asks for {name[:40]!r}")
-        return self._NAMES[name]
+def _build(made: Any, state: Any) -> None:
+    """Fill an array with (version, shape, type, order, content); of a type the byte order is all that matters."""
+    if made and isinstance(made[0], str):
+        made[0] = (">" if state[1] == ">" else "<") + made[0].lstrip("<>=|")
+    elif isinstance(state[4], bytes):
+        made.extend(np.frombuffer(state[4], np.dtype(state[2][0])).tolist())
+    else:
+        made.extend(state[4])
