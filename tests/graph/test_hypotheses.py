@@ -14,7 +14,7 @@ from tests.graph.drive import CLOSURE_SIGMA, ODOMETRY_SIGMA, Drive, position_err
 from vplog.geometry import se3
 from vplog.graph import hypotheses
 from vplog.graph.consistency import OdometryChain, is_loop
-from vplog.graph.evidence import log_evidence, log_partition, log_room, log_tails, runs
+from vplog.graph.evidence import Accidents, log_evidence, log_partition, log_room, log_tails, runs
 from vplog.graph.factors import Factors
 from vplog.graph.hypotheses import best_hypothesis, bounded
 from vplog.graph.least_squares import Objective, descend
@@ -141,16 +141,16 @@ def test_the_evidence_of_true_closures_is_their_density_under_the_odometry() -> 
     """Against the dense joint covariance of closures that are linear in small errors."""
     drive = ring(30, loops=6, seed=7)
     graph, weight = drive.graph, np.ones(len(drive.graph.a))
-    factors, chain = Factors.of(graph), OdometryChain.of(graph)
+    factors, chain, accidents = Factors.of(graph), OdometryChain.of(graph), Accidents(graph)
     loops = np.flatnonzero(is_loop(graph))
     poses = descend(factors, weight, chain.poses, 100, 1e-9).world_from_body
     apart = weight.copy()
     apart[loops] = 0.0
-    change = log_evidence(factors, weight, poses, chain) - log_evidence(factors, apart, chain.poses, chain)
+    change = log_evidence(factors, weight, poses, accidents) - log_evidence(factors, apart, chain.poses, accidents)
     fewer = weight.copy()
     fewer[loops[0]] = 0.0
     rest = descend(factors, fewer, poses, 100, 1e-9).world_from_body
-    assert change > log_evidence(factors, fewer, rest, chain) - log_evidence(factors, apart, chain.poses, chain)
+    assert change > log_evidence(factors, fewer, rest, accidents) - log_evidence(factors, apart, chain.poses, accidents)
     assert np.isfinite(Objective(factors, weight).information(poses).log_determinant())
 
 
