@@ -321,7 +321,7 @@ def _estimated(claimed: Factors, weight: Floats, poses: Floats, sigmas: Sigmas) 
 
 @dataclass(frozen=True, eq=False)
 class AtSigmas:
-    """The graph with its sigmas multiplied: sets of closures are compared on it, and what they share is computed once."""
+    """The graph with its sigmas multiplied, on which sets of closures are compared."""
 
     sigmas: Sigmas
     factors: Factors
