@@ -185,6 +185,16 @@ def tiny_drives(made_once: Callable[..., Path]) -> list[Path]:
 
 
 @pytest.fixture(scope="session")
+def tiny(tiny_drives: list[Path]) -> Drive:
+    """The first of the tiny drives, of which the last half dozen frames pass known places."""
+    from vplog.demo.record import Drive
+    from vplog.demo.scene import make_scene
+
+    folder = tiny_drives[0]
+    return Drive(**vars(make_scene(TINY)), log=folder / "drive.mcap", truth=folder / "truth.tum")
+
+
+@pytest.fixture(scope="session")
 def finished(drive: Drive, made_once: Callable[..., Path]) -> Path:
     """The folder of a default run on the small drive, with two threads. Tests read it and leave it as it is."""
     pipeline, execution = load_pipeline("default"), Execution(2)

@@ -6,6 +6,7 @@ import ast
 import re
 import subprocess
 import sys
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -57,14 +58,23 @@ def module_of(file: Path) -> str:
     return ".".join(("vplog", *file.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__")
 
 
-def imports(file: Path) -> Iterator[str]:
+@cache
+def imports(file: Path) -> list[str]:
     """Full names of all that a file imports, wherever in it and for whatever purpose."""
+    found = []
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{name_of(file)}: imports are absolute"
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            found += [f"{node.module}.{alias.name}" for alias in node.names]
+    return found
+
+
+def nodes(file: Path, words: str) -> Iterator[ast.AST]:
+    """All nodes of a file that has some of the words (a pattern) in its text; else there is nothing to find."""
+    text = file.read_text(encoding="utf-8")
+    yield from ast.walk(ast.parse(text)) if re.search(words, text) else ()
 
 
 def parts_used(file: Path) -> set[str]:
@@ -105,7 +115,7 @@ def test_no_stage_asks_for_a_certain_recogniser() -> None:
     """What a state can do is a protocol of stages.py."""
     asked = []
     for file in FILES:
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        for node in nodes(file, "(Bobb|Hybrid)State"):
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance" and part_of(file) != "places":
                 kinds = {name.id for name in ast.walk(node.args[1]) if isinstance(name, ast.Name)}
                 asked += [f"{name_of(file)}:{node.lineno}" for kind in kinds if re.search("(Bobb|Hybrid)State", kind)]
@@ -125,7 +135,7 @@ def test_only_the_graph_knows_gtsam() -> None:
 def speech(file: Path) -> list[str]:
     """Calls that print or exit."""
     found = []
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in nodes(file, "print|exit|quit|stdout|stderr|SystemExit"):
         if isinstance(node, ast.Call):
             name = ast.unparse(node.func)
             streams = ("sys.stdout.", "sys.stderr.")

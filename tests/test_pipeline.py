@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -41,6 +42,8 @@ FILES = (*(f"{name}.parquet" for name in TABLES), "trajectory.tum", "graph.g2o",
 LIBRARY = ("library/library.json", "library/references.parquet", "library/features.parquet")
 QUICK = ("features.max_features=400", "propose.per_query=2", "library.size=5")
 """Settings for runs of which only the course matters."""
+CLOSE = (*QUICK, "propose.gap_keyframes=15", "propose.gap_steps=15")
+"""With closures on the tiny drive too."""
 
 
 def record_of(folder: Path) -> dict[str, Any]:
@@ -102,16 +105,20 @@ def test_settings_of_a_run_give_the_run_again(finished: Path, tmp_path: Path) ->
 
 
 def test_the_same_bytes_from_any_number_of_threads_and_over_an_old_run(
-    drive: Drive, finished: Path, tmp_path: Path
+    drive: Drive, finished: Path, tiny: Drive, tmp_path: Path
 ) -> None:
-    run(drive.log, tmp_path, load_pipeline("default"), execution=Execution(1))
-    one = contents(tmp_path)
-    (tmp_path / ".cache" / ".extract-000000.stage.1.part").write_bytes(b"left by a run that was killed")
-    run(drive.log, tmp_path, load_pipeline("default"), execution=Execution(4), cache=CacheOptions(use=False))
+    """One thread and two on all that a run does, four and three on a smaller one that is run over another."""
+    run(drive.log, tmp_path / "one", load_pipeline("default"), execution=Execution(1), cache=CacheOptions(use=False))
     for name, data in contents(finished).items():
-        assert one[name] == data, f"{name} differs between one thread and two"
-        assert (tmp_path / name).read_bytes() == data, f"{name} differs between four threads and two"
-    assert not (tmp_path / ".cache").exists()
+        assert (tmp_path / "one" / name).read_bytes() == data, f"{name} differs between one thread and two"
+    out, quick = tmp_path / "over", load_pipeline("default", CLOSE)
+    run(tiny.log, out, quick, execution=Execution(3))
+    three = contents(out)
+    (out / ".cache" / ".extract-000000.stage.1.part").write_bytes(b"left by a run that was killed")
+    run(tiny.log, out, quick, execution=Execution(4), cache=CacheOptions(use=False))
+    for name, data in contents(out).items():
+        assert three[name] == data, f"{name} differs between three threads and four"
+    assert not (out / ".cache").exists()
 
 
 def test_closures_take_out_the_drift(finished: Path, drive: Drive) -> None:
@@ -245,10 +252,12 @@ def test_accepted_closures_are_whole_and_the_others_are_not_in_the_graph(finishe
     assert np.isnan(ledger.residual_after[~accepted]).all()
 
 
-def test_a_closure_that_the_solver_rejects_has_no_weight(drive: Drive, tmp_path: Path) -> None:
+def test_a_closure_that_the_solver_rejects_has_no_weight(drive: Drive, finished: Path, tmp_path: Path) -> None:
     """A gate this narrow turns away closures that are right."""
-    strict = load_pipeline("default", [*QUICK, "solve.kind=pcm", "solve.gate_probability=0.001"])
+    shutil.copytree(finished / ".cache", tmp_path / ".cache")  # all but the solve is as it was
+    strict = load_pipeline("default", ["solve.kind=pcm", "solve.gate_probability=0.001"])
     ledger = run(drive.log, tmp_path, strict, execution=Execution(4)).closures
+    assert record_of(tmp_path)["stages"]["verify"]["result"] == "reused"
     rejected = np.array([verdict == Verdict.REJECTED_BY_SOLVER for verdict in ledger.verdict])
     assert rejected.any()
     assert (ledger.weight[rejected] == 0).all()
@@ -258,12 +267,12 @@ def test_a_closure_that_the_solver_rejects_has_no_weight(drive: Drive, tmp_path:
     assert (edges["weight"][edges["kind"] == "loop"] == 0).sum() == rejected.sum()
 
 
-def test_a_library_of_another_drive_is_used_and_named(drive: Drive, tmp_path: Path) -> None:
+def test_a_library_of_another_drive_is_used_and_named(tiny: Drive, tmp_path: Path) -> None:
     pipeline = load_pipeline("default", QUICK)
-    state = build_library([drive.log], tmp_path / "library", pipeline, execution=Execution(4))
+    state = build_library([tiny.log], tmp_path / "library", pipeline, execution=Execution(4))
     known = json.loads((tmp_path / "library" / "library.json").read_text())
     assert known["references"] == 5
-    record = run(drive.log, tmp_path / "run", pipeline, tmp_path / "library", execution=Execution(4)).record
+    record = run(tiny.log, tmp_path / "run", pipeline, tmp_path / "library", execution=Execution(4)).record
     about = record["library"]
     assert (about["hash"], about["from"], about["references"]) == (known["hash"], str(tmp_path / "library"), 5)
     assert about["coverage"]["explained"] > 0.5

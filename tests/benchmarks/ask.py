@@ -19,7 +19,7 @@ from vplog.data import EdgeKind, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.build import AXES
 from vplog.graph.consistency import OdometryChain, odometry_chain
-from vplog.graph.evidence import accidents, log_room
+from vplog.graph.evidence import Accidents
 from vplog.graph.questions import questions
 from vplog.graph.solve import GncSettings, LmSettings, decided
 from vplog.graph.variance_components import claimed_times
@@ -116,7 +116,7 @@ def misplaced(graph: PoseGraph, seed: int) -> tuple[PoseGraph, Bools]:
     """The graph with a third of the places taken for one that lies some metres on or back, as facades and aisles are:
     all closures of a place agree, and the odometry would stand it. Which edges (E,) are."""
     random, chain = np.random.default_rng(seed), OdometryChain.of(graph)
-    places = list(accidents(graph, np.flatnonzero(~graph.odometry), chain, log_room(graph, chain.poses)))
+    places = list(Accidents(graph).among(np.flatnonzero(~graph.odometry)))
     a_from_b, false = graph.a_from_b.copy(), np.zeros(len(graph.a), bool)
     forward = se3.between(chain.poses[:-1], chain.poses[1:])[:, :3, 3]
     for at in random.choice(len(places), -(-len(places) // 3), replace=False).tolist():
@@ -230,9 +230,8 @@ def _runs(
     """The runs of closures in the order in which they are asked about."""
     if way == "ask":
         return [one.edges for one in questions(graph, weight, np.zeros(len(weight)), answer != 0)]
-    chain = OdometryChain.of(graph)
     loops = np.flatnonzero(~graph.odometry)
-    runs = [run for run in accidents(graph, loops, chain, log_room(graph, chain.poses)) if not answer[run].any()]
+    runs = [run for run in Accidents(graph).among(loops) if not answer[run].any()]
     runs = [runs[at] for at in random.permutation(len(runs))]
     return runs if way == "random" else sorted(runs, key=lambda run: float(case.score[run].mean()))
 

@@ -15,7 +15,7 @@ from vplog.evaluate.closure_pose import pose_bounds, pose_errors
 from vplog.evaluate.closures import ClosureScore, Judgement, score_closures
 from vplog.geometry import se3
 
-SEEDS = range(3)
+SEEDS = range(2)
 
 
 def judged(drive: Drawn, truth: Trajectory) -> tuple[ClosureScore, Judgement, BodyTruth]:
@@ -107,12 +107,11 @@ def test_odometry_without_metres_finds_the_frame_of_the_truth(kind: str, scale: 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_truth_of_another_clock_is_known_as_such(kind: str) -> None:
     drive = draw(kind, 4)
-    for truth in (drive.truth.world_from_body, drive.truth.world_from_body @ drive.camera):
-        for offset_s in (-2.0, 0.1, 0.5):
-            late = Trajectory(drive.truth.stamp_ns + round(offset_s * 1e9), truth)
-            found = body_truth(late, drive.odometry, drive.camera).offset_s
-            assert found == pytest.approx(-offset_s, abs=0.03), offset_s
-        assert body_truth(Trajectory(drive.truth.stamp_ns, truth), drive.odometry, drive.camera).offset_s == 0.0
+    of_body, of_camera = drive.truth.world_from_body, drive.truth.world_from_body @ drive.camera
+    for truth, offset_s in ((of_body, -2.0), (of_camera, 0.1), (of_body, 0.5), (of_camera, 0.0)):
+        late = Trajectory(drive.truth.stamp_ns + round(offset_s * 1e9), truth)
+        found = body_truth(late, drive.odometry, drive.camera).offset_s
+        assert found == pytest.approx(-offset_s, abs=0.03 if offset_s else 0.0), offset_s
 
 
 @pytest.mark.parametrize("times", [1, 10])

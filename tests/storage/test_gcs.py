@@ -42,31 +42,31 @@ def server() -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def log(server: str, drive: Drive) -> str:
+def log(server: str, tiny: Drive) -> str:
     with local_output(located("gs://bucket/in")) as folder:
         folder.mkdir()
-        (folder / "drive.mcap").write_bytes(drive.log.read_bytes())
+        (folder / "drive.mcap").write_bytes(tiny.log.read_bytes())
     return "gs://bucket/in/drive.mcap"
 
 
-def test_a_log_reads_as_the_file_does(drive: Drive, log: str) -> None:
-    there, here = logs.open(located(log)), logs.open(drive.log)
+def test_a_log_reads_as_the_file_does(tiny: Drive, log: str) -> None:
+    there, here = logs.open(located(log)), logs.open(tiny.log)
     assert there.name == "drive"
     assert (there.stamps() == here.stamps()).all()
     stamps = here.stamps()[[3, 20]]
     for one, other in zip(there.frames(stamps), here.frames(stamps), strict=True):
         assert (one.decode().image == other.decode().image).all()
     known: Any = located(log)
-    assert known.version().startswith(f"length {drive.log.stat().st_size}, time 1")
+    assert known.version().startswith(f"length {tiny.log.stat().st_size}, time 1")
 
 
-def test_a_run_goes_from_gs_to_gs_and_is_evaluated_there(drive: Drive, log: str, verb: Callable[..., Said]) -> None:
+def test_a_run_goes_from_gs_to_gs_and_is_evaluated_there(tiny: Drive, log: str, verb: Callable[..., Said]) -> None:
     found = verb("run", log, "-o", "gs://bucket/runs/a", "--threads", 2, "--json", *QUICK).json
     assert (found["run"], found["log"], list(found["inputs"])) == ("gs://bucket/runs/a", log, ["drive.mcap"])
     names = {path.name for path in located("gs://bucket/runs/a").iterdir()}
     assert {"run.json", "result.mcap", "closures.parquet", "trajectory.tum", "library"} <= names
     assert json.loads((located("gs://bucket/runs/a") / "run.json").read_text())["finished"] is True
-    assert verb("evaluate", "gs://bucket/runs/a", "--truth", drive.truth, "--json").json["ate_after"]["count"] > 300
+    assert verb("evaluate", "gs://bucket/runs/a", "--truth", tiny.truth, "--json").json["ate_after"]["count"] > 300
 
 
 def test_a_folder_comes_back_as_it_went(server: str, tmp_path: Path) -> None:

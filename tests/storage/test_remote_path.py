@@ -28,8 +28,12 @@ if TYPE_CHECKING:
 
 QUICK = [
     f"--set={one}"
-    for one in ("features.max_features=400", "features.max_megapixels=0.05", "propose.per_query=2", "library.size=5")
-]
+    for one in (
+        "features.max_features=300", "library.size=5", "propose.per_query=2", "propose.gap_keyframes=15",
+        "propose.gap_steps=15",
+    )
+]  # fmt: skip
+"""With closures on the tiny drive."""
 
 
 class RangeHandler(SimpleHTTPRequestHandler):
@@ -102,8 +106,8 @@ def test_a_log_on_s3_reads_as_the_file_does(drive: Drive, bucket: str) -> None:
     assert there.name == "drive"
 
 
-def test_a_run_goes_from_s3_to_s3_and_is_evaluated_there(drive: Drive, bucket: str, verb: Callable[..., Said]) -> None:
-    put(drive.log, f"{bucket}/two")
+def test_a_run_goes_from_s3_to_s3_and_is_evaluated_there(tiny: Drive, bucket: str, verb: Callable[..., Said]) -> None:
+    put(tiny.log, f"{bucket}/two")
     found = verb("run", f"{bucket}/two/drive.mcap", "-o", f"{bucket}/runs/a", "--threads", 2, "--json", *QUICK).json
     assert found["run"] == f"{bucket}/runs/a"
     assert found["log"] == f"{bucket}/two/drive.mcap"
@@ -111,9 +115,9 @@ def test_a_run_goes_from_s3_to_s3_and_is_evaluated_there(drive: Drive, bucket: s
     names = {path.name for path in located(f"{bucket}/runs/a").iterdir()}
     assert {"run.json", "result.mcap", "closures.parquet", "trajectory.tum"} <= names
     assert json.loads((located(f"{bucket}/runs/a") / "run.json").read_text())["finished"] is True
-    put(drive.truth, f"{bucket}/two")
-    truth = f"{bucket}/two/{drive.truth.name}"
-    assert verb("evaluate", f"{bucket}/runs/a", "--truth", truth, "--json").json["closures"]["keyframes"] > 40
+    put(tiny.truth, f"{bucket}/two")
+    truth = f"{bucket}/two/{tiny.truth.name}"
+    assert verb("evaluate", f"{bucket}/runs/a", "--truth", truth, "--json").json["closures"]["keyframes"] > 20
     assert "Cannot read s3://" in verb("evaluate", f"{bucket}/runs/a", "--truth", f"{truth}.not").error
     assert verb("evaluate", f"{bucket}/runs/a", "--truth", "gps", "--json").json["ate_after"]["rmse_m"] > 0
 

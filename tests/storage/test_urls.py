@@ -53,11 +53,11 @@ class SignedHandler(RangeHandler):
 
 
 @pytest.fixture
-def server(drive: Drive, tmp_path: Path) -> Iterator[str]:
+def server(tiny: Drive, tmp_path: Path) -> Iterator[str]:
     folder = tmp_path / "served"
     folder.mkdir()
-    shutil.copy(drive.log, folder / "drive.mcap")
-    shutil.copy(drive.truth, folder / "truth.tum")
+    shutil.copy(tiny.log, folder / "drive.mcap")
+    shutil.copy(tiny.truth, folder / "truth.tum")
     SignedHandler.asked = []
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(SignedHandler, directory=str(folder)))
     thread = Thread(target=server.serve_forever, daemon=True)
@@ -95,7 +95,7 @@ def test_no_verb_writes_or_says_a_signature(server: str, verb: Verb, tmp_path: P
         verb("map", "redescribe", out / "map", "--library", out / "library", "-o", out / "again"),
         verb("map", "merge", out / "map", "-o", out / "merged"),
         verb("map", "export", out / "map", "-o", out / "places.parquet"),
-        verb("compare", log, "--min-gap", 20, "--methods", "thumbnail", "--truth", truth, "-o", out / "compare"),
+        verb("compare", log, "--min-gap", 15, "--methods", "thumbnail", "--truth", truth, "-o", out / "compare"),
     ]  # fmt: skip
     check(out, *said)
     for one in said:

@@ -32,7 +32,10 @@ if TYPE_CHECKING:
 
     Verb = Callable[..., Said]
 
-QUICK = ("features.max_features=400", "propose.per_query=2", "library.size=5")
+QUICK = (
+    "features.max_features=400", "propose.per_query=2", "library.size=5", "propose.gap_keyframes=15",
+    "propose.gap_steps=15",
+)  # fmt: skip
 
 
 def of(folder: Path, verdict: Verdict) -> int:
@@ -255,8 +258,8 @@ def test_without_its_library_a_run_is_shown_without_boxes(verb: Verb, copied: Pa
 
 
 @pytest.mark.parametrize("kind", ["bovf", "bobb_paper"])
-def test_other_recognisers_are_shown_with_what_they_have(verb: Verb, drive: Drive, tmp_path: Path, kind: str) -> None:
-    run(drive.log, tmp_path / "run", load_pipeline("default", [*QUICK, f"places.kind={kind}"]), execution=Execution(2))
+def test_other_recognisers_are_shown_with_what_they_have(verb: Verb, tiny: Drive, tmp_path: Path, kind: str) -> None:
+    run(tiny.log, tmp_path / "run", load_pipeline("default", [*QUICK, f"places.kind={kind}"]), execution=Execution(2))
     picture = tmp_path / "a.png"
     found = verb("explain", tmp_path / "run", "--closure", 0, "-o", picture, "--json").json
     assert picture.is_file()

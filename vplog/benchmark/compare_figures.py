@@ -74,7 +74,8 @@ class Figures:
         titles = ("query", "given", "right")[: 3 if scored else 2]
         with saved_figure(folder, file, 2.7 * len(titles), 1.9 * len(shown) + 0.4, ("png",)) as figure:
             figure.suptitle(as_text(f"{name}: wrong answers, the most certain first" if scored else f"{name}: answers"))
-            grid = figure.subplots(len(shown), len(titles), squeeze=False)
+            bare = {"xticks": [], "yticks": []}
+            grid = figure.subplots(len(shown), len(titles), squeeze=False, subplot_kw=bare)
             for axes, query in zip(grid, shown.tolist(), strict=True):
                 given, right = int(ranks.top_row[query]), int(ranks.true_row[query])
                 rank = 1 + int(ranks.better[query])
@@ -85,7 +86,7 @@ class Figures:
                 )  # fmt: skip
                 sides = (picture(self.query, query), picture(self.map, given), picture(self.map, right))
                 for one, text, image in zip(axes, texts, sides, strict=False):
-                    one.set_title(as_text(_end(text)), fontsize=7)
+                    one.set_title(as_text(_end(text)), fontsize=7, y=1.0)  # nothing to look for its place among
                     one.axis("off")
                     if image is not None:
                         one.imshow(image, cmap="gray", vmin=0, vmax=255)

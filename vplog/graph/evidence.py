@@ -16,14 +16,13 @@ import numpy as np
 
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed, parts
-from vplog.graph.consistency import degrees_of_freedom, is_loop, residual_sigma
+from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, residual_sigma
 from vplog.graph.least_squares import GAUGE_SIGMA, Objective
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from vplog.data import Floats, Ints, PoseGraph
-    from vplog.graph.consistency import OdometryChain
     from vplog.graph.factors import Factors
 
 _BESIDE = 3
@@ -34,6 +33,8 @@ _EARLIER = 200
 """Runs before one that may share its displacement: bounds the pairs of graphs with thousands of false closures."""
 _PAIRS = 1 << 12
 """Pairs of runs compared at once: some megabytes."""
+_TOGETHER = 32
+"""Claims whose pairs are all compared at once: a call for each costs more than a thousand of them."""
 _RECENT = 10
 """Last members of a family by which the next one is predicted."""
 _SAMPLE = 200
@@ -70,16 +71,44 @@ class _Run(NamedTuple):
     """(d, d) in the frame of b."""
 
 
-def log_evidence(factors: Factors, weight: Floats, poses: Floats, chain: OdometryChain) -> float:
+class Accidents:
+    """Runs of closures of a graph as accidents: what a run comes to is the same in all sets that it is false in."""
+
+    def __init__(self, graph: PoseGraph) -> None:
+        self.graph, self.chain = graph, OdometryChain.of(graph)
+        self.room = log_room(graph, self.chain.poses)
+        self._parted: dict[bytes, list[Ints]] = {}
+        self._measured: dict[bytes, tuple[float, _Run | None]] = {}
+
+    def among(self, loops: Ints) -> Iterator[Ints]:
+        """Runs of the edges `loops` (K,) that agree with each other: of those that do not, each lot is an accident of
+        its own."""
+        for run in runs(self.graph, loops):
+            key = run.tobytes()
+            if key not in self._parted:
+                self._parted[key] = [run[members] for members in self._families(run)] if len(run) > 1 else [run]
+            yield from self._parted[key]
+
+    def _families(self, run: Ints) -> list[Ints]:
+        return families(Displacements(self.chain, *forward(self.graph, run)), self.room)[0]
+
+    def as_one(self, run: Ints) -> tuple[float, _Run | None]:
+        """See `_as_one`."""
+        key = run.tobytes()
+        if key not in self._measured:
+            self._measured[key] = _as_one(self.graph, run, self.chain)
+        return self._measured[key]
+
+
+def log_evidence(factors: Factors, weight: Floats, poses: Floats, accidents: Accidents) -> float:
     """Log density of all closures where those of positive weight (E,), 0 or 1, are true.
 
-    `poses` are their least squares, `chain` the graph's odometry.
+    `poses` are their least squares, `accidents` the graph's.
     """
-    graph = factors.graph
+    graph, room = factors.graph, accidents.room
     loops = ~graph.odometry
     true, false = np.flatnonzero(loops & (weight > 0)), np.flatnonzero(loops & (weight == 0))
-    room = log_room(graph, chain.poses)
-    total, count = _log_false(graph, false, chain, room)
+    total, count = _log_false(accidents, false)
     places = sum(1 for _ in runs(graph, true))
     # each place is true or an accident, the share of true ones unknown: the beta function
     total += math.lgamma(places + 1) + math.lgamma(count + 1) - math.lgamma(places + count + 2)
@@ -180,30 +209,20 @@ def runs(graph: PoseGraph, loops: Ints) -> Iterator[Ints]:
             yield loops[order[run[start : start + _LONGEST]]]
 
 
-def _log_false(graph: PoseGraph, false: Ints, chain: OdometryChain, room: float) -> tuple[float, int]:
+def _log_false(accidents: Accidents, false: Ints) -> tuple[float, int]:
     """Log density of the false closures, and how many runs they are."""
-    total, count, together = 0.0, 0, []
-    for run in accidents(graph, false, chain, room):
+    total, count, together, room = 0.0, 0, [], accidents.room
+    for run in accidents.among(false):
         count += 1
-        inner, one = _as_one(graph, run, chain)
+        inner, one = accidents.as_one(run)
         if one is None or inner < -room * (len(run) - 1):  # they do not agree with each other
             total -= room * len(run)
         else:
             total += inner
             together.append(one)
     if together:
-        total += families(Displacements.of(together, chain), room)[1]
+        total += families(Displacements.of(together, accidents.chain), room)[1]
     return total, count
-
-
-def accidents(graph: PoseGraph, false: Ints, chain: OdometryChain, room: float) -> Iterator[Ints]:
-    """Runs of false closures that agree with each other: of those that do not, each lot is an accident of its own."""
-    for run in runs(graph, false):
-        if len(run) == 1:
-            yield run
-            continue
-        claims = Displacements(chain, *forward(graph, run))
-        yield from (run[members] for members in families(claims, room)[0])
 
 
 def _as_one(graph: PoseGraph, run: Ints, chain: OdometryChain) -> tuple[float, _Run | None]:
@@ -271,18 +290,17 @@ def forward(graph: PoseGraph, edges: Ints) -> tuple[Ints, Ints, Floats, Floats]:
     )
 
 
-def agreeing(graph: PoseGraph, loops: Ints, chain: OdometryChain) -> list[Ints]:
+def agreeing(accidents: Accidents, loops: Ints) -> list[Ints]:
     """The edges `loops` (K,) in sets that claim one displacement, largest first; runs that disagree are in none."""
-    room = log_room(graph, chain.poses)
     members, together = [], []
-    for run in accidents(graph, loops, chain, room):
-        _, one = _as_one(graph, run, chain)
+    for run in accidents.among(loops):
+        _, one = accidents.as_one(run)
         if one is not None:
             members.append(run)
             together.append(one)
     if not together:
         return []
-    found, _ = families(Displacements.of(together, chain), room)
+    found, _ = families(Displacements.of(together, accidents.chain), accidents.room)
     sets = [np.concatenate([members[run] for run in family.tolist()]) for family in found]
     return sorted(sets, key=len, reverse=True)
 
@@ -340,6 +358,7 @@ class Displacements:
         Ad = self._adjoint(at_b)
         self._own = Ad @ noise @ np.swapaxes(Ad, 1, 2)
         self._after = self._adjoint(se3.inverse(self._displaced))
+        self._all: Floats | None = None
 
     @classmethod
     def of(cls, together: list[_Run], chain: OdometryChain) -> Displacements:
@@ -384,11 +403,19 @@ class Displacements:
         mixed = after @ shared(a, b)
         covariance = after @ shared(a, a) @ after.T + shared(b, b) - mixed - mixed.transpose(1, 0, 3, 2)
         covariance[range(len(a)), range(len(a))] += self._own[members]
-        error = se3.log(se3.between(self._displaced[middle][None], self._displaced[members]))[:, self._chain.axes]
         try:
-            return _log_common(error, np.swapaxes(covariance, 1, 2))[0]
+            return _log_common(self._twists(middle, members), np.swapaxes(covariance, 1, 2))[0]
         except np.linalg.LinAlgError:
             return -np.inf
+
+    def _twists(self, one: int, others: list[int]) -> Floats:
+        """Twists (K, d) from a displacement to others; of few claims, those of all pairs are computed together."""
+        if self.count > _TOGETHER:
+            return se3.log(se3.between(self._displaced[one][None], self._displaced[others]))[:, self._chain.axes]
+        if self._all is None:
+            apart = se3.between(np.repeat(self._displaced, self.count, 0), np.tile(self._displaced, (self.count, 1, 1)))
+            self._all = se3.log(apart)[:, self._chain.axes].reshape(self.count, self.count, -1)
+        return self._all[one, others]
 
     def _adjoint(self, poses: Floats) -> Floats:
         return se3.adjoint(poses)[:, self._chain.axes][:, :, self._chain.axes]

@@ -16,7 +16,7 @@ import numpy as np
 from vplog.errors import GraphError
 from vplog.graph.build import informed
 from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, residual_sigma
-from vplog.graph.evidence import agreeing, log_evidence, log_room, runs
+from vplog.graph.evidence import Accidents, agreeing, log_evidence, log_room, runs
 from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
 from vplog.graph.least_squares import Objective, descend
@@ -166,10 +166,9 @@ def _at_the_sigmas_of_others(claimed: Factors, found: list[Hypothesis]) -> list[
         if len(sets) < _COMPARED and not any((one.weight == other.weight).all() for other in sets):
             sets.append(one)
     pairs = [(one, other.sigmas) for one in sets for other in sets if one.sigmas.differ(other.sigmas, _STEADY)]
+    at = {sigmas: AtSigmas.of(claimed, sigmas) for sigmas in dict.fromkeys(sigmas for _, sigmas in pairs)}
     return [
-        two
-        for one, s in pairs
-        for two in attempted(lambda one=one, s=s: [hypothesis_of(claimed, one.weight, one.poses, s)])
+        two for one, s in pairs for two in attempted(lambda one=one, s=s: [at[s].hypothesis(one.weight, one.poses)])
     ]
 
 
@@ -224,7 +223,7 @@ def _families(graph: PoseGraph, loops: Ints, sigmas: Sigmas) -> list[Bools]:
     for share in _SHARES:
         tried = sigmas._replace(rotation=share * sigmas.rotation, translation=share * sigmas.translation)
         present = claimed_times(graph, tried)
-        found += [np.isin(loops, edges) for edges in agreeing(present, loops, OdometryChain.of(present))[:_FAMILIES]]
+        found += [np.isin(loops, edges) for edges in agreeing(Accidents(present), loops)[:_FAMILIES]]
     return found
 
 
@@ -234,15 +233,17 @@ def _improved(claimed: Factors, best: Hypothesis, families: Sequence[Ints] = ())
     Tried are the rejected runs that fit best, the accepted ones that fit worst, and `families` rejected as a whole:
     their members support each other.
     """
-    loops = is_loop(claimed.graph)
+    loops, at = is_loop(claimed.graph), AtSigmas.of(claimed, best.sigmas)
     for _ in range(_MOST_FLIPS):
-        misfit = residual_sigma(claimed_times(claimed.graph, best.sigmas), best.poses)
+        if at.sigmas != best.sigmas:
+            at = AtSigmas.of(claimed, best.sigmas)
+        misfit = residual_sigma(at.factors.graph, best.poses)
         flips: list[Ints] = []
         for accepted, sign in ((False, 1.0), (True, -1.0)):
             edges = np.flatnonzero(loops & ((best.weight > 0) == accepted))
             flips += sorted(runs(claimed.graph, edges), key=lambda run: sign * float(misfit[run].mean()))[:_FLIPS]
         flips += [accepted for family in families if len(accepted := family[best.weight[family] > 0])]
-        tried = [one for run in flips for one in _flipped(claimed, best, run)]
+        tried = [one for run in flips for one in _flipped(at, best, run)]
         better = max(tried, key=lambda one: one.log_evidence, default=best)
         if better.log_evidence <= best.log_evidence:
             break
@@ -251,12 +252,12 @@ def _improved(claimed: Factors, best: Hypothesis, families: Sequence[Ints] = ())
     return best
 
 
-def _flipped(claimed: Factors, best: Hypothesis, run: Ints) -> list[Hypothesis]:
+def _flipped(at: AtSigmas, best: Hypothesis, run: Ints) -> list[Hypothesis]:
     weight = np.array(best.weight)
     weight[run] = 1.0 - weight[run]
-    if not weight[is_loop(claimed.graph)].any():
+    if not weight[is_loop(at.factors.graph)].any():
         return []
-    return attempted(lambda: [hypothesis_of(claimed, weight, best.poses, best.sigmas)])
+    return attempted(lambda: [at.hypothesis(weight, best.poses)])
 
 
 def bounded(graph: PoseGraph) -> PoseGraph:
@@ -318,13 +319,30 @@ def _estimated(claimed: Factors, weight: Floats, poses: Floats, sigmas: Sigmas) 
     return poses, sigmas
 
 
+@dataclass(frozen=True, eq=False)
+class AtSigmas:
+    """The graph with its sigmas multiplied, on which sets of closures are compared."""
+
+    sigmas: Sigmas
+    factors: Factors
+    accidents: Accidents
+
+    @classmethod
+    def of(cls, claimed: Factors, sigmas: Sigmas) -> AtSigmas:
+        factors = _times(claimed, sigmas)
+        return cls(sigmas, factors, Accidents(factors.graph))
+
+    def hypothesis(self, weight: Floats, poses: Floats) -> Hypothesis:
+        """The least squares of the weighted edges from `poses`, and their evidence."""
+        if (weight[~self.factors.graph.odometry] > 0).any():
+            poses = descend(self.factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
+        found = log_evidence(self.factors, weight, poses, self.accidents) + self.sigmas.log_prior()
+        return Hypothesis(weight, poses, self.sigmas, found)
+
+
 def hypothesis_of(claimed: Factors, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
     """The least squares of the weighted edges from `poses`, and their evidence, with these sigmas."""
-    factors = _times(claimed, sigmas)
-    if (weight[~claimed.graph.odometry] > 0).any():
-        poses = descend(factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
-    found = log_evidence(factors, weight, poses, OdometryChain.of(factors.graph)) + sigmas.log_prior()
-    return Hypothesis(weight, poses, sigmas, found)
+    return AtSigmas.of(claimed, sigmas).hypothesis(weight, poses)
 
 
 def _times(claimed: Factors, sigmas: Sigmas) -> Factors:

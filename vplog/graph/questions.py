@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.geometry import se3
-from vplog.graph.consistency import OdometryChain, residual_sigma
-from vplog.graph.evidence import accidents, agreeing, log_room
+from vplog.graph.consistency import residual_sigma
+from vplog.graph.evidence import Accidents, agreeing
 from vplog.graph.factors import Factors
-from vplog.graph.hypotheses import attempted, hypothesis_of
+from vplog.graph.hypotheses import AtSigmas, attempted
 from vplog.graph.variance_components import Sigmas
 
 if TYPE_CHECKING:
@@ -61,14 +61,14 @@ def questions(graph: PoseGraph, weight: Floats, log_odds: Floats, decided: Bools
     (E,) are of being false by what else is known of a closure, 0 where nothing is; on those `decided` (E,) nothing is
     asked. Raises GraphError where the poses are not determined.
     """
-    chain, claimed = OdometryChain.of(graph), Factors.of(graph)
-    now = hypothesis_of(claimed, weight, graph.world_from_body, Sigmas())
+    at = AtSigmas.of(Factors.of(graph), Sigmas())
+    now = at.hypothesis(weight, graph.world_from_body)
     best: dict[int, Question] = {}
-    for closures, turned in _sets(graph, weight, decided, chain):
+    for closures, turned in _sets(at.accidents, weight, decided):
         other = np.array(weight)
         other[turned] = 1.0 - weight[turned]
-        start = now.poses if other[~graph.odometry].any() else chain.poses
-        for then in attempted(lambda other=other, start=start: [hypothesis_of(claimed, other, start, Sigmas())]):
+        start = now.poses if other[~graph.odometry].any() else at.accidents.chain.poses
+        for then in attempted(lambda other=other, start=start: [at.hypothesis(other, start)]):
             used = weight[turned[0]] > 0
             odds = _POWER * (then.log_evidence - now.log_evidence)
             odds += float(log_odds[turned].mean()) * (1.0 if used else -1.0)
@@ -79,18 +79,19 @@ def questions(graph: PoseGraph, weight: Floats, log_odds: Floats, decided: Bools
     return sorted(best.values(), key=lambda one: (-one.expected_m, int(one.edges[0])))
 
 
-def _sets(graph: PoseGraph, weight: Floats, decided: Bools, chain: OdometryChain) -> Iterator[tuple[Ints, Ints]]:
+def _sets(accidents: Accidents, weight: Floats, decided: Bools) -> Iterator[tuple[Ints, Ints]]:
     """Closures to ask about, and those that are turned with them.
 
     Each run by itself; and where runs that claim one displacement have no decision among them, all by the longest one:
     a person who knows of one of them knows of them all.
     """
+    graph = accidents.graph
     loops = np.flatnonzero(~graph.odometry)
     misfit = residual_sigma(graph, graph.world_from_body)
     most = min(_MOST, max(_LEAST, _POSES // len(graph.world_from_body)))
     runs: list[Ints] = []
     for used in (True, False):
-        some = [run[(weight[run] > 0) == used] for run in accidents(graph, loops, chain, log_room(graph, chain.poses))]
+        some = [run[(weight[run] > 0) == used] for run in accidents.among(loops)]
         some = [run for one in some if len(run := one[~decided[one]])]
         # as the search flips them: the used ones that fit worst, the others that fit best; and what stands alone
         doubtful = np.argsort([float(misfit[run].mean()) * (-1.0 if used else 1.0) for run in some], kind="stable")
@@ -98,7 +99,7 @@ def _sets(graph: PoseGraph, weight: Floats, decided: Bools, chain: OdometryChain
         chosen = dict.fromkeys([*doubtful[:most].tolist(), *alone[:most].tolist()])
         yield from ((some[at], some[at]) for at in chosen)
         runs += some
-    families = [one for one in agreeing(graph, loops, chain)[:_FAMILIES] if not decided[one].any()]
+    families = [one for one in agreeing(accidents, loops)[:_FAMILIES] if not decided[one].any()]
     for family in families:
         used = (weight[family] > 0).any()
         members = [run for run in runs if (weight[run[0]] > 0) == used and np.isin(run[0], family)]

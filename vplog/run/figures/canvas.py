@@ -41,7 +41,7 @@ def saved_figure(
 def _settle(figure: Figure) -> None:
     """Fix the layout, rounded: the solver's last digits differ from one process to the next."""
     figure.draw_without_rendering()
-    figure.set_layout_engine("none")
+    figure.set_layout_engine(None)  # a placeholder, as "none" leaves, has each file drawn twice
     for part in figure.subfigs:
         x0, y0, x1, y1 = (round(float(value), 4) for value in part.bbox_relative.extents)
         part.bbox_relative.p0, part.bbox_relative.p1 = (x0, y0), (x1, y1)
