@@ -110,15 +110,17 @@ def test_a_map_grows_by_its_new_drives_alone(
     tmp_path: Path,
     verb: Callable[..., Said],
     monkeypatch: pytest.MonkeyPatch,
-    own_processes: None,
+    request: pytest.FixtureRequest,
 ) -> None:
-    """With two jobs, the library given, one drive after the other and a bad one between: the bytes of one batch."""
+    """With two jobs in processes of their own, the library given, one drive after the other and a bad one between: the
+    bytes of one batch."""
     monkeypatch.setattr(batch, "_FREE_BYTES", 0)  # however full the disk is
     [library] = (whole / "libraries").iterdir()
     root, bad = tmp_path / "map", tmp_path / "bad.mcap"
     bad.write_bytes(b"no log at all")
     verb("batch", logs[0], "-o", root, "--library", library, "--threads", 2, *OPTIONS)
     before = files(root)
+    request.getfixturevalue("own_processes")
     said = verb("batch", *logs, bad, tmp_path / "gone.bag", "-o", root, "--jobs", 2, "--threads", 2, "--json", *OPTIONS)
     assert said.code == 1
     assert "2 of 4 drives failed" in said.err
@@ -226,7 +228,7 @@ def test_another_library_or_writer_is_refused(whole: Path, logs: list[Path], tmp
 def test_a_killed_batch_leaves_finished_drives_and_goes_on(whole: Path, logs: list[Path], tmp_path: Path) -> None:
     """Killed while the first drive runs, then once it is in; what is there is whole, and the end is the same."""
     root, reference = tmp_path / "map", tables(whole)
-    command = [sys.executable, "-m", "vplog", "batch", *map(str, logs), "-o", str(root), "--threads", "1", *OPTIONS]
+    command = [sys.executable, "-m", "vplog", "batch", *map(str, logs), "-o", str(root), "--jobs", "1", *OPTIONS]
     for until in (root / ".staging", root / "runs" / "drive=drive"):
         with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as batch:
             while batch.poll() is None and not until.exists():

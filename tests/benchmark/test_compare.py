@@ -63,7 +63,7 @@ TIMES = {"encode_ms", "feature_ms", "mining_ms", "query_ms", "learn_s"}
 
 
 @pytest.fixture(scope="module")
-def traversals(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def traversals(compiled: None, drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folders = tmp_path_factory.mktemp("traversals") / "day", tmp_path_factory.mktemp("traversals") / "dusk"
     for folder in folders:
         folder.mkdir()

@@ -40,7 +40,7 @@ def test_code_counts_where_it_is_imported(tmp_path: Path, monkeypatch: pytest.Mo
     assert len({before, *found}) == len(COUNTS) + 1
 
 
-def test_all_code_that_a_part_runs_counts(drive: Drive) -> None:
+def test_all_code_that_a_part_runs_counts(tiny: Drive) -> None:
     """What of the package a process has loaded after computing a part is among the files that its key is made of."""
     code = f"""
 import sys
@@ -56,7 +56,7 @@ from vplog.run.feature_extraction import compute_part, parts_of
 feature_extraction.PART_KEYFRAMES = 1
 asked = SimpleNamespace(keyframes=KeyframeSettings(), features=SiftSettings(max_features=10), stereo=StereoSettings(),
                         pictures=PictureSettings())
-compute_part(parts_of(Path({str(drive.log)!r}), asked)[0])
+compute_part(parts_of(Path({str(tiny.log)!r}), asked)[0])
 print(*[name for name in sys.modules if name.split(".")[0] == "vplog"])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

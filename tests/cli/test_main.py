@@ -289,7 +289,7 @@ def test_info_in_words_names_topics_and_the_command_to_run(verb: Verb, drive: Dr
     assert f"vplog run {drive.log} -o OUT" in said.out
 
 
-def test_json_of_library_and_run(verb: Verb, tiny: Drive, tmp_path: Path) -> None:
+def test_json_of_library_and_run(compiled: None, verb: Verb, tiny: Drive, tmp_path: Path) -> None:
     made = verb("library", tiny.log, "-o", tmp_path / "library", *QUICK, "--json")
     assert made.err == ""
     assert made.json["references"] == 4

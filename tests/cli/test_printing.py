@@ -67,7 +67,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_ros2(tmp_path_factory.mktemp("print") / "drive", messages)
 
 
-@pytest.mark.parametrize("columns", [40, 80, 200])
+@pytest.mark.parametrize("columns", [40, 200])
 def test_a_terminal_gets_whole_topics_and_whole_words(recording: Path, columns: int, verb: Verb) -> None:
     code, text = on_a_terminal(columns, "info", recording)
     assert code == 0, text

@@ -16,12 +16,15 @@ if TYPE_CHECKING:
 def serving() -> Iterator[None]:
     """With a bucket named `bucket`, found by all that ask for S3."""
     moto = pytest.importorskip("moto.server", reason="moto speaks S3 on loopback: pip install 'moto[server]'")
+    from moto import backends
     from obstore.store import HTTPStore
 
+    modules = list(backends.list_of_moto_modules())  # which moto lists by the folders on disk, twice a request
     started = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     started.start()
     host, port = started.get_host_and_port()
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as cache:
+        patch.setattr(backends, "list_of_moto_modules", lambda: modules)
         patch.setenv("VPLOG_CACHE", cache)  # not the user's
         patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
         patch.setenv("AWS_ACCESS_KEY_ID", "test")

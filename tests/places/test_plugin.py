@@ -77,26 +77,26 @@ def test_a_plugin_is_imported_when_it_is_named_and_not_before() -> None:
 
 
 @pytest.mark.usefixtures("installed")
-def test_compare_names_it_as_its_own(drive: Drive, tmp_path: Path) -> None:
+def test_compare_names_it_as_its_own(tiny: Drive, tmp_path: Path) -> None:
     options = CompareOptions(library_size=3, min_gap=5, out=tmp_path / "out")
     pipeline = Pipeline(features=SiftSettings(max_features=60, max_megapixels=0.01))
-    done = compare(drive.log, None, [NAME, f"{NAME}:blocks=2"], TruthChoice("poses"), pipeline, options)
+    done = compare(tiny.log, None, [NAME, f"{NAME}:blocks=2"], TruthChoice("poses"), pipeline, options)
     assert [one["bits"] for one in done.record["methods"].values()] == [8 * 8 * 3 * 16, 2 * 2 * 3 * 16]
     scores = np.load(next((tmp_path / "out").glob("scores-01*.npz")))["scores"]
     assert np.isfinite(scores[-1, :-5]).all()
 
 
 @pytest.mark.usefixtures("installed")
-def test_a_run_with_a_library_of_a_plugin(drive: Drive, tmp_path: Path) -> None:
+def test_a_run_with_a_library_of_a_plugin(tiny: Drive, tmp_path: Path) -> None:
     pipeline = pipeline_from({**SMALL, "places": {"kind": NAME, "blocks": 2}}, "mine.yaml")
-    build_library([drive.log], tmp_path / "library", pipeline)
+    build_library([tiny.log], tmp_path / "library", pipeline)
     again = Pipeline.read(pipeline.model_dump(mode="json"), "run.json")
     assert again == pipeline
     check_library(tmp_path / "library", again)
     others = pipeline_from({**SMALL, "places": {"kind": NAME, "blocks": 4}}, "mine.yaml")
     with pytest.raises(LibraryError, match=r"places\.blocks=2, and this run has 4"):
         check_library(tmp_path / "library", others)
-    done = run(drive.log, tmp_path / "out", pipeline, tmp_path / "library")
+    done = run(tiny.log, tmp_path / "out", pipeline, tmp_path / "library")
     assert done is not None
     assert read_library_record(tmp_path / "library")["hash"] == done.state.hash
     assert np.array(done.places).shape[1] == 12
@@ -141,8 +141,8 @@ def test_two_packages_of_one_name_are_told(tmp_path: Path, monkeypatch: pytest.M
         read_method("same", Pipeline())
 
 
-def test_logs_keep_colour_for_it(drive: Drive, tmp_path: Path) -> None:
-    log = logs.open(drive.log)
+def test_logs_keep_colour_for_it(tiny: Drive, tmp_path: Path) -> None:
+    log = logs.open(tiny.log)
     frame = next(iter(log.frames(log.stamps()[:1])))
     assert frame.decode().colour is None
     colour = frame.decode(colour=True).colour

@@ -26,7 +26,13 @@ if TYPE_CHECKING:
     from vplog.data import Camera
     from vplog.demo.record import Drive
 
-QUICK = ("features.max_features=800", "propose.per_query=2", "pictures.closures=0", "pictures.megapixels=0")
+QUICK = (
+    "features.max_features=500",
+    "library.size=8",
+    "propose.per_query=1",
+    "pictures.closures=0",
+    "pictures.megapixels=0",
+)
 VISUAL = logs.TopicChoice(odometry="visual")
 
 

@@ -17,7 +17,6 @@ import pytest
 
 from tests.cli.test_main import no_images, no_messages, no_odometry, wrong_magic
 from tests.verbs.test_resume import OPTIONS, QUICK
-from vplog.demo import SMALL, make_drive
 from vplog.errors import LogError, ResultError, SettingsError
 from vplog.pipeline import Pipeline, load_pipeline
 from vplog.results.run_record import read_finished_run, write_run_json
@@ -338,20 +337,20 @@ def test_nothing_that_writes_a_file_replaces_a_log(finished: Path, drive: Drive,
     assert log.read_bytes() == drive.log.read_bytes()
 
 
-def test_libraries_and_demos_take_no_other_folder(drive: Drive, tmp_path: Path, verb: Callable[..., Said]) -> None:
+def test_libraries_and_demos_take_no_other_folder(tiny: Drive, tmp_path: Path, verb: Callable[..., Said]) -> None:
     """A file of the name of a record makes no library or study."""
     for holds in ("files", "map", "study", "library"):
         out = tmp_path / holds
         OTHER_THINGS[holds](out)
         before = tree(out)
-        assert "other things in it, not a library" in verb("library", drive.log, "-o", out, *OPTIONS).error
-        study = ("study", drive.log, "--truth", "odometry", "--min-gap", "5", "-o", out)
+        assert "other things in it, not a library" in verb("library", tiny.log, "-o", out, *OPTIONS).error
+        study = ("study", tiny.log, "--truth", "odometry", "--min-gap", "5", "-o", out)
         assert "other things in it, not a study" in verb(*study).error
         assert tree(out) == before
     run = tmp_path / "run"
     _holds("run.json", "library/library.json")(run)
-    assert f"is the library of the run in {run}" in verb("library", drive.log, "-o", run / "library", *OPTIONS).error
-    for name, data in (("drive.mcap", drive.log.read_bytes()[8:]), ("truth.tum", b"1 0 0 0 0 0 0 1\n")):
+    assert f"is the library of the run in {run}" in verb("library", tiny.log, "-o", run / "library", *OPTIONS).error
+    for name, data in (("drive.mcap", tiny.log.read_bytes()[8:]), ("truth.tum", b"1 0 0 0 0 0 0 1\n")):
         out = tmp_path / name / "drive"
         out.mkdir(parents=True)
         (out / name).write_bytes(data.replace(b"vplog demo", b"my robot's"))
@@ -361,10 +360,10 @@ def test_libraries_and_demos_take_no_other_folder(drive: Drive, tmp_path: Path, 
 
 
 def test_an_interrupted_library_leaves_the_one_before(
-    drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, pipeline = tmp_path / "library", load_pipeline("default", QUICK)
-    build_library([drive.log], out, pipeline)
+    build_library([tiny.log], out, pipeline)
     before = tree(out)
     for error in (KeyboardInterrupt, OSError):
 
@@ -373,20 +372,20 @@ def test_an_interrupted_library_leaves_the_one_before(
 
         monkeypatch.setattr("json.dumps", fails)  # of the last file of a library
         with pytest.raises((KeyboardInterrupt, Exception)):
-            build_library([drive.log], out, load_pipeline("default", [*QUICK, "library.size=3"]))
+            build_library([tiny.log], out, load_pipeline("default", [*QUICK, "library.size=3"]))
         assert tree(out) == before
         monkeypatch.undo()
-    build_library([drive.log], out, load_pipeline("default", [*QUICK, "library.size=3"]))
+    build_library([tiny.log], out, load_pipeline("default", [*QUICK, "library.size=3"]))
     assert tree(out) != before
 
 
-def test_a_library_of_another_log_is_not_replaced_without_force(verb: Verb, drive: Drive, tmp_path: Path) -> None:
+def test_a_library_of_another_log_is_not_replaced_without_force(verb: Verb, tiny: Drive, tmp_path: Path) -> None:
     """One of the same log is, with other settings too; a damaged one is of an unknown log."""
-    out, other = tmp_path / "library", tmp_path / f"other{drive.log.suffix}"
-    shutil.copyfile(drive.log, other)
+    out, other = tmp_path / "library", tmp_path / f"other{tiny.log.suffix}"
+    shutil.copyfile(tiny.log, other)
     arguments = ("library", "-o", out, *(part for one in QUICK for part in ("--set", one)))
-    assert verb(*arguments, drive.log).code == 0
-    assert verb(*arguments, drive.log, "--set", "library.size=3").code == 0
+    assert verb(*arguments, tiny.log).code == 0
+    assert verb(*arguments, tiny.log, "--set", "library.size=3").code == 0
     before = tree(out)
     said = verb(*arguments, other)
     assert "is another log or has changed. Choose another folder with -o" in said.error
@@ -420,15 +419,15 @@ main.main()
 
 
 def test_a_run_over_that_of_another_log_is_interrupted_killed_and_gone_on_with(
-    drive: Drive, tmp_path: Path, verb: Callable[..., Said]
+    tiny: Drive, tiny_drives: list[Path], tmp_path: Path, verb: Callable[..., Said]
 ) -> None:
     """With --force; until it is whole every verb finds the run before, and then it is that of an empty folder."""
-    other = make_drive(tmp_path / "elsewhere", SMALL.model_copy(update={"seed": SMALL.seed + 1})).log
+    other = tiny_drives[1] / "drive.mcap"
     out, empty, chance = tmp_path / "out", tmp_path / "empty", random.Random(17)
-    verb("run", drive.log, "-o", out, *OPTIONS)
+    verb("run", tiny.log, "-o", out, *OPTIONS)
     (out / "notes.txt").write_text("mine")
     before = tree(out)
-    assert f"{out} is the run of {drive.log}" in verb("run", other, "-o", out, *OPTIONS).error
+    assert f"{out} is the run of {tiny.log}" in verb("run", other, "-o", out, *OPTIONS).error
     told: list[object] = [other, "--force", *OPTIONS]
     for sent, code in ((signal.SIGINT, 130), (signal.SIGKILL, -9), (signal.SIGTERM, 143)):
         process, stages = started("run", "-o", out, "--json", "--threads", 1, *told), set(out.glob(".cache/*.stage"))
@@ -446,7 +445,7 @@ def test_a_run_over_that_of_another_log_is_interrupted_killed_and_gone_on_with(
             assert len(error.splitlines()) == 1
             assert {path.name for path in out.glob(".*")} == {".cache"}
         assert {name: data for name, data in tree(out).items() if not name.startswith(".vplog")} == before
-        assert verb("evaluate", out, "--truth", drive.truth, "--json").json["truth"] == str(drive.truth)
+        assert verb("evaluate", out, "--truth", tiny.truth, "--json").json["truth"] == str(tiny.truth)
         assert verb("export", out, "--format", "tum", "-o", tmp_path / "x.tum").code == 0
         assert (tmp_path / "x.tum").read_bytes() == before["trajectory.tum"]
         told = ["--resume"]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import struct
-import subprocess
-import sys
 import zlib
 from contextlib import suppress
 from typing import TYPE_CHECKING
@@ -20,7 +18,10 @@ from vplog.logs.topic_selection import TopicChoice
 from vplog.storage.image_file import BadImageError, decode_image
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
+
+    from conftest import Said
 
 RNG = np.random.default_rng(4)
 COLOUR = cv2.resize(RNG.integers(0, 256, (12, 16, 3)).astype(np.uint8), (160, 120))
@@ -220,17 +221,14 @@ def test_nothing_is_printed_of_a_png_of_another_coding(capfd: pytest.CaptureFixt
     assert capfd.readouterr() == ("", "")
 
 
-def test_stderr_of_a_command_has_vplogs_lines_alone(tmp_path: Path) -> None:
+def test_stderr_of_a_command_has_vplogs_lines_alone(tmp_path: Path, verb: Callable[..., Said]) -> None:
     """A folder of sound and damaged images of one camera; what is lost is said by vplog."""
     kinds = ("png", "jpeg", "webp", "bmp")
     for number in range(24):
         kind = kinds[number % 4]
         data = FILES[kind] if number < 8 else damaged(FILES[kind], number // 4)
         (tmp_path / f"{number:03}.{kind}").write_bytes(data)
-    done = subprocess.run(
-        [sys.executable, "-m", "vplog", "library", str(tmp_path), "-o", str(tmp_path / "lib"), "--set",
-         "library.size=24"], capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert "Lost: " in done.stderr
-    for line in done.stderr.splitlines():
+    said = verb("library", tmp_path, "-o", tmp_path / "lib", "--set", "library.size=24")
+    assert "Lost: " in said.err
+    for line in said.err.splitlines():
         assert not any(word in line for word in ("libpng", "JPEG data", "[ERROR", "[ WARN", "imdecode_")), line

@@ -123,16 +123,17 @@ def angle(rotation: Floats) -> Floats:
 def quaternion(rotation: Floats) -> Floats:
     """(..., 4) x y z w with w >= 0 of rotation matrices (..., 3, 3). Shepperd 1978: the largest component first."""
     m = rotation
-    trace = np.trace(m, axis1=-2, axis2=-1)
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    squares = np.stack([1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + trace], axis=-1)
-    sum_xy, sum_xz, sum_yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
-    dif_x, dif_y, dif_z = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
-    xx, yy, zz, ww = np.moveaxis(squares, -1, 0)
-    rows = [[xx, sum_xy, sum_xz, dif_x], [sum_xy, yy, sum_yz, dif_y], [sum_xz, sum_yz, zz, dif_z]]
-    rows = _matrices([*rows, [dif_x, dif_y, dif_z, ww]])
-    best = np.argmax(squares, axis=-1)[..., None, None]
-    q = np.take_along_axis(rows, np.broadcast_to(best, (*best.shape[:-2], 1, 4)), axis=-2)[..., 0, :]
+    rows = np.empty((*m.shape[:-2], 4, 4))  # 4 q q^T
+    rows[..., 0, 0], rows[..., 1, 1], rows[..., 2, 2] = 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz
+    rows[..., 3, 3] = 1 + (xx + yy + zz)
+    for one, other in ((0, 1), (0, 2), (1, 2)):
+        rows[..., one, other] = rows[..., other, one] = m[..., one, other] + m[..., other, one]
+    for axis, (one, other) in enumerate(((2, 1), (0, 2), (1, 0))):
+        rows[..., axis, 3] = rows[..., 3, axis] = m[..., one, other] - m[..., other, one]
+    best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
+    each = rows.reshape(-1, 4, 4)
+    q = each[np.arange(len(each)), best.ravel()].reshape(*best.shape, 4)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., 3:] < 0, -q, q)
 
