@@ -13,7 +13,16 @@ from vplog.data import Closures, Verdict
 from vplog.execution.execution import Execution
 from vplog.features.sift import SiftSettings, mirrored
 from vplog.loops.candidate import Drive, VerifySettings
-from vplog.loops.false_rate import at_rate, certain_pairs, mirrored_evidence, p_false, with_p_false, wrong_poses
+from vplog.loops.false_rate import (
+    FalseRateSettings,
+    at_rate,
+    certain_pairs,
+    mirrored_evidence,
+    null_pairs,
+    p_false,
+    with_p_false,
+    wrong_poses,
+)
 from vplog.loops.verify import drive_of, verify_between
 
 
@@ -42,6 +51,15 @@ def test_few_pairs_support_no_small_rate() -> None:
     assert (p_false(candidates, np.zeros(0, np.int64), np.zeros(200))[:20] == 1.0).all()
     some, more = (p_false(candidates, np.zeros(count, np.int64), np.zeros(200))[0] for count in (100, 1000))
     assert more < 0.01 < some < 1.0
+
+
+@pytest.mark.parametrize("rate", [0.05, 0.01, 0.001])
+def test_a_rate_is_given_the_pairs_that_it_needs(rate: float) -> None:
+    """Where all that is verified is true, none of it is left out for want of pairs that are no closures."""
+    candidates = np.array([100] * 200 + [0] * 600)
+    count = null_pairs(candidates, FalseRateSettings(rate=rate))
+    assert count >= null_pairs(candidates, FalseRateSettings()) == 200
+    assert (p_false(candidates, np.zeros(count, np.int64), np.zeros(800))[:200] <= rate).all()
 
 
 def test_more_evidence_is_never_likelier_to_be_false() -> None:

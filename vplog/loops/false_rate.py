@@ -8,6 +8,7 @@ that odometry makes certain tell how often the pose is wrong at a right place.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 _VERIFIED = (Verdict.ACCEPTED, Verdict.NO_CALIBRATION)
 """Geometry found one place."""
+_FINER = 2.0
+"""Times the least false rate that pairs can tell is below the rate that is asked for."""
 MOST_APART = 8
 """Keyframes between which odometry hardly drifts, as of the pairs that calibrate the camera."""
 
@@ -41,8 +44,8 @@ class FalseRateSettings(Settings):
     """Odometry rules a pair out that it has further apart than a closure is long by so many sigmas of the
     drift model (`noise`), whatever the log claims: with 2 % of drift, 10 %."""
     null_pairs: int = Field(default=200, ge=0, le=100_000)
-    """Pairs that are no closures, at least; where odometry rules out fewer, as in a room, candidates with the query
-    mirrored make up for them, which costs their verification."""
+    """Pairs that are no closures, at least, and as many as `rate` needs; where odometry rules out fewer, as in a room,
+    candidates with the query mirrored make up for them, which costs their verification."""
     certain_pairs: int = Field(default=200, ge=0, le=100_000)
     """Pairs of neighbouring keyframes, most, whose verified poses are held against the odometry between them: how many
     are wrong at so many inliers, with depth or stereo; 0 takes every pose of a right place for right."""
@@ -57,6 +60,14 @@ def conformal_p(found: Floats | Ints, null: Floats | Ints) -> Floats:
 def evidence(closures: Closures) -> Ints:
     """(C,) inliers of candidates that geometry verified, 0 of the others."""
     return np.where(closures.of(*_VERIFIED), closures.inliers, 0).astype(np.int64)
+
+
+def null_pairs(found: Ints, settings: FalseRateSettings) -> int:
+    """Pairs that are no closures, enough for `rate`: by K of them the least false rate of candidates with evidence
+    (C,) is C / verified / K."""
+    if settings.rate is None:
+        return settings.null_pairs
+    return max(settings.null_pairs, math.ceil(_FINER * len(found) / max(int((found > 0).sum()), 1) / settings.rate))
 
 
 def mirrored_evidence(closures: Closures, rows: Ints, drive: Drive, execution: Execution) -> Ints:

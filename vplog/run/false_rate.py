@@ -23,6 +23,7 @@ from vplog.loops.false_rate import (
     certain_pairs,
     evidence,
     mirrored_evidence,
+    null_pairs,
     with_p_false,
 )
 from vplog.loops.propose import ProposeSettings, candidate_stops
@@ -54,7 +55,7 @@ def rate_closures(
     keyframes, reach_m, views = drive.keyframes, drive.settings.metric.max_distance_m, for_verification(drive)
     ruled_out = beyond_drift(closures, keyframes, odometry, noise, reach_m, settings.sigmas)
     left = np.flatnonzero(~ruled_out)
-    count = min(max(settings.null_pairs - int(ruled_out.sum()), 0), len(left))
+    count = min(max(null_pairs(evidence(closures), settings) - int(ruled_out.sum()), 0), len(left))
     rows = left[np.linspace(0, len(left) - 1, count).astype(np.int64)]
     mirror = mirrored_evidence(closures, rows, views, execution)
     piece = np.zeros(len(keyframes.stamp_ns))
