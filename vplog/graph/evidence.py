@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from vplog.data import Floats, Ints, PoseGraph
     from vplog.graph.factors import Factors
-    from vplog.graph.sparse.cholesky import Cholesky
 
 _BESIDE = 3
 """Keyframes between neighbours of a run, at both ends: they see the same things."""
@@ -101,12 +100,10 @@ class Accidents:
         return self._measured[key]
 
 
-def log_evidence(
-    factors: Factors, weight: Floats, poses: Floats, accidents: Accidents, bias: Floats | None = None
-) -> float:
+def log_evidence(factors: Factors, weight: Floats, poses: Floats, accidents: Accidents) -> float:
     """Log density of all closures where those of positive weight (E,), 0 or 1, are true.
 
-    `poses` are their least squares, `accidents` the graph's, `bias` as `log_bias` has it, none by default.
+    `poses` are their least squares, `accidents` the graph's.
     """
     graph, room = factors.graph, accidents.room
     loops = ~graph.odometry
@@ -115,49 +112,21 @@ def log_evidence(
     places = sum(1 for _ in runs(graph, true))
     # each place is true or an accident, the share of true ones unknown: the beta function
     total += math.lgamma(places + 1) + math.lgamma(count + 1) - math.lgamma(places + count + 2)
-    return total + (_log_true(factors, weight, poses, true, room, bias) if len(true) else 0.0)
+    return total + (_log_true(factors, weight, poses, true, room) if len(true) else 0.0)
 
 
-def _log_true(
-    factors: Factors, weight: Floats, poses: Floats, true: Ints, room: float, bias: Floats | None
-) -> float:
+def _log_true(factors: Factors, weight: Floats, poses: Floats, true: Ints, room: float) -> float:
     """Log density of the true closures under the odometry: N(0, A C A^T + R) by the matrix determinant lemma."""
     graph = factors.graph
     d = degrees_of_freedom(graph)
     loose = len(factors.loose(weight))
     held = (1 + loose) * d * -2.0 * math.log(GAUGE_SIGMA)
     joined = int(factors.piece.max()) - loose  # pieces of odometry whose place only closures tell
-    information = Objective(factors, weight).information(poses)
-    determinant = information.log_determinant() - held
+    determinant = Objective(factors, weight).information(poses).log_determinant() - held
     known = np.linalg.slogdet(informed(graph, weight > 0))[1].sum()
     chi2 = weight * residual_sigma(graph, poses) ** 2
     gaussian = 0.5 * (known - determinant - chi2.sum()) - 0.5 * _LOG_2PI * d * (len(true) - joined) - joined * room
-    biased = 0.0 if bias is None else log_bias(graph, poses, information, bias)
-    return float(gaussian) + biased + log_tails(chi2[true], d)
-
-
-def log_bias(graph: PoseGraph, poses: Floats, information: Cholesky, bias: Floats) -> float:
-    """By how much the density grows where each axis of the odometry may have a bias besides its noise.
-
-    An odometry edge errs by `bias` (E, d), in the frame of its b, times d standard normal variables that all edges
-    share: what a gyroscope or a wheel's radius adds up along the drive, and no short stretch of it tells. They are
-    integrated over like the poses, whose `information` is that of the least squares at `poses`.
-    """
-    edges = np.flatnonzero(graph.odometry)
-    a, b, axes = graph.a[edges], graph.b[edges], np.array(AXES[graph.dimension])
-    motion = se3.between(poses[a], poses[b])
-    error = se3.log(se3.between(graph.a_from_b[edges], motion))[:, axes]
-    Omega = informed(graph, edges)
-    pulled = Omega * bias[edges, None, :]  # (E, d, d) Omega D
-    gradient = -(pulled * error[:, :, None]).sum((0, 1))
-    own = (bias[edges, :, None] * pulled).sum(0)
-    Ad = se3.adjoint(se3.inverse(motion))[:, axes][:, :, axes]
-    mixed = np.zeros((len(poses), len(axes), len(axes)))
-    np.add.at(mixed, b, -pulled)
-    np.add.at(mixed, a, np.swapaxes(Ad, 1, 2) @ pulled)
-    own = np.eye(len(axes)) + own - np.einsum("nij,nik->jk", mixed, information.solve(mixed))
-    step = np.linalg.solve(own, gradient)
-    return float(0.5 * gradient @ step - 0.5 * np.linalg.slogdet(own)[1])
+    return float(gaussian) + log_tails(chi2[true], d)
 
 
 def log_tails(chi2: Floats, d: int) -> float:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.errors import GraphError
-from vplog.graph.build import AXES, informed
+from vplog.graph.build import informed
 from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, residual_sigma
 from vplog.graph.evidence import Accidents, agreeing, log_evidence, log_room, runs
 from vplog.graph.factors import Factors
@@ -326,31 +326,18 @@ class AtSigmas:
     sigmas: Sigmas
     factors: Factors
     accidents: Accidents
-    bias: Floats
-    """(E, d)."""
 
     @classmethod
     def of(cls, claimed: Factors, sigmas: Sigmas) -> AtSigmas:
         factors = _times(claimed, sigmas)
-        return cls(sigmas, factors, Accidents(factors.graph), _bias(claimed.graph, sigmas))
+        return cls(sigmas, factors, Accidents(factors.graph))
 
     def hypothesis(self, weight: Floats, poses: Floats) -> Hypothesis:
         """The least squares of the weighted edges from `poses`, and their evidence."""
         if (weight[~self.factors.graph.odometry] > 0).any():
             poses = descend(self.factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
-        found = log_evidence(self.factors, weight, poses, self.accidents, self.bias) + self.sigmas.log_prior()
+        found = log_evidence(self.factors, weight, poses, self.accidents) + self.sigmas.log_prior()
         return Hypothesis(weight, poses, self.sigmas, found)
-
-
-def _bias(claimed: PoseGraph, sigmas: Sigmas) -> Floats:
-    """(E, d) of the odometry: over the drive as much as its noise adds up to, by the claim or more."""
-    edges, axes = np.flatnonzero(claimed.odometry), np.array(AXES[claimed.dimension])
-    found = np.zeros((len(claimed.a), len(axes)))
-    if len(edges):
-        variance = np.diagonal(np.linalg.inv(informed(claimed, edges)), axis1=1, axis2=2)
-        factor = np.where(axes < 3, max(sigmas.rotation, 1.0), max(sigmas.translation, 1.0))
-        found[edges] = factor * variance / np.sqrt(variance.sum(0))
-    return found
 
 
 def hypothesis_of(claimed: Factors, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
