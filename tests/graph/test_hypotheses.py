@@ -10,9 +10,10 @@ import pytest
 
 from tests.benchmarks import back_ends
 from tests.benchmarks.worlds import draw, make, world
-from tests.graph.drive import CLOSURE_SIGMA, ODOMETRY_SIGMA, Drive, position_error, ring
+from tests.graph.drive import CLOSURE_SIGMA, ODOMETRY_SIGMA, Drive, ledger, position_error, ring
 from vplog.geometry import se3
 from vplog.graph import hypotheses
+from vplog.graph.build import build_graph
 from vplog.graph.consistency import OdometryChain, is_loop
 from vplog.graph.evidence import Accidents, log_evidence, log_partition, log_room, log_tails, runs
 from vplog.graph.factors import Factors
@@ -117,6 +118,23 @@ def test_where_all_are_false_odometry_is_kept_with_every_method() -> None:
         drives = [ring(120, loops=0, false=25, seed=seed) for seed in range(6)]
         solutions = [decided(drive.graph, optimiser).solution for drive in drives]
         assert sum("likelier to be all false" in solution.reason for solution in solutions) >= 5
+
+
+@pytest.mark.parametrize(("p_false", "kept"), [(0.01, 25), (0.4, 0)])
+def test_one_place_passed_again_is_believed_where_recognition_is_sure(p_false: float, kept: int) -> None:
+    """Odometry that is far better over 25 keyframes than it claims, and drifts over the drive by what it claims."""
+    drive = ring(200, noise=0.05)
+    query = np.arange(175, 200)
+    z = se3.between(drive.true[query - 100], drive.true[query])
+    measured = drive.graph.a_from_b[drive.graph.odometry] @ se3.exp(np.array([[0, 0, 7.5e-4, 0.006, 0.006, 0]]))
+    covariance = np.broadcast_to(np.diag(ODOMETRY_SIGMA**2), (199, 6, 6))
+    graph, _, _ = build_graph(drive.keyframes, covariance, ledger(query, query - 100, z))
+    graph = replace(graph, a_from_b=np.concatenate([measured, graph.a_from_b[199:]]))
+    log_odds = np.where(graph.odometry, 0.0, math.log(p_false / (1.0 - p_false)))
+    decision = decided(graph, GncSettings(), log_odds=log_odds)
+    assert (decision.solution.weight[is_loop(graph)] > 0.5).sum() == kept
+    assert not (decided(graph, GncSettings()).solution.weight[is_loop(graph)] > 0.5).any()
+    assert kept or decision.sigmas == Sigmas()  # closures that are not believed tell nothing of the odometry
 
 
 def test_no_closure_outweighs_a_hundred_others() -> None:

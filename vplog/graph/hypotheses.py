@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from vplog.data import Bools, Floats, Ints, PoseGraph
     from vplog.stages import Optimiser
 
+    Cost = Callable[[Factors, Floats, Floats], float]
+
 _MOST_INFORMATION = 1e4
 """A closure's information as a multiple of the median one's, so that none outweighs a hundred others."""
 _ROUNDS = 4
@@ -73,11 +75,13 @@ class Hypothesis:
 
 
 def best_hypothesis(
-    graph: PoseGraph, optimiser: Optimiser, cost: Callable[[Factors, Floats, Floats], float] | None = None
+    graph: PoseGraph, optimiser: Optimiser, cost: Cost | None = None, log_odds: Floats | None = None
 ) -> Hypothesis:
     """The hypothesis of greatest evidence: the optimiser's, with `gnc` from several starts, or that none is true.
 
     `cost` is what other measurements cost more with factors, weights and poses: by how much their log likelihood falls.
+    `log_odds` (E,) are of being false by recognition and geometry; where they are sure, odometry alone is best only if
+    it is with the noise that it claims, too.
     Raises GraphError where the graph cannot be solved.
     """
     graph, loops = bounded(graph), np.flatnonzero(is_loop(graph))
@@ -97,8 +101,29 @@ def best_hypothesis(
         alone = hypothesis_of(claimed, none, chain.poses, sigmas)
         margin = _VERY_STRONG if isinstance(optimiser, GncSettings) else 0.0
         found.append(replace(alone, log_evidence=alone.log_evidence + margin))
-    if cost is None:
-        return max(found, key=lambda one: one.log_evidence)
+    best = _likeliest(found)[0] if cost is None else _least_cost(claimed, found, cost)
+    if log_odds is None or best.weight[loops].any():
+        return best
+    some = _likeliest([one for one in found if one.weight[loops].any()])
+    return next((one for one in some if _recognised(claimed, one, chain, log_odds, cost)), best)
+
+
+def _recognised(claimed: Factors, one: Hypothesis, chain: OdometryChain, log_odds: Floats, cost: Cost | None) -> bool:
+    """Whether recognition is very sure of its runs of closures, less what speaks against them where odometry drifts as
+    it claims: how well it agrees with itself along a run does not tell what it gathers over the drive."""
+    at = AtSigmas.of(claimed, Sigmas())
+    true = at.hypothesis(one.weight, one.poses)
+    none = at.hypothesis(np.where(is_loop(claimed.graph), 0.0, 1.0), chain.poses)
+    by_graph = true.log_evidence - none.log_evidence
+    if cost is not None:
+        by_graph -= cost(at.factors, true.weight, true.poses) - cost(at.factors, none.weight, none.poses)
+    accepted = np.flatnonzero(is_loop(claimed.graph) & (one.weight > 0))
+    sure = -sum(float(log_odds[run].mean()) for run in runs(claimed.graph, accepted))
+    return sure + min(by_graph, 0.0) > _VERY_STRONG
+
+
+def _least_cost(claimed: Factors, found: list[Hypothesis], cost: Cost) -> Hypothesis:
+    """The hypothesis of greatest evidence less what it costs other measurements."""
     best, most = found[-1], -np.inf
     judged: list[Hypothesis] = []
     for one in sorted(found, key=lambda one: -one.log_evidence):

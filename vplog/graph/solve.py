@@ -18,9 +18,8 @@ from vplog.graph.robust_kernels import CauchySettings, DcsSettings, GemanMcClure
 from vplog.graph.variance_components import Sigmas
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from vplog.data import Floats, PoseGraph
+    from vplog.graph.hypotheses import Cost
     from vplog.stages import Optimiser
 
 OptimiserSettings = Annotated[
@@ -40,22 +39,23 @@ class Decision(NamedTuple):
 
 
 def decided(
-    graph: PoseGraph, optimiser: Optimiser, cost: Callable[[Factors, Floats, Floats], float] | None = None
+    graph: PoseGraph, optimiser: Optimiser, cost: Cost | None = None, log_odds: Floats | None = None
 ) -> Decision:
     """The hypothesis of greatest evidence, less what it costs other measurements, solved.
 
-    Raises GraphError where the graph cannot be solved.
+    `log_odds` (E,) are of being false by what else is known of a closure. Raises GraphError where the graph cannot be
+    solved.
     """
     graph, _ = checked(graph)
     loops = is_loop(graph)
     if not loops.any():
         return Decision(graph, optimiser(graph), Sigmas())
-    best = best_hypothesis(graph, optimiser, cost)
+    best = best_hypothesis(graph, optimiser, cost, log_odds)
     graph = bounded(graph)
     count, kept = int(loops.sum()), int(best.weight[loops].sum())
     if kept == 0:
         why = f"Odometry was kept: the {count} closures are likelier to be all false than any of them to be true."
-        return Decision(graph, Solution(best.poses, best.weight, 0.0, 0.0, 0, True, why), best.sigmas)
+        return Decision(graph, Solution(best.poses, best.weight, 0.0, 0.0, 0, True, why), Sigmas())  # nothing tells
     if not isinstance(optimiser, GncSettings):
         return Decision(graph, optimiser(graph), best.sigmas)
     found = f"{kept} of {count} closures were kept. "

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 _VERIFIED = (Verdict.ACCEPTED, Verdict.NO_CALIBRATION)
 """Geometry found one place."""
+_SURE = 1e-3
+"""Least `p_false` that is believed, and most likewise: it is counted from some hundred pairs."""
 _FINER = 2.0
 """Times the least false rate that pairs can tell is below the rate that is asked for."""
 MOST_APART = 8
@@ -134,6 +136,12 @@ def with_p_false(closures: Closures, ruled_out: Bools, mirror: Ints, certain: In
     rate, left = np.ones(len(closures)), found[~ruled_out]
     rate[~ruled_out] = p_false(left, np.concatenate([found[ruled_out], mirror]), wrong_poses(left, certain, wrong))
     return replace(closures, p_false=np.where(found > 0, rate, np.nan))
+
+
+def log_odds_false(closures: Closures) -> Floats:
+    """(C,) log of the odds of being false by `p_false`, 0 where there is none."""
+    p = np.clip(np.where(np.isnan(closures.p_false), 0.5, closures.p_false), _SURE, 1.0 - _SURE)
+    return np.asarray(np.log(p) - np.log1p(-p), np.float64)
 
 
 def at_rate(closures: Closures, rate: float) -> Closures:

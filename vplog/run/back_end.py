@@ -39,6 +39,7 @@ from vplog.graph.pieces import pieces_placed
 from vplog.graph.refine import Refined, RefineSettings, Scale, refine, rescaled
 from vplog.graph.solve import Decision, OptimiserSettings, decided
 from vplog.graph.variance_components import Sigmas
+from vplog.loops.false_rate import log_odds_false
 
 _log = logging.getLogger(__name__)
 _CONFIRMED = 0.99
@@ -86,7 +87,9 @@ def solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps
         fixes, scale = noisier(fixes, by_gps.fixes), by_gps.scale
         present = rescaled(graph, [Scale("odometry", of_odometry, 0.0, 0.0, scale)], Sigmas())
         cost = partial(cost_of_fixes, fixes=fixes)
-    decision = decided(present, settings.solve, cost)
+    log_odds = np.zeros(len(graph.a))
+    log_odds[~graph.odometry] = log_odds_false(closures)[rows]
+    decision = decided(present, settings.solve, cost, log_odds)
     refined = refine(bounded(graph), decision.solution, of_odometry, settings.refine, fixes, decision.sigmas, scale)
     warnings = noise_warnings + build_warnings + (fixes.warnings if fixes else [])
     warnings += _apart(broken, keyframes, graph, refined.solution)

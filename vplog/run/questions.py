@@ -12,15 +12,13 @@ from vplog.errors import ResultError
 from vplog.graph.build import busier, checked
 from vplog.graph.hypotheses import bounded
 from vplog.graph.questions import questions
+from vplog.loops.false_rate import log_odds_false
 from vplog.results.report.page import Question
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from vplog.data import Closures, Floats, Ints, PoseGraph
-
-_SURE = 1e-3
-"""Least `p_false` that is believed, and most likewise: it is counted from some hundred pairs."""
 
 
 def ask_ledger(
@@ -39,9 +37,8 @@ def ask_ledger(
         weight[len(weight) - len(rows) :][rows == row] = float(accepted)
     if not len(rows) or decided[rows].all():
         return []
-    p_false = np.clip(np.where(np.isnan(closures.p_false), 0.5, closures.p_false), _SURE, 1.0 - _SURE)[rows]
     odometry = np.zeros(len(weight) - len(rows))
-    log_odds = np.concatenate([odometry, np.log(p_false) - np.log1p(-p_false)])
+    log_odds = np.concatenate([odometry, log_odds_false(closures)[rows]])
     found = questions(graph, weight, log_odds, np.concatenate([odometry > 0, decided[rows]]))
     asked = [rows[one.edges - len(odometry)] for one in found]
     order = [about[np.argsort(-closures.inliers[about], kind="stable")].tolist() for about in asked]
