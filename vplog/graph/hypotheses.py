@@ -15,8 +15,8 @@ import numpy as np
 
 from vplog.errors import GraphError
 from vplog.graph.build import informed
-from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, residual_sigma
-from vplog.graph.evidence import Accidents, agreeing, log_evidence, log_room, runs
+from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, is_loop, residual_sigma
+from vplog.graph.evidence import Accidents, agreeing, log_evidence, log_room, log_student, log_tails, runs
 from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
 from vplog.graph.least_squares import Objective, descend
@@ -73,6 +73,13 @@ class Hypothesis:
     sigmas: Sigmas
     log_evidence: float
 
+    def by_heavy_tails(self, claimed: Factors) -> float:
+        """By how much the evidence grows where the noise of closures is Student's t."""
+        factors = _times(claimed, self.sigmas)
+        of_loops = (residual_sigma(factors.graph, self.poses) ** 2)[~factors.graph.odometry & (self.weight > 0)]
+        log_normal = log_tails(of_loops, degrees_of_freedom(factors.graph))
+        return log_student(factors, self.weight, self.poses) - log_normal
+
 
 def best_hypothesis(
     graph: PoseGraph, optimiser: Optimiser, cost: Cost | None = None, log_odds: Floats | None = None
@@ -102,10 +109,28 @@ def best_hypothesis(
         margin = _VERY_STRONG if isinstance(optimiser, GncSettings) else 0.0
         found.append(replace(alone, log_evidence=alone.log_evidence + margin))
     best = _likeliest(found)[0] if cost is None else _least_cost(claimed, found, cost)
-    if log_odds is None or best.weight[loops].any():
+    if best.weight[loops].any():
+        return _with_the_claimed(claimed, best, optimiser) if isinstance(optimiser, GncSettings) else best
+    if log_odds is None:
         return best
     some = _likeliest([one for one in found if one.weight[loops].any()])
     return next((one for one in some if _recognised(claimed, one, chain, log_odds, cost)), best)
+
+
+def _with_the_claimed(claimed: Factors, best: Hypothesis, gnc: GncSettings) -> Hypothesis:
+    """The hypothesis with the closures that it predicts within the noise that the log claims, where noise of heavy
+    tails makes that likelier: estimated from those that fit best, noise is too small for the others."""
+    rejected = np.flatnonzero(best.weight == 0)
+    if not len(rejected):
+        return best
+    poses = descend(claimed, best.weight, best.poses, _STEPS, _TOLERANCE).world_from_body
+    apart, _ = distance(claimed, best.weight, poses, rejected)
+    weight = np.array(best.weight)
+    weight[rejected[apart <= chi2_quantile(gnc.inlier_probability, degrees_of_freedom(claimed.graph))]] = 1.0
+    if (weight == best.weight).all():
+        return best
+    more = attempted(lambda: [_refit(claimed, weight, best.poses, best.sigmas)])
+    return max([best, *more], key=lambda one: one.log_evidence + one.by_heavy_tails(claimed))
 
 
 def _recognised(claimed: Factors, one: Hypothesis, chain: OdometryChain, log_odds: Floats, cost: Cost | None) -> bool:
