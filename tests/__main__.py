@@ -23,7 +23,7 @@ LINT = {"lint": ["-m", "ruff", "check", "."], "format": ["-m", "ruff", "format",
 DOCS = {"docs": ["-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", "build/site"]}
 # a file stays with one worker, so that what its tests share is made once; they come in the order of conftest.py
 TESTS = ["-m", "pytest", "--numprocesses", "auto", "--dist", "loadfile", "--no-loadscope-reorder"]
-TYPES = ["-m", "pyright", "--pythonpath", sys.executable]
+TYPES = ["-m", "pyrefly", "check", "--python-interpreter-path", sys.executable]
 
 
 def main(arguments: list[str]) -> int:

@@ -76,7 +76,7 @@ def test_every_public_name_is_there_and_documented() -> None:
     for name in vplog.__all__:
         assert inspect.getdoc(getattr(vplog, name)), name
     with pytest.raises(AttributeError, match="no attribute 'rum'"):
-        _ = vplog.rum  # pyright: ignore[reportAttributeAccessIssue]
+        _ = vplog.rum
 
 
 def test_help_reads_as_documentation() -> None:
@@ -191,7 +191,7 @@ def test_from_a_worker_process(tiny: Tiny, run: vplog.RunFolder, tmp_path: Path)
 
 
 def test_a_daemonic_process_is_refused_a_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)  # pyright: ignore[reportAttributeAccessIssue]
+    monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)  # pyrefly: ignore[missing-attribute]
     with pytest.raises(vplog.SettingsError, match="daemonic"):
         OwnProcesses(1).begin()
 

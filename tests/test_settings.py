@@ -196,7 +196,7 @@ def test_a_broken_file_says_in_which_line(tmp_path: Path) -> None:
 
 def test_settings_do_not_change() -> None:
     with pytest.raises(ValidationError):
-        Outer().name = "b"  # pyright: ignore[reportAttributeAccessIssue]
+        Outer().name = "b"  # pyrefly: ignore[read-only]
 
 
 def test_a_file_is_read(tmp_path: Path) -> None:

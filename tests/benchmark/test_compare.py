@@ -153,7 +153,7 @@ def test_figures_of_a_method(day: Traversal) -> None:
     truth = index_pairs(day.frames, day.frames, 0)
     seen: list[tuple[str, int, int]] = []
     inputs = inputs_of(day, truth, np.full(FRAMES, FRAMES))
-    result = evaluate_method(BOBB, inputs, Execution(1, lambda *at: seen.append(at)))
+    result = evaluate_method(BOBB, inputs, Execution(1, lambda name, done, total: seen.append((name, done, total))))
     assert result.ranks.top_row.tolist() == list(range(FRAMES))
     assert (result.figures["r_at_1"], result.figures["ap"], result.figures["anr"]) == (1.0, 1.0, 0.0)
     assert result.figures["bytes_per_image"] == 4 * (2 + 1 + 9)  # J references with a weight and I boxes each

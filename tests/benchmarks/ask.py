@@ -182,7 +182,7 @@ def coarse(case: Case) -> Case:
         kind=[EdgeKind.ODOMETRY] * len(a) + [EdgeKind.LOOP] * len(loops),
     )
     none = np.zeros(len(a))
-    false, score = (np.concatenate([none, one[loops]]) for one in (case.false, case.score))
+    false, score = (np.concatenate([none, one[loops].astype(float)]) for one in (case.false, case.score))
     return replace(case, graph=fewer, false=false > 0, score=score, truth=case.truth[rows])
 
 

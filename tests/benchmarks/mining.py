@@ -39,7 +39,7 @@ def mining(images: Images, pipeline: Pipeline, name: str, bar: float, rounds: in
             "size": "x".join(str(side) for side in images.images[0].shape[::-1]),
             "mining_ms": round(mined, 2),
             "sift_ms": round(found, 2),
-            "recall_of_first_neighbours": round(recall(state, features), 3),  # pyright: ignore[reportArgumentType]
+            "recall_of_first_neighbours": round(recall(state, features), 3),  # pyrefly: ignore[bad-argument-type]
         }
     return Figure(f"mining / SIFT, {name}, {images.name}, one thread", turns.ratio, bar, at_most=True, facts=facts)
 
@@ -83,7 +83,7 @@ def bare_sift(settings: FeatureSettings) -> Callable[[Bytes], Any]:
             contrastThreshold=settings.contrast_threshold,
             enable_precise_upscale=True,
         )
-        return sift.detectAndCompute(small, None)  # pyright: ignore[reportArgumentType, reportCallIssue]
+        return sift.detectAndCompute(small, None)
 
     return detect
 
@@ -96,12 +96,12 @@ def recall(state: BobbState, features: list[Features]) -> float:
         if kind is None:
             continue
         exact = faiss.IndexFlatL2(kind.graph.d)
-        exact.add(kind.graph.reconstruct_n(0, kind.graph.ntotal))  # pyright: ignore[reportCallIssue]
+        exact.add(kind.graph.reconstruct_n(0, kind.graph.ntotal))
         for one in features:
             values, _ = described(one, settings)
             if len(values):
                 found = kind.graph.search(values, settings.neighbours)[0][:, 0]
-                nearest = exact.search(values, 1)[0][:, 0]  # pyright: ignore[reportCallIssue]
+                nearest = exact.search(values, 1)[0][:, 0]
                 right += int(np.sum(found <= nearest))
                 count += len(values)
     return right / max(count, 1)

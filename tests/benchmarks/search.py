@@ -142,9 +142,9 @@ def _table(settings: BobbSettings) -> np.ndarray:
     return expected_votes.overlaps(settings.positions, settings.box_columns, settings.box_rows)
 
 
-def make_index(places: Places, settings: BobbSettings, pairing: str, library: int = LIBRARY) -> CodeIndex:
+def make_index(places: Places, settings: BobbSettings, pairing: Any, library: int = LIBRARY) -> CodeIndex:
     lists = build_lists(places.references, places.weights, places.boxes, library, BLOCK)
-    return CodeIndex(lists, _table(settings), pairing)  # pyright: ignore[reportArgumentType]
+    return CodeIndex(lists, _table(settings), pairing)
 
 
 def plain_scores(places: Places, query: Place, settings: BobbSettings, pairing: str) -> np.ndarray:

@@ -756,8 +756,9 @@ def test_results_that_cannot_be_printed_are_one_line() -> None:
 @pytest.mark.parametrize(
     ("arguments", "streams", "status"),
     [
-        ("--help", "| true", 0), ("config", "| true", 0), ("config", "2>&-", 0), ("diff gone gone", "2>&1 | true", 1),
-        ("diff gone gone", "2>/dev/full", 1), ("diff gone gone", "2>&-", 1), ("conf", "2>&1 | true", 2),
+        ("--help", "| true", 0), ("config", "| true", 0), ("config", "2>&-", 0),
+        ("evaluate gone --truth gone", "2>&1 | true", 1), ("evaluate gone --truth gone", "2>/dev/full", 1),
+        ("evaluate gone --truth gone", "2>&-", 1), ("conf", "2>&1 | true", 2),
         ("run", "2>/dev/full", 2), ("conf", "2>&-", 2),
     ],
 )  # fmt: skip

@@ -33,7 +33,7 @@ def revisits(scene: Scene) -> list[tuple[int, int]]:
 def two_view(scene: Scene, a: Bytes, b: Bytes) -> tuple[int, Floats | None]:
     """Inliers of the essential matrix between two images, and a_from_b with a translation of length 1."""
     assert scene.camera.matrix is not None
-    sift = cv2.SIFT_create(1000)  # pyright: ignore[reportAttributeAccessIssue]
+    sift = cv2.SIFT_create(1000)  # pyrefly: ignore[missing-attribute]
     (points_a, described_a), (points_b, described_b) = (sift.detectAndCompute(image, None) for image in (a, b))
     matcher = cv2.BFMatcher()
     back = {m.queryIdx: m.trainIdx for m in matcher.match(described_a, described_b)}
@@ -78,7 +78,7 @@ def test_the_same_place_seen_backwards_is_not_matched(scene: Scene) -> None:
 
 
 def test_every_frame_has_enough_to_hold_on_to(scene: Scene) -> None:
-    sift = cv2.SIFT_create(1000)  # pyright: ignore[reportAttributeAccessIssue]
+    sift = cv2.SIFT_create(1000)  # pyrefly: ignore[missing-attribute]
     for frame in range(0, len(scene.stamp_ns), 29):
         assert len(sift.detect(take_picture(scene, frame)[0], None)) >= 500
 

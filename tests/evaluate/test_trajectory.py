@@ -118,7 +118,7 @@ def test_kitti_agrees_with_the_published_results(method: str, file: str) -> None
         trajectories.append(Trajectory(np.round(stamps * 1e9).astype(np.int64), poses))
     with zipfile.ZipFile(data(f"{folder}/res_files/{method}_ape.zip")) as archive:
         published = json.loads(archive.read("stats.json"))
-    ours = ate(*trajectories)
+    ours = ate(trajectories[0], trajectories[1])
     for name in ("rmse", "mean", "median", "max"):
         assert getattr(ours, f"{name}_m") == pytest.approx(published[name], abs=1e-6)
 

@@ -73,7 +73,7 @@ def test_what_progress_or_work_raises_ends_the_work() -> None:
 
 def test_progress_of_parts_adds_up_to_that_of_the_whole() -> None:
     reports: list[tuple[str, int, int]] = []
-    execution = Execution(2, lambda *report: reports.append(report)).within("drive")
+    execution = Execution(2, lambda name, done, total: reports.append((name, done, total))).within("drive")
     for before, count in ((0, 2), (2, 0), (2, 3)):
         list(execution.part(before, 5).counted("extract", range(count), count))
     assert reports == [("drive: extract", done, 5) for done in range(1, 6)]

@@ -107,7 +107,7 @@ def test_a_loop_may_be_written_either_way_round() -> None:
         drive.graph,
         a=drive.graph.b,
         b=drive.graph.a,
-        a_from_b=np.linalg.inv(drive.graph.a_from_b),
+        a_from_b=np.linalg.inv(drive.graph.a_from_b).astype(np.float64),
     )
     # only the loops: odometry goes forward
     keep = loops(drive.graph)

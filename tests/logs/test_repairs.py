@@ -42,9 +42,9 @@ def track(*messages: PoseMessage) -> tuple[Odometry | None, str]:
 
 
 def pose(stamp_ns: int, covariance: Any = None, **fields: Any) -> PoseMessage:
-    values = {"position": np.ones(3), "quaternion": QUARTER} | fields
-    covariance = None if covariance is None else np.ravel(covariance)
-    return PoseMessage(stamp_ns, "odom", "base_link", covariance=covariance, **values)
+    values: dict[str, Any] = {"position": np.ones(3), "quaternion": QUARTER} | fields
+    values["covariance"] = None if covariance is None else np.ravel(covariance)
+    return PoseMessage(stamp_ns, "odom", "base_link", **values)
 
 
 @given(st.lists(st.integers(0, 50), max_size=30))
@@ -163,7 +163,7 @@ def test_missing_chain_is_a_warning_unless_the_log_names_no_frames() -> None:
 def calibration(model: str = "plumb_bob", distortion: Any = (), **fields: Any) -> CalibrationMessage:
     matrix = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
     projection = np.array([[90.0, 0, 49, 0], [0, 90, 39, 0], [0, 0, 1, 0]])
-    values = {"width": 100, "height": 80, "matrix": matrix, "projection": projection} | fields
+    values: dict[str, Any] = {"width": 100, "height": 80, "matrix": matrix, "projection": projection} | fields
     return CalibrationMessage(0, "camera", model=model, distortion=np.array(distortion, float), **values)
 
 

@@ -278,7 +278,7 @@ def test_no_candidates_and_progress() -> None:
     lens, frames, _, seen = drive(False)
     assert len(verify(proposals([]), frames, lens, seen.__getitem__, EXACT)) == 0
     calls: list[tuple[str, int, int]] = []
-    execution = Execution(2, lambda *at: calls.append(at))
+    execution = Execution(2, lambda name, done, total: calls.append((name, done, total)))
     verify(proposals(lap_pairs()[:5]), frames, lens, seen.__getitem__, EXACT, execution)
     assert calls == [("verify", i + 1, 5) for i in range(5)]
 

@@ -143,7 +143,7 @@ def test_a_merge_that_was_stopped_while_it_copied_leaves_no_half_drive(
 
         with monkeypatch.context() as patch:
             patch.setattr(
-                shutil, "copytree", lambda *told, **more: copytree(*told, **{**more, "copy_function": copied})
+                shutil, "copytree", lambda *told, **more: copytree(*told, **(more | {"copy_function": copied}))
             )
             patch.setattr("vplog.maps.merge.copy_library", lambda *_: None)
             with pytest.raises(ResultError, match="Cannot copy"):

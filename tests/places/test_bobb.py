@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -93,7 +93,7 @@ def test_grain_is_not_used() -> None:
 
 @pytest.mark.parametrize("kinds", [{"features": 0}, {"patch_weight": 0.0}, {}])
 def test_matches_are_of_the_kinds_asked_for(kinds: dict[str, float], references: list[Reference]) -> None:
-    wanted = WeighedMatchSettings(**kinds)  # pyright: ignore[reportArgumentType]
+    wanted = WeighedMatchSettings(**kinds)
     matcher = index_references(references, wanted)
     keypoints, patches = matcher.indexed()
     assert (keypoints is None) == (wanted.features == 0)
@@ -223,7 +223,7 @@ def test_search_is_equation_1(seed: int, pairing: str, stop: int) -> None:
     boxes[rng.random(boxes.shape) < 0.1] = NOWHERE
     table = expected_votes.overlaps((5, 4), 3, 2)
     lists = build_lists(references, weights, boxes, L, BLOCK)
-    index = CodeIndex(lists, table, pairing)  # pyright: ignore[reportArgumentType]
+    index = CodeIndex(lists, table, pairing)  # pyrefly: ignore[bad-argument-type]
     query = Place(references[0], weights[0], boxes[0])
     unit = weights / np.maximum(np.linalg.norm(weights.astype(float), axis=1, keepdims=True), 1)
     scores = index.scores(query, stop)
@@ -245,6 +245,6 @@ def test_search_is_equation_1(seed: int, pairing: str, stop: int) -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"columns": 60}, {"box_columns": 17}, {"pairing": "worst"}, {"references": 0}])
-def test_settings_that_fit_no_byte_are_refused(wrong: dict[str, object]) -> None:
+def test_settings_that_fit_no_byte_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"(?i)byte|larger|most|input should"):
-        BobbSettings(**wrong)  # pyright: ignore[reportArgumentType]
+        BobbSettings(**wrong)

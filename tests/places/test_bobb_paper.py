@@ -93,7 +93,7 @@ def test_the_hash_tells_libraries_apart(state: PaperBobbState, references: list[
     "change", [{}, {"grid": 13, "boxes": 2}, {"references": 2, "max_box_share": 0.3, "aspects": (1.0,), "grid": 9}]
 )
 def test_bits_of_a_place(references: list[Reference], change: dict[str, Any]) -> None:
-    settings = PaperBobbSettings(**{"partitions": 1, "features": 20, "grid": 20, **change})
+    settings = PaperBobbSettings(**(dict[str, Any](partitions=1, features=20, grid=20) | change))
     state = settings.learn(references[:7], Execution())
     boxes = len(all_boxes(settings.grid, rvp.box_shapes(settings.grid, settings.max_box_share, settings.aspects))) + 1
     sets = math.factorial(7) // math.factorial(settings.references) // math.factorial(7 - settings.references)

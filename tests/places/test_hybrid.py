@@ -22,7 +22,6 @@ from vplog.places.vocabulary import root_sift
 
 if TYPE_CHECKING:
     from vplog.data import Bytes, Features, Reference
-    from vplog.places.code_search import CodeIndex
 
 SMALL = HybridSettings(bobb=BobbSettings(references=4, features=250), words=4)
 
@@ -46,8 +45,7 @@ class NoBoxes:
 
 
 def signs_alone(signs: Bytes) -> HybridIndex:
-    boxes: CodeIndex = NoBoxes(len(signs))  # pyright: ignore[reportAssignmentType]
-    return HybridIndex(boxes, signs, 1.0)
+    return HybridIndex(NoBoxes(len(signs)), signs, 1.0)  # pyrefly: ignore[bad-argument-type]
 
 
 def literal_signs(state: HybridState, features: Features) -> list[bool]:

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -46,7 +46,7 @@ def tree(out: Path) -> dict[str, bytes]:
 def complete(out: Path, logs: Path | list[Path], force: bool = False, joint: bool = False, stage: bool = False) -> None:
     """A run that has nothing but its account."""
     paths = logs if isinstance(logs, list) else [logs]
-    drives = {path.stem: path for path in paths} if joint else {}
+    drives: dict[str, Any] = {path.stem: path for path in paths} if joint else {}
     asked = head(Pipeline(), paths[0] if joint else paths, 1)
     if joint:
         asked |= run_folder.provenance.logs_of(paths)

@@ -305,8 +305,8 @@ def _publish(store: Store, task: Task, outcome: Outcome, attempts: int) -> Drive
             error = str(problem)
     if error:
         shutil.rmtree(task.folder, ignore_errors=True)
-    figures = {name: value for name, value in vars(outcome).items() if name in Drive.__dataclass_fields__}
+    known = Drive.__dataclass_fields__
+    figures: dict[str, Any] = {name: value for name, value in vars(outcome).items() if name in known}
+    figures["error"] = error
     state = "failed" if error else "computed"
-    return Drive(
-        **{**figures, "error": error}, drive=task.drive, log=task.record["log"], state=state, attempts=attempts
-    )
+    return Drive(**figures, drive=task.drive, log=task.record["log"], state=state, attempts=attempts)

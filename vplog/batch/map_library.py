@@ -44,7 +44,7 @@ def map_library(
     if given is not None:
         check_library(given, pipeline)
         digest = str(read_library_record(given)["hash"])
-        if known not in (None, digest):
+        if known is not None and known != digest:
             raise LibraryError(
                 f"{given} has hash {digest[:12]}, and the places of {store} are described with library "
                 f"{known[:12]}: they cannot be compared. Leave --library out, or make another map."

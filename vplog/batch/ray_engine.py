@@ -277,7 +277,7 @@ def compute_remote_drive(task: Task, library: dict[str, Bytes], parts: list[tupl
                 with suppress(exceptions.RayError, VplogError):  # failed, lost or damaged: it is computed here
                     put_part(cache, part, ray.get(data))
             outcome = compute_drive(replace(task, folder=made, library=place, cache=cache))
-            ended = {**vars(outcome), "worker": f"{where}:{outcome.worker.rpartition(':')[2]}"}
+            ended: dict[str, Any] = {**vars(outcome), "worker": f"{where}:{outcome.worker.rpartition(':')[2]}"}
             if outcome.error:
                 return RemoteOutcome(**ended)
             account = run_record.read_run_json(made / "run.json")

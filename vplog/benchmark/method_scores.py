@@ -237,9 +237,9 @@ def stored_bytes(column: pa.Array) -> int:
     """
     kind: Any = column.type
     if pa.types.is_struct(kind):
-        return sum(stored_bytes(part) for part in column.flatten())  # pyright: ignore[reportAttributeAccessIssue]
+        return sum(stored_bytes(part) for part in column.flatten())
     nested = pa.types.is_fixed_size_list(kind) or pa.types.is_list(kind) or pa.types.is_large_list(kind)
-    below = stored_bytes(column.flatten()) if nested else 0  # pyright: ignore[reportAttributeAccessIssue]
+    below = stored_bytes(column.flatten()) if nested else 0
     if pa.types.is_fixed_size_list(kind):
         return below
     if nested:

@@ -58,7 +58,7 @@ class Parser(argparse.ArgumentParser):
         made_by: Any = partial(Parser, family=self._family)
         return super().add_subparsers(parser_class=made_by, **options)
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """A verb takes its arguments before, between and behind its options."""
         if self._intermixing or args is None:
             return super().parse_known_args(args, namespace)

@@ -162,7 +162,7 @@ def ground(rng: np.random.Generator, axis_m: Floats, size_m: Floats, road_m: flo
 
 
 def _packed(pictures: list[Bytes]) -> Textures:
-    levels = []
+    levels: list[Any] = []
     for image in pictures:
         for _ in range(_LEVELS):
             levels.append(image)

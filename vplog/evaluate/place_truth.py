@@ -278,12 +278,12 @@ def _fixes(query: Log, other: Log) -> list[tuple[Floats, Any]]:
         if found is None or not len(found.stamp_ns):
             raise TruthError(f"{log.name} has no GPS fixes, so --truth gps is not possible. Choose another truth.")
         fixes.append(found)
-    together = {
+    together: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in fixes])
         for name in ("stamp_ns", "latitude_deg", "longitude_deg", "altitude_m", "covariance")
     }
     count = len(fixes[0].stamp_ns)
-    order, positions = local_enu(Gps(**{**together, "stamp_ns": np.arange(len(together["stamp_ns"]))}))
+    order, positions = local_enu(Gps(**(together | {"stamp_ns": np.arange(len(together["stamp_ns"]))})))
     result = []
     for log, mine in ((query, order < count), (other, order >= count)):
         stamp_ns, first = np.unique(together["stamp_ns"][order[mine]], return_index=True)

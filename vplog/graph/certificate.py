@@ -232,7 +232,7 @@ class Problem:
 
     def cost(self, point: Floats) -> float:
         """The chi-square."""
-        return float(((self.D @ self.columns(point)) ** 2).sum())
+        return float(np.square(self.D @ self.columns(point)).sum())
 
     def columns(self, point: Floats) -> Floats:
         """X^T ((d + 1) n, p) of a point (n, p, p + 1)."""
@@ -378,7 +378,8 @@ class _Factor:
         """Factors of a matrix with equally many rows for each pose but the held one; `poses` in elimination order."""
         size = (len(matrix.indptr) - 1) // len(poses)
         order = (poses[:, None] * size + np.arange(size)).ravel()
-        permuted = matrix[order][:, order].tocsc()
+        rows: Any = matrix[order]
+        permuted = rows[:, order].tocsc()
         lu = splu(permuted, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         return cls(lu, order)
 
@@ -404,7 +405,7 @@ def least_eigenvalue(problem: Problem, point: Floats) -> tuple[float, Floats, fl
     The tolerance is what leaves other poses GAP of the chi-square to gain, or rounding.
     """
     d, n = problem.d, len(point)
-    S = problem.certificate_matrix(point)[d + 1 :, d + 1 :]
+    S: Any = problem.certificate_matrix(point)[d + 1 :, d + 1 :]
     rotation = np.tile(np.arange(d + 1) < d, n - 1)
     rounding = _ROUNDING * float(S.diagonal().max())
     tolerance = max(GAP * problem.cost(point) / _suboptimality(n, d, -1.0), rounding)

@@ -134,7 +134,7 @@ def _smoothed(at_s: Floats, places: Floats, variance: Floats) -> _Smooth:
     middle = (steps[1:] + steps[:-1]) / 2
     bend = scipy.sparse.diags_array(
         [1 / (steps[:-1] * middle), -(1 / steps[:-1] + 1 / steps[1:]) / middle, 1 / (steps[1:] * middle)],
-        offsets=[0, 1, 2], shape=(count - 2, count),  # pyright: ignore[reportArgumentType]
+        offsets=[0, 1, 2], shape=(count - 2, count),
     )  # fmt: skip
     energy = (bend.T @ scipy.sparse.diags_array(middle) @ bend).tocsr()
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (count, _PROBES))
@@ -144,7 +144,7 @@ def _smoothed(at_s: Floats, places: Floats, variance: Floats) -> _Smooth:
             [np.append(energy.diagonal(k), np.zeros(k)) for k in range(3)]
         )  # fmt: skip
         bands[0] += weight
-        solved = scipy.linalg.solveh_banded(bands, right, lower=True)
+        solved = np.asarray(scipy.linalg.solveh_banded(bands, right, lower=True))
         trace = float((signs * solved[:, places.shape[1] :]).sum()) / _PROBES
         free = max(count - trace, 1e-9)
         smooth = solved[:, : places.shape[1]]

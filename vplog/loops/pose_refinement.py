@@ -69,7 +69,7 @@ def fit(match_from_query: Floats, matches: Matches) -> tuple[Floats, Floats, flo
         )  # fmt: skip
         excess = cost / freedom
         try:
-            step = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(hessian, check_finite=False), gradient)
+            step = np.negative(scipy.linalg.cho_solve(scipy.linalg.cho_factor(hessian, check_finite=False), gradient))
         except np.linalg.LinAlgError:  # no one pose is best
             break
         match_from_query = match_from_query @ se3.exp(step)

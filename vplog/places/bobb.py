@@ -194,7 +194,7 @@ class BobbState(RecordState):
         s = self.settings
         rarity = self.rarity()
         total = _sums(matches) * rarity
-        found = []
+        found: list[tuple[int, float, Float32s, Float32s, Float32s]] = []
         for reference in np.argsort(-total, kind="stable")[: s.candidates * s.references].tolist():
             if total[reference] <= 0.0:
                 break
@@ -205,7 +205,7 @@ class BobbState(RecordState):
         if s.own and matches.itself >= 0:
             best = found[0][1] if found else 1.0
             found.insert(0, (matches.itself, best, *self.agreed(matches, matches.itself)))
-        return [(reference, explained / found[0][1], *rest) for reference, explained, *rest in found[: s.references]]
+        return [(reference, explained / found[0][1], *rest) for reference, explained, *rest in found[: s.references]]  # pyrefly: ignore[bad-return]
 
     def agreed(self, matches: Matches, reference: int) -> tuple[Float32s, Float32s, Float32s]:
         """Where matches with a reference are (E, 2) in the image and (E, 2) in the reference, as shares of the sides,

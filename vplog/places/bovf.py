@@ -73,8 +73,8 @@ class BovfSettings(RelearnedSettings):
 class BovfState(ReferencesState):
     """A vocabulary with the weight of each word. Shared freely between threads."""
 
-    settings: BovfSettings
-    references: list[Reference]
+    settings: BovfSettings  # pyrefly: ignore[bad-override]
+    references: list[Reference]  # pyrefly: ignore[bad-override]
     vocabulary: Vocabulary
     idf: Float32s
     """(V,)."""

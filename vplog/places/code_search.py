@@ -216,7 +216,7 @@ def _compare(cells, words, boxes, e, windows, pairing):
     for part in range((len(windows) + _LANES - 1) // _LANES):
         most = np.uint64(0)
         for i in range(len(windows)):
-            most = _larger_bytes(most, words[boxes[e, np.uint64(i)], np.uint64(part)])  # pyright: ignore[reportCallIssue]
+            most = _larger_bytes(most, words[boxes[e, np.uint64(i)], np.uint64(part)])  # pyrefly: ignore[missing-argument]
         best += _sum_bytes(most)
     for i in range(len(windows)):
         same += np.int64(cells[boxes[e, np.uint64(i)], np.uint64(i)])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
@@ -126,8 +126,8 @@ def greedy_cover(found: scipy.sparse.csr_array, size: int) -> Ints:
 
     Maximises the sum over the frames of the worth of their best reference, see `_worth`. Ties go to the first.
     """
-    worth = _worth(found)
-    columns = scipy.sparse.csc_array(worth)
+    worth: Any = _worth(found)
+    columns: Any = scipy.sparse.csc_array(worth)
     best, chosen = np.zeros(worth.shape[0]), list[int]()
     gain = np.bincount(worth.indices, worth.data, worth.shape[1])
     while len(chosen) < size and gain[c := int(np.argmax(gain))] > 1e-9:  # what is left is rounding

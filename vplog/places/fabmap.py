@@ -108,8 +108,8 @@ class FabmapSettings(RelearnedSettings):
 class FabmapState(ReferencesState):
     """Words, their tree and what evidence is worth. Shared freely between threads."""
 
-    settings: FabmapSettings
-    references: list[Reference]
+    settings: FabmapSettings  # pyrefly: ignore[bad-override]
+    references: list[Reference]  # pyrefly: ignore[bad-override]
     vocabulary: Vocabulary
     model: Model
     samples: Evidence | None

@@ -52,7 +52,7 @@ class RelearnedSettings(Settings):
 
     def prepare(self, references: Iterable[Reference], execution: Execution) -> Any:
         """The state of a saved library."""
-        return self.learn(references, execution)  # pyright: ignore[reportAttributeAccessIssue]
+        return self.learn(references, execution)  # pyrefly: ignore[missing-attribute]
 
     def load(self, folder: Path, execution: Execution) -> Any:
         """The state of a library saved by `save_references`, whose own settings count, but for where files are now.

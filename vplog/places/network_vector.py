@@ -55,9 +55,9 @@ class OnnxSettings(NetworkSettings, RelearnedSettings):
 class OnnxState(VectorState):
     """The network. Shared freely between threads."""
 
-    settings: OnnxSettings
-    references: list[Reference]
-    arrow_type: pa.FixedSizeListType
+    settings: OnnxSettings  # pyrefly: ignore[bad-override]
+    references: list[Reference]  # pyrefly: ignore[bad-override]
+    arrow_type: pa.FixedSizeListType  # pyrefly: ignore[bad-override]
 
     @property
     def colour(self) -> bool:

@@ -67,11 +67,11 @@ class VectorsSettings(RelearnedSettings):
 class VectorsState(VectorState):
     """The files. Shared freely between threads."""
 
-    settings: VectorsSettings
-    references: list[Reference]
+    settings: VectorsSettings  # pyrefly: ignore[bad-override]
+    references: list[Reference]  # pyrefly: ignore[bad-override]
     tables: Sequence[_Rows | _Stamped]
     """One file, or that of queries, then that of the map."""
-    arrow_type: pa.FixedSizeListType
+    arrow_type: pa.FixedSizeListType  # pyrefly: ignore[bad-override]
 
     @cached_property
     def _hash(self) -> str:

@@ -63,14 +63,14 @@ class VladSettings(RelearnedSettings):
 class VladState(VectorState):
     """Centres and a whitening projection. Shared freely between threads."""
 
-    settings: VladSettings
-    references: list[Reference]
+    settings: VladSettings  # pyrefly: ignore[bad-override]
+    references: list[Reference]  # pyrefly: ignore[bad-override]
     vocabulary: Vocabulary
     whitening: Whitening | None
     """None for vectors without PCA."""
 
     @property
-    def arrow_type(self) -> pa.FixedSizeListType:
+    def arrow_type(self) -> pa.FixedSizeListType:  # pyrefly: ignore[bad-override]
         size = self.vocabulary.centres.size if self.whitening is None else len(self.whitening.projection)
         return pa.list_(pa.float16(), size)
 

@@ -23,6 +23,6 @@ def camera_from(values: dict[str, Any], again: str) -> Camera:
     """The camera of plain values. Raises ResultError, with the remedy `again`, where the values are not one."""
     try:
         known = {name: kind(values[name]) for name, kind in _CAMERA.items() if values[name] is not None}
-        return Camera(**{"matrix": None, "baseline_m": None, **known})
+        return Camera(**(dict[str, Any](matrix=None, baseline_m=None) | known))
     except (KeyError, TypeError, ValueError) as error:
         raise ResultError(f"The record of a camera is damaged: {error}. {again}") from None

@@ -173,7 +173,8 @@ def _proposals(pairs: list[tuple[int, int]], closures: Closures, row_at: dict[tu
         name: np.where(rows < 0, other, np.append(getattr(closures, name), 0)[rows]) for name, other in ranked.items()
     }
     types = {"rank": np.int32, "score": np.float32, "support": np.int32}
-    return Proposals(query, match, **{name: known[name].astype(kind) for name, kind in types.items()})
+    columns: dict[str, Any] = {name: known[name].astype(kind) for name, kind in types.items()}
+    return Proposals(query, match, **columns)
 
 
 def _with(closures: Closures, found: Closures, row_at: dict[tuple[int, int], int]) -> Closures:

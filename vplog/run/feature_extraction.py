@@ -74,10 +74,14 @@ _POOR_SHARE = 0.1
 class Extraction(Protocol):
     """The settings that extraction takes, as the pipeline has them."""
 
-    keyframes: KeyframeSettings
-    features: FeatureSettings
-    stereo: StereoSettings
-    pictures: PictureSettings
+    @property
+    def keyframes(self) -> KeyframeSettings: ...
+    @property
+    def features(self) -> FeatureSettings: ...
+    @property
+    def stereo(self) -> StereoSettings: ...
+    @property
+    def pictures(self) -> PictureSettings: ...
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,8 @@ _LOOKED_AT = 16
 class DriveSettings(Extraction, Protocol):
     """The settings that landmarks take, as the pipeline has them."""
 
-    verify: VerifySettings
+    @property
+    def verify(self) -> VerifySettings: ...
 
 
 @contextmanager

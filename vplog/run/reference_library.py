@@ -47,9 +47,12 @@ _log = logging.getLogger(__name__)
 class Describing(Protocol):
     """The settings that a library is made with, as the pipeline has them."""
 
-    features: FeatureSettings
-    library: LibrarySettings
-    places: PlaceSettings
+    @property
+    def features(self) -> FeatureSettings: ...
+    @property
+    def library(self) -> LibrarySettings: ...
+    @property
+    def places(self) -> PlaceSettings: ...
 
 
 def check_library(folder: Path | None, pipeline: Describing) -> None:

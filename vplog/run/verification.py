@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import chain
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -82,7 +82,7 @@ def _parts(match: np.ndarray) -> list[Ints]:
 def merged(parts: Sequence[Closures], rows: Sequence[Ints]) -> Closures:
     """One ledger of several parts, by the numbers `rows` of their candidates."""
     place = np.argsort(np.concatenate(rows), kind="stable")
-    columns = {}
+    columns: dict[str, Any] = {}
     for field in fields(Closures):
         values = [getattr(part, field.name) for part in parts]
         joined = np.concatenate(values) if isinstance(values[0], np.ndarray) else list(chain.from_iterable(values))

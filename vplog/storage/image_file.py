@@ -184,7 +184,7 @@ def _inflated(packed: bytes, rows: list[tuple[int, int]]) -> bytes:
     size, at = sum(count * length for count, length in rows), 0
     try:
         data = zlib.decompressobj().decompress(packed, size)
-    except zlib.error:  # pyright: ignore[reportGeneralTypeIssues]
+    except zlib.error:  # pyrefly: ignore[not-a-type]
         data = b""
     for count, length in rows if len(data) == size else ():
         if max(data[at : at + count * length : length]) > _LAST_FILTER:

@@ -131,7 +131,7 @@ def exceeded(found: dict[str, Any], limits: Sequence[str]) -> list[str]:
     check_limits(limits)
     sentences = []
     for limit in limits:
-        name, operator, number, percent = _LIMIT.fullmatch(limit.replace(" ", "")).groups()  # pyright: ignore[reportOptionalMemberAccess]
+        name, operator, number, percent = _LIMIT.fullmatch(limit.replace(" ", "")).groups()  # pyrefly: ignore[missing-attribute]
         before, after, change = found["figures"].get(name, (None, None, None))
         if change is None or (percent and not before):
             why = " Give --truth." if name in _SCORES and name not in found["figures"] else ""

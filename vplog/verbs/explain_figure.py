@@ -145,7 +145,7 @@ def _rectangle(axes: Axes, corners: Floats, image: Bytes, at: Floats | float, in
     height, wide = image.shape
     size = np.array([wide, height])
     low, high = corners[:2] * size + at + inset * wide, corners[2:] * size + at - inset * wide
-    axes.add_patch(Rectangle(tuple(low), *(high - low), fill=False, **{"linewidth": 1.2, **style}))
+    axes.add_patch(Rectangle(tuple(low), *(high - low), fill=False, **(dict[str, Any](linewidth=1.2) | style)))
     return np.array([low[0], high[1]])
 
 

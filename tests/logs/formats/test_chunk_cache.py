@@ -104,7 +104,7 @@ def test_messages_are_found_in_place_as_in_the_whole(
     for brief in ((), wanted):
         defined: list[list] = [[], []]
         walks = [
-            ChunkReader(3, len(data), dict(CHANNELS), lambda *one, to=to: to.append(one), wanted, brief)
+            ChunkReader(3, len(data), dict(CHANNELS), lambda *one, to=to: to.append(one), wanted, brief)  # pyrefly: ignore[missing-attribute]
             for to in defined
         ]
         whole = walks[0].whole(data)

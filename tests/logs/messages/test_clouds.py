@@ -64,7 +64,7 @@ def by_foxglove(encoding: str, cloud: np.ndarray) -> tuple[Channel, bytes]:
     message.timestamp.seconds, message.timestamp.nanos = divmod(STAMP_NS, 10**9)
     message.pose.position.z, message.pose.orientation.w = 1.0, 1.0
     for name, offset, kind in columns(cloud.dtype, FOXGLOVE_TYPES):
-        message.fields.add(name=name, offset=offset, type=kind)  # pyright: ignore[reportArgumentType]
+        message.fields.add(name=name, offset=offset, type=kind)
     raw = message.SerializeToString() if encoding == "protobuf" else json.dumps(_json(message)).encode()
     return Channel("/points", "foxglove.PointCloud", encoding), raw
 

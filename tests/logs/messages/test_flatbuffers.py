@@ -99,7 +99,7 @@ def test_every_type_agrees_with_protobuf() -> None:
     several = FrameTransforms(transforms=[m.message for m in foxglove_messages(Drive())[:2]])
     poses = PosesInFrame(frame_id="odom", poses=[Pose(), odometry.pose])
     cloud = PointCloud(frame_id="lidar", pose=odometry.pose, point_stride=4, data=b"01234567")
-    cloud.fields.add(name="x", offset=2, type=4)  # pyright: ignore[reportArgumentType]
+    cloud.fields.add(name="x", offset=2, type=4)
     messages = [m.message for m in foxglove_messages(Drive())] + [raw, odometry, several, poses, cloud]
     for message in messages:
         name = message.DESCRIPTOR.full_name

@@ -321,8 +321,9 @@ def test_candidates_are_bounded_over_all_drives() -> None:
             candidates = with_proposals(candidates, number, more, settings)
         found.append(candidates)
     for threads in (1, 3):
-        state, searched = Likeness(), {7: range(7)}
-        found.append(candidates_among({7: later}, drives.__getitem__, searched, state, settings, Execution(threads))[7])
+        like: Any = Likeness()
+        searched = {7: range(7)}
+        found.append(candidates_among({7: later}, drives.__getitem__, searched, like, settings, Execution(threads))[7])
     for one in found:
         proposals = one.proposals
         assert np.array_equal(one.drive, found[0].drive)

@@ -187,6 +187,6 @@ def test_wrong_inputs_are_refused_in_a_line(verb: Callable[..., Said], drive: Dr
     with pytest.raises(SettingsError, match="in memory"):
         opened.localize(image, "camera.yaml")
     with pytest.raises(LogError, match="uint8"):
-        opened.localize(np.zeros((8, 8), np.float32), camera)  # pyright: ignore[reportArgumentType]
+        opened.localize(np.zeros((8, 8), np.float32), camera)  # pyrefly: ignore[bad-argument-type]
     with pytest.raises(ResultError):
         vplog.open_run(tmp_path)

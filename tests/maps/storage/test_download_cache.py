@@ -60,7 +60,7 @@ def fill(root: Path, finished: Path, library: str) -> Path:
 
 @pytest.fixture
 def root(server: None, finished: Path, library: str, request: pytest.FixtureRequest) -> Any:
-    return fill(located(f"s3://bucket/{request.node.name}"), finished, library)  # pyright: ignore[reportArgumentType]
+    return fill(located(f"s3://bucket/{request.node.name}"), finished, library)
 
 
 @pytest.fixture

@@ -289,7 +289,7 @@ def test_two_writers(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lease_lock, "RENEWALS", -20)
     with map_store.writing(root) as store:
         put(store, "two", 2)
-        lock = gone.mirror.lock  # pyright: ignore[reportOptionalMemberAccess]
+        lock = gone.mirror.lock  # pyrefly: ignore[missing-attribute]
         assert lock is not None
         lease_lock._write(lock, lease_lock._content(lock))
         gone.staging.mkdir(parents=True)
@@ -317,7 +317,7 @@ def test_a_writer_that_was_stopped_before_its_write_replaces_nothing(
     with pytest.raises(ResultError, match=r"Another writer has replaced .*drive\.json"):
         put(stopped, "one", 3)
     with pytest.raises(ResultError, match=r"replaced .*drive\.json"):
-        upload.relocate(stopped.mirror, "one", "elsewhere.mcap")  # pyright: ignore[reportArgumentType]
+        upload.relocate(stopped.mirror, "one", "elsewhere.mcap")  # pyrefly: ignore[bad-argument-type]
     with pytest.raises(ResultError, match=r"replaced .*failures\.json"):
         stopped.write_failures({})
     write_rest(stopped, "3")
@@ -330,7 +330,7 @@ def test_a_writer_that_was_stopped_before_its_write_replaces_nothing(
     shutil.rmtree(stopped.root)
     assert same_state(root) == {"one": {2}}
     with map_store.reading(root) as store:
-        store.mirror.rest()  # pyright: ignore[reportOptionalMemberAccess]
+        store.mirror.rest()  # pyrefly: ignore[missing-attribute]
         assert (store.root / "joint.json").read_text() == "2"
         assert store.failures()["bad"]["error"] == "new"
 

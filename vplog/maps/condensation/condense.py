@@ -143,7 +143,7 @@ def _account(found: Condensed, state: PlaceState, root: Path, target: Path, warn
     posed, answered = int((places.frame >= 0).sum()), len(answers.place)
     best = np.array([one.rows[0] for one in answers.queries.best], np.int64)
     others = int((places.drive[best] != places.drive[answers.place]).sum())
-    drives = []
+    drives: list[dict[str, Any]] = []
     for number, drive in enumerate(places.drives):
         own, files = places.drive == number, [f"runs/{layout.folder_name(drive)}/descriptors.parquet"] * 2
         before, after = ((top / file).stat().st_size for top, file in zip((root, target), files, strict=True))
