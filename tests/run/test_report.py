@@ -490,7 +490,13 @@ def test_closures_are_selected_and_rejected_and_the_next_run_knows(
         pairs = [tuple(map(int, re.findall(r"\d+", one))) for one in titles]
         assert all(at[row] and [before.query[row], before.match[row]] == ends for row, *ends in pairs)
         assert page.input_value("#command").endswith(f"--closure {pairs[-1][1]}:{pairs[-1][2]}")
-        assert page.is_visible("#query")
+        drawn = ledger((run / "report.html").read_text())["pictures"]
+        for row in (next(row for row in drawn if at[row]), next(row for row in np.flatnonzero(at) if row not in drawn)):
+            page.fill("#search", f"row={row}")
+            page.locator("#rows tr[data-row]").first.click()
+            assert page.is_visible("#drawn") == (row in drawn) != page.is_visible("#query")
+        page.fill("#search", "inliers>10")
+        page.locator("#rows tr[data-row]").first.click()
         page.fill("#who", 'Jo "J", Doe')
         page.fill("#reason", "another door")
         page.locator("#closure-title").click()

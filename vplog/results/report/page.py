@@ -336,16 +336,16 @@ def _truth(judged: TruthComparison) -> list[list[str]]:
     return [[f"{heading} ({alignment})" if "ATE" in heading else heading, *values] for heading, *values in rows]
 
 
-def _pictured(content: Content, rows: list[int]) -> str:
-    """How many closures of the solution have a picture, and how the others get one."""
+def _pictured(content: Content, rows: list[int]) -> tuple[str, str]:
+    """How many closures of the solution have a picture, and the command that draws the others."""
     used = np.flatnonzero(content.closures.of(*USED))
     shown = int(np.isin(used, rows).sum())
     if not rows or shown == len(used):
-        return ""
+        return "", ""
     log, drawn = shlex.quote(str(content.record.get("log"))), len(content.pictures) < 2 * len(used)
     said = f"{shown} of the {len(used)} closures in the solution and {len(rows) - shown} others have a picture."
     again = f"vplog run {log} -o RUN --set pictures.closures={2 * len(used)}"
-    return f"{said} All of them, without reading the log again: {again}" if drawn else f"{said} The page is full."
+    return (f"{said} All, without reading the log again: ", again) if drawn else (f"{said} The page is full.", "")
 
 
 def _examples(content: Content) -> list[dict[str, Any]]:
@@ -431,14 +431,14 @@ def _distributions(content: Content) -> list[tuple[str, charts.Chart | None]]:
     """Distributions of accepted and rejected candidates, with the thresholds of the settings."""
     closures, verify = content.closures, mapping(mapping(content.record.get("settings")).get("verify"))
     metric = mapping(verify.get("metric"))
-    taken = closures.of(*USED)
+    taken, residual = closures.of(*USED), np.minimum(closures.residual_after, _MOST_SIGMA)
     shown = []
     for label, values, name, least in (
         ("score", closures.score, "", None),
         ("feature matches", closures.matches, "least matches", verify.get("min_matches")),
         ("inliers", closures.inliers, "least inliers", metric.get("min_inliers")),
         ("spread of the inliers", closures.spread, "least spread", metric.get("min_spread")),
-        ("residual after the solve, in sigma", closures.residual_after, "", None),
+        (f"residual after the solve in sigma, cut at {_MOST_SIGMA:.0f}", residual, "", None),
     ):
         wide = values.astype(np.float64)
         threshold = [(f"{name} {least:g}", float(least))] if isinstance(least, int | float) else []
