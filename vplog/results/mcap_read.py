@@ -76,8 +76,8 @@ def read_pictures(path: Path) -> McapContent:
             pictures.append(picture.data)
             if named := re.fullmatch(r"closure_(\d{1,9})", picture.frame_id):  # as older versions named the frame
                 rows.append(int(named[1]))
-        kept = dict(zip(rows or _picture_rows(reader), pictures, strict=True))
-    kept.pop(None, None)
+        named = list(zip(rows or _picture_rows(reader), pictures, strict=True))
+    kept = {row: data for row, data in named if row is not None}
     return McapContent(kept, references, _gps(fixes) if fixes else None)
 
 
