@@ -21,7 +21,7 @@ from tests.results.example import COUNT, METADATA, make_run
 from tests.results.test_mcap import decode, of
 from vplog.data import USED, Gps, Verdict
 from vplog.errors import ResultError
-from vplog.results import geo, mcap_read
+from vplog.results import foxglove, geo, mcap_read
 from vplog.results.contracts import TOPICS
 from vplog.results.geo import Earth
 from vplog.results.mcap import McapExtras, ReferenceBoxes, camera_topic, write_mcap
@@ -96,11 +96,11 @@ def test_images_calibration_and_boxes_share_the_keyframes_stamps(tmp_path: Path)
         assert window.timestamp.ToNanoseconds() == time
         assert [(p.x, p.y) for p in window.points] == [(1, 1), (159, 1), (159, 119), (1, 119)]
         assert "reference" in message.texts[-1].text
-    for (time, image), (other, boxes) in zip(
-        of(messages, "/reference/image"), of(messages, "/reference/annotations"), strict=True
-    ):
+    (began, blank), *shown = of(messages, "/reference/image")
+    assert (began, blank.frame_id) == (stamps[0], "reference")
+    for (time, image), (other, boxes) in zip(shown, of(messages, "/reference/annotations"), strict=True):
         number = stamps.index(time) % 2
-        assert (time, image.frame_id, image.data) == (other, f"reference_{number}", SHOWN.references[number])
+        assert (time, image.frame_id, image.data) == (other, "reference", SHOWN.references[number])
         assert [(p.x, p.y) for p in boxes.points[0].points] == [(21, 16), (59, 16), (59, 44), (21, 44)]
 
 
@@ -160,6 +160,23 @@ def test_pictures_references_and_fixes_come_back(tmp_path: Path) -> None:
     assert found.gps is not None
     for name in ("stamp_ns", "latitude_deg", "longitude_deg", "altitude_m", "covariance"):
         np.testing.assert_array_equal(getattr(found.gps, name), getattr(GPS, name))
+
+
+def test_rows_of_pictures_are_those_of_the_metadata_or_of_older_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mcap_read, "_picture_rows", lambda _: [])
+    write(tmp_path / "new.mcap")
+    with pytest.raises(ResultError, match="cannot be read"):
+        mcap_read.read_pictures(tmp_path / "new.mcap")
+    order, image = sorted(SHOWN.pictures, key=lambda row: (int(RUN.closures.query[row]), row)), foxglove.image
+    older = [f"closure_{row}" for row in (7, *(row + 5 for row in order))]
+    monkeypatch.setattr(
+        foxglove, "image", lambda ns, frame, data: image(ns, older.pop(0) if frame == "closure" else frame, data)
+    )
+    write(tmp_path / "old.mcap")
+    found = mcap_read.read_pictures(tmp_path / "old.mcap").pictures
+    assert {row + 5: SHOWN.pictures[row] for row in order}.items() <= found.items()
 
 
 @pytest.mark.parametrize("cut", [0, 7, 100, 5000, -10])
@@ -264,8 +281,10 @@ def test_rerun_converts_the_whole_picture_and_finds_no_fault(tmp_path: Path) -> 
         (f"{topic}/image", COUNT, "EncodedImage:blob"),
         (f"{topic}/calibration", COUNT, "Pinhole:image_from_camera"),
         (f"{topic}/annotations", COUNT - 1, "foxglove.ImageAnnotations:message"),
-        ("/reference/image", COUNT - 1, "EncodedImage:blob"),
-        ("/closures/picture", 2, "EncodedImage:blob"),
+        ("/reference/image", 1 + COUNT - 1, "EncodedImage:blob"),
+        ("/closures/picture", 1 + 2, "EncodedImage:blob"),
+        ("/closures/calibration", 1, "Pinhole:image_from_camera"),
+        ("/reference/calibration", 1, "Pinhole:image_from_camera"),
         ("/gps", COUNT // 3, "GeoPoints:positions"),
         ("/tf", COUNT, "Transform3D:translation"),
     ):

@@ -83,15 +83,18 @@ def test_frames_hang_together_in_one_tree(messages: Messages) -> None:
             kind = part.DESCRIPTOR.name
             if kind == "FrameTransform":
                 assert parent.setdefault(part.child_frame_id, part.parent_frame_id) == part.parent_frame_id
-            elif kind in ("CompressedImage", "LocationFix"):  # looked at by themselves; a camera's has a calibration
+            elif kind == "LocationFix":  # on earth
                 continue
             elif "frame_id" in part.DESCRIPTOR.fields_by_name:
                 used.add(part.frame_id)
     frames = set(parent) | set(parent.values())
     assert used - {""} <= frames
     calibrated = {m.frame_id for _, _, m in foxglove(messages) if m.DESCRIPTOR.name == "CameraCalibration"}
-    images = {m.frame_id for topic, _, m in messages if topic.startswith("/cam/") and topic.endswith("/image")}
-    assert images == calibrated
+    images = {m.frame_id for _, _, m in foxglove(messages) if m.DESCRIPTOR.name == "CompressedImage"}
+    assert images == calibrated == {"camera", "reference", "closure"}
+    # rerun's 3D view is faulty at any moment at which an image has no frame
+    began = {topic: log_ns for topic, log_ns, m in reversed(messages) if m.DESCRIPTOR.name == "CompressedImage"}
+    assert set(began.values()) == {min(log_ns for _, log_ns, _ in messages)}
     roots = frames - set(parent)
     assert len(roots) == 1
     for frame in frames:

@@ -128,6 +128,23 @@ def test_pictures_are_of_every_fate_and_the_browsers_own_kind(page: str, finishe
         assert f'id="closure-{row}"' in page
 
 
+def test_closures_without_a_picture_are_counted_and_the_page_holds_those_of_the_solution(
+    finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record = read_run_json(finished / "run.json")
+    content = gather(finished, record)
+    used = content.closures.of(*USED)
+    assert record["pictures"]["drawn"] == len(content.pictures)
+    assert record["pictures"]["accepted_left_out"] == used.sum() - sum(used[row] for row in content.pictures)
+    each = max(map(len, content.pictures.values()))
+    shown = [row for row in content.pictures if used[row]][:2]
+    pictures = {row: bytes(each) if used[row] else jpeg for row, jpeg in content.pictures.items()}
+    monkeypatch.setattr("vplog.results.report.page._MOST_PICTURE_BYTES", len(shown) * each)
+    text = write_page(dataclasses.replace(content, pictures=pictures))
+    assert f"{len(shown)} of the {used.sum()} closures in the solution and 0 others have a picture." in text
+    assert used[ledger(text)["pictures"]].all()
+
+
 def test_the_certificate_and_the_sigma_of_keyframes_are_told(page: str, finished: Path) -> None:
     assert read_run_json(finished / "run.json")["certificate"]["reason"].split(":")[0] in page
     covariance = tables.read_keyframe_covariance(finished / "keyframes.parquet")
@@ -473,7 +490,13 @@ def test_closures_are_selected_and_rejected_and_the_next_run_knows(
         pairs = [tuple(map(int, re.findall(r"\d+", one))) for one in titles]
         assert all(at[row] and [before.query[row], before.match[row]] == ends for row, *ends in pairs)
         assert page.input_value("#command").endswith(f"--closure {pairs[-1][1]}:{pairs[-1][2]}")
-        assert page.is_visible("#query")
+        drawn = ledger((run / "report.html").read_text())["pictures"]
+        for row in (next(row for row in drawn if at[row]), next(row for row in np.flatnonzero(at) if row not in drawn)):
+            page.fill("#search", f"row={row}")
+            page.locator("#rows tr[data-row]").first.click()
+            assert page.is_visible("#drawn") == (row in drawn) != page.is_visible("#query")
+        page.fill("#search", "inliers>10")
+        page.locator("#rows tr[data-row]").first.click()
         page.fill("#who", 'Jo "J", Doe')
         page.fill("#reason", "another door")
         page.locator("#closure-title").click()

@@ -30,6 +30,8 @@ Rgba = tuple[float, float, float, float]
 
 MAP, BODY, CAMERA = "map", "base_link", "camera"
 """Frames: the root, the body, the camera fixed on it."""
+REFERENCE, CLOSURE = "reference", "closure"
+"""Frames of the two topics of pictures that are no view of the camera; they stand in the map's origin."""
 RERUN_ROOT = "tf#/"
 """The frame that rerun's 3D view begins with; what does not hang on it is not drawn (rerun.io, named transforms)."""
 IDENTITY: PoseVector = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
@@ -115,14 +117,27 @@ def calibration(stamp_ns: int, camera: Camera, size: tuple[int, int]) -> CameraC
     by_x, by_y = width / camera.width, height / camera.height
     # the pixel's centre lies half a pixel from the image's edge at either size
     scale = np.array([[by_x, 0.0, 0.5 * by_x - 0.5], [0.0, by_y, 0.5 * by_y - 0.5], [0.0, 0.0, 1.0]])
-    matrix = scale @ camera.matrix
-    message.K.extend(matrix.reshape(-1).tolist())
-    message.R.extend(np.eye(3).reshape(-1).tolist())
-    message.P.extend(np.column_stack([matrix, np.zeros(3)]).reshape(-1).tolist())
+    _set_pinhole(message, scale @ camera.matrix)
     if camera.distortion_model in _DISTORTION:
         message.distortion_model = _DISTORTION[camera.distortion_model]
         message.D.extend(camera.distortion.tolist())
     return message
+
+
+def picture_calibration(stamp_ns: int, frame_id: str, size: tuple[int, int]) -> CameraCalibration:
+    """A pinhole with the picture's width as focal length, for a picture that no camera of the drive took: rerun places
+    an image by the pinhole of its frame, and marks a view as faulty where there is none."""
+    width, height = size
+    message = CameraCalibration(timestamp=_time(stamp_ns), frame_id=frame_id, width=width, height=height)
+    _set_pinhole(message, np.array([[width, 0.0, (width - 1) / 2], [0.0, width, (height - 1) / 2], [0.0, 0.0, 1.0]]))
+    return message
+
+
+def _set_pinhole(message: CameraCalibration, matrix: Floats) -> None:
+    """An unrotated camera (3, 3) without distortion."""
+    message.K.extend(matrix.reshape(-1).tolist())
+    message.R.extend(np.eye(3).reshape(-1).tolist())
+    message.P.extend(np.column_stack([matrix, np.zeros(3)]).reshape(-1).tolist())
 
 
 def boxes(stamp_ns: int, corners: Floats, size: tuple[int, int], title: str) -> ImageAnnotations:

@@ -22,9 +22,9 @@ def foxglove_layout(topics: Collection[str], positions_m: Floats) -> dict[str, A
     `positions_m` (N, 3) are to be in view.
     """
     panels = {"3D!map": _map(positions_m)}
-    images = {one.removesuffix("/image"): one for one in topics if one.startswith("/cam/") and one.endswith("/image")}
-    pictures = [*images.items(), *((topic.removesuffix("/image"), topic) for topic in (PICTURES, REFERENCE))]
-    panels |= {f"Image!{base.strip('/')}": _image(base, one, topics) for base, one in pictures if one in topics}
+    images = [one for one in topics if one.startswith("/cam/") and one.endswith("/image")]
+    shown = [one for one in (*images, PICTURES, REFERENCE) if one in topics]
+    panels |= {f"Image!{one.rpartition('/')[0].strip('/')}": _image(one, topics) for one in shown}
     beside = [name for name in panels if name.startswith("Image!")]
     accepted = '/loop_closures{verdict=="accepted"}'
     sigmas = {name: f"{accepted}.{name}_sigma" for name in ("residual_before", "residual_after")}
@@ -61,8 +61,9 @@ def _map(positions_m: Floats) -> dict[str, Any]:
     }
 
 
-def _image(base: str, topic: str, topics: Collection[str]) -> dict[str, Any]:
-    """An Image panel; `base` is the part of its topic's name that calibration and annotations share."""
+def _image(topic: str, topics: Collection[str]) -> dict[str, Any]:
+    """An Image panel, with the calibration and the annotations that stand beside its topic."""
+    base = topic.rpartition("/")[0]
     mode: dict[str, Any] = {"imageTopic": topic}
     if f"{base}/calibration" in topics:
         mode["calibrationTopic"] = f"{base}/calibration"

@@ -10,6 +10,8 @@ from functools import cache, partial
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
+from vplog.storage.image_file import image_size
+
 if TYPE_CHECKING:
     from jinja2 import Environment
     from markupsafe import Markup
@@ -35,6 +37,7 @@ def _environment() -> Environment:
     indented = partial(json.dumps, indent=1, ensure_ascii=False)
     environment.filters |= {"inline": _inline, "hashed": _hashed}
     environment.filters |= {"figure": figure, "data_url": data_url, "mapping": mapping, "indented": indented}
+    environment.filters["image_size"] = image_size
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     return environment
 

@@ -1,6 +1,7 @@
 """result.mcap: the run as Foxglove and rerun show it, every message in protobuf with the schema beside it.
 
-Frames: `map` is the root, `base_link` the body, `camera` fixed on the body. Topics are listed in `TOPICS`.
+Frames: `map` is the root, `base_link` the body, `camera` fixed on the body, `reference` and `closure` those of pictures
+that no camera of the drive took. Topics are listed in `TOPICS`.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from vplog.data import ACCEPTED, Camera, Closures, Floats, Gps, Ints, Keyframes,
 from vplog.geometry import se3
 from vplog.results import foxglove, geo
 from vplog.results.messages import descriptor_set, loop_closure_class
+from vplog.results.previews import jpeg
 from vplog.results.tables import TableMetadata, covariance_of
 from vplog.storage.image_file import image_size
 from vplog.storage.json_records import canonical_json
@@ -51,17 +53,25 @@ TOPICS = {
         "Odometry grey, closures green, amber without metres, red where rejected by the solver.",
     ),
     "/graph/rejected": ("foxglove.SceneUpdate", "Candidates that geometry rejected, faint red."),
-    "/tf_static": ("foxglove.FrameTransforms", "The camera on the body; and the map in the root of rerun's 3D view."),
+    "/tf_static": (
+        "foxglove.FrameTransforms",
+        "The camera on the body; the map in the root of rerun's 3D view; the frames of pictures in the map's origin.",
+    ),
     "/tf": ("foxglove.FrameTransforms", "The body in the map, at each keyframe."),
     "/loop_closures": ("vplog.LoopClosure", "The ledger: one message for each candidate, at its query's stamp."),
     FIXES: ("foxglove.LocationFix", "The log's satellite fixes."),
     EARTH: ("foxglove.GeoJSON", "The path and the accepted closures on earth, where there are fixes."),
-    REFERENCE: ("foxglove.CompressedImage", "The library image that explains the keyframe of this stamp best."),
+    REFERENCE: ("foxglove.CompressedImage", "The library image that explains the keyframe best; a blank one first."),
+    "/reference/calibration": ("foxglove.CameraCalibration", "A pinhole of its size, which rerun places it by."),
     "/reference/annotations": (
         "foxglove.ImageAnnotations",
         "The boxes mined on it, numbered as the keyframe's windows.",
     ),
-    PICTURES: ("foxglove.CompressedImage", "Some candidates drawn; frame_id is closure_ROW of the ledger."),
+    PICTURES: (
+        "foxglove.CompressedImage",
+        "Candidates drawn; `pictures` in the metadata has their ledger rows in this order, null for the first, blank.",
+    ),
+    "/closures/calibration": ("foxglove.CameraCalibration", "A pinhole of their size, which rerun places them by."),
     f"{_CAMERA}/image": ("foxglove.CompressedImage", "The keyframe, downsized, at the log's own stamp."),
     f"{_CAMERA}/calibration": ("foxglove.CameraCalibration", "The camera's calibration, at the size of these images."),
     f"{_CAMERA}/annotations": (
@@ -132,6 +142,8 @@ def write_mcap(
         writer.start(profile="", library=f"vplog {__version__}")
         header = {key.removeprefix("vplog."): text for key, text in metadata.record().items()}
         about = {name: canonical_json(value) for name, value in extras.about.items()}
+        if extras.pictures:
+            about["pictures"] = canonical_json([None, *_picture_rows(closures, extras)])
         writer.add_metadata("vplog", {**header, "drive": keyframes.drive, **about})
         if len(keyframes.stamp_ns):
             start_ns = int(keyframes.stamp_ns[0])
@@ -168,6 +180,7 @@ def _solved(
             if extras.camera is not None:
                 mount = se3.vectors(extras.camera.body_from_camera).tolist()
                 fixed.append((foxglove.BODY, foxglove.CAMERA, mount))
+                fixed += [(foxglove.MAP, frame, foxglove.IDENTITY) for frame in (foxglove.REFERENCE, foxglove.CLOSURE)]
             yield stamp_ns, "/tf_static", foxglove.transforms(stamp_ns, fixed)
             if extras.earth is not None:
                 tree = geo.feature_collection(extras.earth, world_from_body, keyframes.stamp_ns, closures)
@@ -186,7 +199,9 @@ def _camera_messages(keyframes: Keyframes, closures: Closures, camera: Camera, e
     if extras.image is None:
         size = camera.width, camera.height  # annotations then are drawn on the log's own images
     sizes = {number: image_size(data) or (0, 0) for number, data in extras.references.items()}
-    pictures = sorted(extras.pictures, key=lambda row: (int(closures.query[row]), row))
+    pictures, shown = _picture_rows(closures, extras), {}
+    if len(keyframes.stamp_ns):
+        yield from _blanks(int(keyframes.stamp_ns[0]), extras, shown)
     for node, stamp_ns in enumerate(keyframes.stamp_ns.tolist()):
         if extras.image is not None or extras.explained is not None:
             yield stamp_ns, f"{topic}/calibration", foxglove.calibration(stamp_ns, camera, size)
@@ -199,13 +214,42 @@ def _camera_messages(keyframes: Keyframes, closures: Closures, camera: Camera, e
             windows = np.where(np.isfinite(found.boxes), found.windows, np.nan)
             yield stamp_ns, f"{topic}/annotations", foxglove.boxes(stamp_ns, windows, size, title)
             if first in sizes:
-                data = foxglove.image(stamp_ns, f"reference_{first}", extras.references[first])
-                yield stamp_ns, REFERENCE, data
+                yield from _picture(stamp_ns, REFERENCE, foxglove.REFERENCE, extras.references[first], shown)
                 named = foxglove.boxes(stamp_ns, found.boxes, sizes[first], f"reference {first}")
                 yield stamp_ns, "/reference/annotations", named
         while pictures and int(closures.query[pictures[0]]) == node:
             row = pictures.pop(0)
-            yield stamp_ns, PICTURES, foxglove.image(stamp_ns, f"closure_{row}", extras.pictures[row])
+            yield from _picture(stamp_ns, PICTURES, foxglove.CLOSURE, extras.pictures[row], shown)
+
+
+def _picture_rows(closures: Closures, extras: McapExtras) -> list[int]:
+    """Rows of the ledger in the order of their pictures' messages."""
+    return sorted(extras.pictures, key=lambda row: (int(closures.query[row]), row))
+
+
+def _blanks(stamp_ns: int, extras: McapExtras, shown: dict[str, tuple[int, int]]) -> Iterator[Timed]:
+    """A grey picture at the start of each topic of pictures: rerun marks a 3D view as faulty as long as one of its
+    images has no frame yet."""
+    for topic, frame, pictures in (
+        (REFERENCE, foxglove.REFERENCE, extras.references),
+        (PICTURES, foxglove.CLOSURE, extras.pictures),
+    ):
+        if pictures:
+            width, height = image_size(pictures[min(pictures)]) or (1, 1)
+            yield from _picture(stamp_ns, topic, frame, jpeg(np.full((height, width), 24, np.uint8), 75), shown)
+
+
+def _picture(
+    stamp_ns: int, topic: str, frame_id: str, data: bytes, shown: dict[str, tuple[int, int]]
+) -> Iterator[Timed]:  # fmt: skip
+    """A picture that no camera of the drive took, after a calibration where its topic's last, in `shown`, had another
+    size."""
+    size = image_size(data) or (0, 0)
+    if shown.get(topic) != size:
+        shown[topic] = size
+        calibration = foxglove.picture_calibration(stamp_ns, frame_id, size)
+        yield stamp_ns, f"{topic.rpartition('/')[0]}/calibration", calibration
+    yield stamp_ns, topic, foxglove.image(stamp_ns, frame_id, data)
 
 
 def _fixes(extras: McapExtras) -> Iterator[Timed]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import re
 import struct
 from collections.abc import Iterator
@@ -62,7 +63,7 @@ class CameraPicture:
 
 def read_pictures(path: Path) -> McapContent:
     """The pictures, references and fixes of a result.mcap. Raises ResultError where it is missing or damaged."""
-    pictures, references, fixes = {}, {}, []
+    rows, pictures, references, fixes = [], [], {}, []
     with _reading(path) as reader:
         for attachment in reader.iter_attachments():
             if named := re.fullmatch(r"reference-(\d{1,6})\.jpg", attachment.name):
@@ -72,9 +73,12 @@ def read_pictures(path: Path) -> McapContent:
                 fixes.append(LocationFix.FromString(message.data))
                 continue
             picture = CompressedImage.FromString(message.data)
-            if named := re.fullmatch(r"closure_(\d{1,9})", picture.frame_id):
-                pictures[int(named[1])] = picture.data
-    return McapContent(pictures, references, _gps(fixes) if fixes else None)
+            pictures.append(picture.data)
+            if named := re.fullmatch(r"closure_(\d{1,9})", picture.frame_id):  # as older versions named the frame
+                rows.append(int(named[1]))
+        named = list(zip(rows or _picture_rows(reader), pictures, strict=True))
+    kept = {row: data for row, data in named if row is not None}
+    return McapContent(kept, references, _gps(fixes) if fixes else None)
 
 
 def read_fixes(path: Path) -> Gps | None:
@@ -113,6 +117,13 @@ def read_topics(path: Path) -> list[str]:
     """The topics of the file. Raises ResultError as above."""
     with _reading(path) as reader:
         return _topics(reader)
+
+
+def _picture_rows(reader: McapReader) -> list[int | None]:
+    """Rows of the ledger in the order of the pictures' messages, None for one of no closure."""
+    about = next((one.metadata for one in reader.iter_metadata() if one.name == "vplog"), {})
+    rows = json.loads(about.get("pictures", "[]"))
+    return [row if isinstance(row, int) else None for row in rows] if isinstance(rows, list) else []
 
 
 def _topics(reader: McapReader) -> list[str]:

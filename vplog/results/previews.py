@@ -18,9 +18,10 @@ class PictureSettings(Settings):
     those of the log, so a viewer that opens both files shows the log's images instead."""
     quality: int = Field(default=75, ge=1, le=100)
     """JPEG quality of all pictures."""
-    closures: int = Field(default=12, ge=0, le=1000)
+    closures: int = Field(default=30, ge=0, le=20_000)
     """Candidates drawn with their matches, boxes and voting maps: half of them accepted ones, the others rejected. One
-    takes 0.07 to 0.2 s of one core and 100 kB."""
+    takes 0.07 to 0.2 s of one core and 100 kB, so the default is some 5 % of a run of a few hundred frames; a run
+    again with another value draws them without reading the log."""
 
 
 def scaled_size(width: int, height: int, megapixels: float) -> tuple[int, int]:

@@ -16,7 +16,7 @@ from vplog.graph.refine import about_odometry
 from vplog.results import g2o, mcap, run_record, tables
 from vplog.run import provenance
 from vplog.run.back_end import Solved, about_gps, keyframe_covariances
-from vplog.run.figures.run_figures import ClosureInputs, earth_of, mcap_extras, reference_use
+from vplog.run.figures.run_figures import ClosureInputs, choose_examples, earth_of, mcap_extras, reference_use
 from vplog.run.report import write_report
 from vplog.storage.image_file import decode_image
 
@@ -106,6 +106,7 @@ def report(folder: Path, run: Run, head: dict[str, Any], *, steps: Steps) -> dic
     """Write report.html of the run in `folder`; the record for its run.json, but for the time that this step takes."""
     warnings = run.log.warnings + steps.warnings
     record = {**head, **_results_record(run), "inputs": steps.cache.hashes(), "warnings": warnings}
+    record["pictures"] = _pictures_record(run, head["settings"]["pictures"]["closures"])
     record["graph_sha256"] = hashlib.sha256((folder / "graph.g2o").read_bytes()).hexdigest()
     write_report(folder, {**record, **steps.record()})
     return record
@@ -116,6 +117,15 @@ def finish(folder: Path, run: Run, record: dict[str, Any], steps: Steps) -> Run:
     record = {**record, **steps.record(), "finished": True}
     run_record.write_run_json(folder / "run.json", record)
     return replace(run, record=record)
+
+
+def _pictures_record(run: Run, most: int) -> dict[str, int]:
+    """Number of closures drawn, and of accepted ones that are left out."""
+    rows = choose_examples(run.closures, most) if run.features.has_pictures else []
+    return {
+        "drawn": len(rows),
+        "accepted_left_out": int(run.closures.accepted.sum() - run.closures.accepted[rows].sum()),
+    }
 
 
 def _results_record(run: Run) -> dict[str, Any]:

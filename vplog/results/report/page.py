@@ -26,8 +26,8 @@ _AFTER_GEOMETRY = (Verdict.REJECTED_BY_SOLVER, Verdict.NOT_SIGNIFICANT, Verdict.
 """Verdicts of closures that geometry found and the solution leaves out."""
 _MOST_LOSSES = 100
 """Rows of the table of losses; run.json has them all."""
-_MOST_PICTURE_BYTES = 6_000_000
-"""Bytes of all pictures together: the page then stays below 10 MB, base64 and table included."""
+_MOST_PICTURE_BYTES = 12_000_000
+"""Bytes of all pictures together: with thumbnails, table and base64 the page then stays below 60 MB."""
 _DOUBTFUL_SIGMA = 6.5
 """Residuals of that much are red."""
 _MOST_SIGMA = 10.0
@@ -156,6 +156,7 @@ def page(content: Content) -> str:
         verdicts=[(verdict.value, figure(count), verdict.sentence) for verdict, count in counts if count],
         candidates=len(closures),
         examples=examples,
+        pictured=_pictured(content, [one["row"] for one in examples]),
         audit=_audit(content, drawn, [one["row"] for one in examples]),
         over_time=_over_time(content),
         distributions=_distributions(content),
@@ -335,11 +336,26 @@ def _truth(judged: TruthComparison) -> list[list[str]]:
     return [[f"{heading} ({alignment})" if "ATE" in heading else heading, *values] for heading, *values in rows]
 
 
+def _pictured(content: Content, rows: list[int]) -> tuple[str, str]:
+    """How many closures of the solution have a picture, and the command that draws the others."""
+    used = np.flatnonzero(content.closures.of(*USED))
+    shown = int(np.isin(used, rows).sum())
+    if not rows or shown == len(used):
+        return "", ""
+    log, drawn = shlex.quote(str(content.record.get("log"))), len(content.pictures) < 2 * len(used)
+    said = f"{shown} of the {len(used)} closures in the solution and {len(rows) - shown} others have a picture."
+    again = f"vplog run {log} -o RUN --set pictures.closures={2 * len(used)}"
+    return (f"{said} All, without reading the log again: ", again) if drawn else (f"{said} The page is full.", "")
+
+
 def _examples(content: Content) -> list[dict[str, Any]]:
-    """Closures with a picture, by row, until the page holds enough bytes of them."""
+    """Closures with a picture, by row, until the page holds enough bytes of them: false ones first, then those of the
+    solution, then those of most inliers."""
     closures, left, examples = content.closures, _MOST_PICTURE_BYTES, []
-    for row, jpeg in sorted(content.pictures.items()):
-        if row >= len(closures) or len(jpeg) > left:
+    order = np.lexsort((-closures.inliers, ~closures.of(*USED), ~false_closures(content))).tolist()
+    for row in order:
+        jpeg = content.pictures.get(row)
+        if jpeg is None or len(jpeg) > left:
             continue
         left -= len(jpeg)
         verdict = closures.verdict[row]
@@ -347,7 +363,7 @@ def _examples(content: Content) -> list[dict[str, Any]]:
         one |= {"kind": "accepted" if verdict in USED else "rejected"}
         one |= {name: getattr(closures, name)[row] for name in ("query", "match", "matches", "inliers", "score")}
         examples.append(one)
-    return examples
+    return sorted(examples, key=lambda one: one["row"])
 
 
 def _audit(content: Content, drawn: dict[str, Any], pictures: list[int]) -> dict[str, Any]:
@@ -415,14 +431,14 @@ def _distributions(content: Content) -> list[tuple[str, charts.Chart | None]]:
     """Distributions of accepted and rejected candidates, with the thresholds of the settings."""
     closures, verify = content.closures, mapping(mapping(content.record.get("settings")).get("verify"))
     metric = mapping(verify.get("metric"))
-    taken = closures.of(*USED)
+    taken, residual = closures.of(*USED), np.minimum(closures.residual_after, _MOST_SIGMA)
     shown = []
     for label, values, name, least in (
         ("score", closures.score, "", None),
         ("feature matches", closures.matches, "least matches", verify.get("min_matches")),
         ("inliers", closures.inliers, "least inliers", metric.get("min_inliers")),
         ("spread of the inliers", closures.spread, "least spread", metric.get("min_spread")),
-        ("residual after the solve, in sigma", closures.residual_after, "", None),
+        (f"residual after the solve in sigma, cut at {_MOST_SIGMA:.0f}", residual, "", None),
     ):
         wide = values.astype(np.float64)
         threshold = [(f"{name} {least:g}", float(least))] if isinstance(least, int | float) else []

@@ -1,7 +1,7 @@
 "use strict";
 (() => {
   const $ = (id) => document.getElementById(id), data = JSON.parse($("audit").textContent);
-  const { columns, used, stamps, thumbnails, pictures, sentences } = data;
+  const { columns, used, stamps, thumbnails, sentences } = data;
   const count = columns.row.length, names = Object.keys(columns);
   const isUsed = (row) => used.includes(columns.verdict[row]);
   const isFalse = (row) => isUsed(row) && columns.true?.[row] === "no";
@@ -286,8 +286,12 @@
       $(end).hidden = !jpeg;
       if (jpeg) $(end).src = "data:image/jpeg;base64," + jpeg;
     }
-    $("no-picture").hidden = [columns.query[row], columns.match[row]].every((at) => thumbnails[at]);
-    $("full").hidden = !pictures.includes(columns.row[row]); $("full").href = "#closure-" + columns.row[row];
+    // the full picture in place of both thumbnails; the link leads to it at its full size
+    const full = document.querySelector("#closure-" + columns.row[row] + " img");
+    $("query").parentElement.hidden = Boolean(full); $("drawn").hidden = !full;
+    if (full) $("drawn").src = full.src;
+    $("no-picture").hidden = full || [columns.query[row], columns.match[row]].every((at) => thumbnails[at]);
+    $("full").hidden = !full; $("full").href = "#closure-" + columns.row[row];
   };
   $("query").addEventListener("load", (event) => {  // wide pictures one above the other
     event.target.parentElement.classList.toggle("stacked", event.target.naturalWidth > 2 * event.target.naturalHeight);

@@ -139,7 +139,7 @@ def _draw(
     agreement = find_agreement(*features, pose, inliers, inputs.camera, verify)
     sides = [np.array([one.width, one.height]) for one in features]
     frames = [
-        FramePanel(images[node], f"{name}: keyframe {node}", (points + 0.5) / side)
+        FramePanel(images[node], f"closure {row}, {name}: keyframe {node}", (points + 0.5) / side)
         for name, node, points, side in zip(
             ("query", "match"), nodes, (agreement.query, agreement.match), sides, strict=True
         )
