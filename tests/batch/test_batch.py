@@ -491,7 +491,7 @@ def test_the_name_of_a_drive_that_failed_is_its_own(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     with map_store.writing(tmp_path / "map") as store:
-        store.write_failures({"run": {"log": str(tmp_path / "a" / "run.mcap"), "error": "bad"}})
+        store.update_failures({"run": {"log": str(tmp_path / "a" / "run.mcap"), "error": "bad"}})
     known = {drive: {"log": told["log"], "inputs": None} for drive, told in store.failures().items()}
     names = [str(tmp_path / folder / "run.mcap") for folder in "ba"]
     assert drive_names(["run", "run"], names, known, [{"run.mcap": "1"}, {"run.mcap": "2"}]) == ["run-2", "run"]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import tempfile
+from collections import Counter
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -33,3 +34,22 @@ def serving() -> Iterator[None]:
         HTTPStore(f"http://{host}:{port}", client_options={"allow_http": True}).put("bucket", b"")
         yield
     started.stop()
+
+
+@contextmanager
+def counting() -> Iterator[Counter[str]]:
+    """The requests that the server gets meanwhile, by kind."""
+    from moto.moto_server.werkzeug_app import DomainDispatcherApplication
+
+    asked, answer = Counter[str](), DomainDispatcherApplication.__call__
+
+    def counted(self: DomainDispatcherApplication, environ: dict[str, str], start: Any) -> Any:
+        kind = environ["REQUEST_METHOD"]
+        if "list-type" in environ.get("QUERY_STRING", ""):
+            kind = "LIST"
+        asked["COPY" if "HTTP_X_AMZ_COPY_SOURCE" in environ else kind] += 1
+        return answer(self, environ, start)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(DomainDispatcherApplication, "__call__", counted)
+        yield asked

@@ -26,7 +26,7 @@ def as_google(serve_s3: Callable[..., Any]) -> Callable[..., Any]:
         if generation == "0":
             environ["HTTP_IF_NONE_MATCH"] = "*"
         elif generation:
-            environ["HTTP_IF_MATCH"] = tags[generation]
+            environ["HTTP_IF_MATCH"] = tags.get(generation, '"of no state"')
         if source := environ.pop("HTTP_X_GOOG_COPY_SOURCE", None):
             environ["HTTP_X_AMZ_COPY_SOURCE"] = source
 

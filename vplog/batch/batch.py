@@ -26,7 +26,7 @@ from vplog.maps.joining.join import join as join_drives
 from vplog.maps.joining.join import load_places
 from vplog.maps.storage import layout, map_store
 from vplog.maps.storage.contents import damage_warnings
-from vplog.maps.storage.layout import drive_record, folder_name
+from vplog.maps.storage.layout import folder_name
 from vplog.pipeline import Pipeline, load_pipeline, pipeline_from
 from vplog.storage.remote_path import RemotePath, located
 from vplog.storage.urls import shown
@@ -149,7 +149,7 @@ def _failed(store: Store) -> dict[str, dict[str, Any]]:
     found = {drive: {"log": failure.get("log"), "inputs": None} for drive, failure in store.failures().items()}
     for drive in store.damaged:
         with suppress(ResultError):
-            found[drive] = drive_record(store.root / "runs" / folder_name(drive))
+            found[drive] = store.record(drive)
     return found
 
 
@@ -160,13 +160,12 @@ def _is_damaged(store: Store, drive: str) -> bool:
 
 
 def write_failures(store: Store, done: Mapping[str, Drive]) -> None:
-    """failures.json: of this batch, and those of other drives that were there before."""
-    failures = {drive: failure for drive, failure in store.failures().items() if drive not in done}
+    """Note the failures of this batch in the map, beside those of other drives."""
+    changes = dict[str, dict[str, Any] | None]()
     for drive, one in done.items():
-        if one.state == "failed":
-            failures[drive] = {"log": one.log, "error": one.error, "attempts": one.attempts}
-    if failures or (store.root / "failures.json").exists():
-        store.write_failures(failures)
+        failed = {"log": one.log, "error": one.error, "attempts": one.attempts}
+        changes[drive] = failed if one.state == "failed" else None
+    store.update_failures(changes)
 
 
 def _write_failures(store: Store, done: Mapping[str, Drive]) -> list[str]:
@@ -295,12 +294,10 @@ def _common_record(pipeline: Pipeline, topics: TopicChoice, library: str) -> dic
 
 
 def _publish(store: Store, task: Task, outcome: Outcome, attempts: int) -> Drive:
-    """Raises ResultError where the map is another writer's now: what is left would be computed for nothing."""
-    store.check_lock()
-    error = outcome.error
+    error, drive = outcome.error, task.drive
     if not error:
         try:
-            map_store.publish(store, task.drive, task.folder)
+            drive = map_store.publish(store, drive, task.folder)
         except ResultError as problem:
             error = str(problem)
     if error:
@@ -309,4 +306,4 @@ def _publish(store: Store, task: Task, outcome: Outcome, attempts: int) -> Drive
     figures: dict[str, Any] = {name: value for name, value in vars(outcome).items() if name in known}
     figures["error"] = error
     state = "failed" if error else "computed"
-    return Drive(**figures, drive=task.drive, log=task.record["log"], state=state, attempts=attempts)
+    return Drive(**figures, drive=drive, log=task.record["log"], state=state, attempts=attempts)

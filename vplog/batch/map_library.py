@@ -34,7 +34,7 @@ def map_library(
     where they have decisions.
     """
     pipeline.decisions.check_single_drive()
-    begun = (store.root / "map.json").exists()
+    begun = store.exists
     known = store.recovered_head().library if begun else None
     if known is not None and not store.library(known).is_dir():
         raise LibraryError(

@@ -56,6 +56,22 @@ def remove_drives(arguments: argparse.Namespace) -> None:
     print_result(arguments, found, printing.print_removed)
 
 
+def show_log(arguments: argparse.Namespace) -> None:
+    """Show the last snapshots of a map on an object store, newest first: each is one change of a writer."""
+    from vplog.maps.snapshots import snapshots_of
+
+    print_result(arguments, snapshots_of(arguments.map), printing.print_snapshots)
+
+
+def vacuum(arguments: argparse.Namespace) -> None:
+    """Remove from an object store what no snapshot of a map needs: replaced files, and those of killed writers."""
+    from vplog.maps.snapshots import vacuum_map
+
+    with one_stage(arguments, "vacuum"):
+        found = vacuum_map(arguments.map, arguments.hours)
+    print_result(arguments, found, printing.print_vacuumed)
+
+
 def condense_map(arguments: argparse.Namespace) -> None:
     """Copy a map to another without the places that recognition can do without, at a stated loss."""
     from vplog.maps.condensation.condense import condense_map as condense
@@ -84,7 +100,7 @@ def batch(arguments: argparse.Namespace) -> None:
     with Progress(arguments) as progress:
         found = call(api.batch, arguments, progress=progress, on_drive=progress.print_drive)
     drives = plural(len(found["drives"]), "drive")
-    wrong = f"{found['failed']} of {drives} failed; {arguments.map}/failures.json has the reasons."
+    wrong = f"{found['failed']} of {drives} failed; `vplog map info {arguments.map}` has the reasons."
     _end(arguments, found, printing.print_batch, wrong)
 
 
@@ -178,6 +194,10 @@ def add_maps(
     verb("join", join_map, "find closures between the drives of a map and solve them together", threads)
     sub = verb("remove", remove_drives, "remove drives")
     option(sub, "drives", str, "DRIVE", "as `map info` names them", nargs="+")
+    verb("log", show_log, "the last changes of a map on an object store")
+    sub = verb("vacuum", vacuum, "remove what was replaced on an object store")
+    text = "age of what is removed, longer than any reader runs (default: 168, a week)"
+    option(sub, "--hours", parser.number(lambda value: value >= 24, "at least 24"), "H", text, default=168.0)
     sub = verb("condense", condense_map, "leave out the places that recognition can do without", threads)
     option(sub, "-o --target", place, "MAP2", "the new map", required=True)
     text = "recall at rank one that the map's own queries may lose (default: 0.01)"

@@ -423,6 +423,15 @@ def print_removed(found: dict[str, Any]) -> None:
     warn(found["warnings"])
 
 
+def print_snapshots(found: dict[str, Any]) -> None:
+    for one in found["snapshots"]:
+        print(f"{one['version']:6}  {one['time']}  {plural(one['drives'], 'drive'):>14}  {one['change']}")
+
+
+def print_vacuumed(found: dict[str, Any]) -> None:
+    print(f"{found['map']}: {plural(found['objects'], 'object')} removed, {found['bytes'] / 1e6:.1f} MB")
+
+
 def print_condensed(found: dict[str, Any]) -> None:
     rows = [
         (one["drive"], *(str(one["places"][end]) for end in ("before", "after")), str(one["faded"]),

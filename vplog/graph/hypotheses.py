@@ -119,7 +119,7 @@ def best_hypothesis(
 
 def _with_the_claimed(claimed: Factors, best: Hypothesis, gnc: GncSettings) -> Hypothesis:
     """The hypothesis with the closures that it predicts within the noise that the log claims, where noise of heavy
-    tails makes that likelier: estimated from those that fit best, noise is too small for the others."""
+    tails makes that far likelier: estimated from those that fit best, noise is too small for the others."""
     rejected = np.flatnonzero(best.weight == 0)
     if not len(rejected):
         return best
@@ -129,8 +129,9 @@ def _with_the_claimed(claimed: Factors, best: Hypothesis, gnc: GncSettings) -> H
     weight[rejected[apart <= chi2_quantile(gnc.inlier_probability, degrees_of_freedom(claimed.graph))]] = 1.0
     if (weight == best.weight).all():
         return best
+    least = best.log_evidence + best.by_heavy_tails(claimed) + _VERY_STRONG
     more = attempted(lambda: [_refit(claimed, weight, best.poses, best.sigmas)])
-    return max([best, *more], key=lambda one: one.log_evidence + one.by_heavy_tails(claimed))
+    return next((one for one in more if one.log_evidence + one.by_heavy_tails(claimed) > least), best)
 
 
 def _recognised(claimed: Factors, one: Hypothesis, chain: OdometryChain, log_odds: Floats, cost: Cost | None) -> bool:

@@ -15,7 +15,6 @@ from vplog.maps.storage import layout, map_store
 from vplog.maps.storage.contents import damage_warnings, library_mismatch, skip_damaged
 from vplog.maps.storage.damage import damaged_files, damaged_table
 from vplog.places.library_files import read_library_record
-from vplog.results import run_record
 from vplog.storage.folders import regular_files
 
 if TYPE_CHECKING:
@@ -44,7 +43,7 @@ def _damaged_files(store: Store) -> list[str]:
         names = (name for name in regular_files(store.root) if name.endswith(".parquet") and name[:5] != "runs/")
         return [*lines, *filter(None, (damaged_table(store.root / name) for name in names))]
     wrong = list(store.mirror.damaged.values())
-    for drive in list(store.mirror.manifests):
+    for drive in list(store.mirror.drives):
         try:
             store.full_run(drive)
         except ResultError as error:
@@ -75,7 +74,7 @@ def _describe(store: Store) -> dict[str, Any]:
     stored = sum(one["descriptor_bytes"] for one in drives)
     library = {}
     try:
-        library = read_library_record(store.library(head.library)) if head.library else {}
+        library = read_library_record(store.library(head.library, ["library.json"])) if head.library else {}
     except LibraryError as error:
         problems.append(f"{store} has lost its library {str(head.library)[:12]}: {error}")
     return {
@@ -96,7 +95,7 @@ def _describe(store: Store) -> dict[str, Any]:
 
 def _drive(store: Store, drive: str, about: dict[str, Any]) -> dict[str, Any]:
     def read(_: Path) -> dict[str, Any]:
-        record = run_record.read_run_json(store.file(drive, "run.json"))
+        record = store.figures(drive)
         sizes = store.sizes(drive)
         return {
             "drive": drive,

@@ -116,7 +116,7 @@ def _check_chosen(sources: Sequence[Store | Path], chosen: Sequence[str]) -> Non
 
 def copy_library(store: Store, other: Store, library: str) -> None:
     """The library and the settings of the first map are those of a new one."""
-    if (store.root / "map.json").exists() and store.head().library is not None:
+    if store.exists and store.head().library is not None:
         return
     made = store.staging / "library"
     shutil.rmtree(made, ignore_errors=True)
@@ -158,7 +158,10 @@ def _merge_drive(
         layout.set_drive_id(made / "keyframes.parquet", taken)
     _link_join_inputs(other, drive, store, taken)  # what has a drive.json is put in by the next writer
     run_record.write_run_json(made / "drive.json", record if taken == drive else layout.renamed(record, taken))
-    map_store.publish(store, taken, made)
+    published = map_store.publish(store, taken, made)
+    if published != taken:  # which another writer has taken meanwhile
+        shutil.rmtree(store.root / "joins" / folder_name(taken), ignore_errors=True)
+        taken = published
     other.evict(drive)
     known[taken], by_content[_content(record)] = record, taken
     return {**entry, "as": taken, "state": "taken"}

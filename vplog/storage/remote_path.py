@@ -25,7 +25,7 @@ from vplog.storage.scratch import scratch
 from vplog.storage.urls import shown, without_secrets
 
 if TYPE_CHECKING:
-    from obstore import ObjectMeta
+    from obstore import ObjectMeta, PutResult
     from obstore.store import ObjectStore
 
 SCHEMES = (*STORES, "http", "https")
@@ -273,9 +273,9 @@ def objects_below(path: RemotePath) -> dict[str, ObjectMeta]:
         return {one["path"][path.prefix_length :]: one for one in found.collect()}
 
 
-def send(path: RemotePath, source: Path) -> None:
+def send(path: RemotePath, source: Path) -> PutResult:
     """A local file as an object, which appears when all of it is there. Raises OSError."""
-    path.ask("put", source, upload=True, chunk_size=_PART_BYTES, max_concurrency=1)
+    return path.ask("put", source, upload=True, chunk_size=_PART_BYTES, max_concurrency=1)
 
 
 def s3_place() -> tuple[str | None, str | None]:

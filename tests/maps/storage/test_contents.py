@@ -17,7 +17,7 @@ from vplog.batch.batch import settings_for
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.joining.joint_record import read_joint, write_joint
 from vplog.maps.search.index import update_index
-from vplog.maps.storage import lease_lock, map_store
+from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import damaged_files
 from vplog.maps.storage.layout import drive_record, set_drive_id
@@ -167,7 +167,7 @@ def test_no_flip_in_a_record_is_silent(root: Path, tmp_path: Path, name: str) ->
     """A drive whose record is damaged is left out, what failed is not known; a damaged map.json or joint.json is one
     line."""
     here = copied(root, tmp_path / "map")
-    Store(here).write_failures({"bad": {"log": "/logs/bad.mcap", "error": "It broke."}})
+    Store(here).update_failures({"bad": {"log": "/logs/bad.mcap", "error": "It broke."}})
     write_joint(here, {"groups": [], "alone": sorted(DRIVES), "apart": {}, "keys": {}})
     [path] = here.glob(f"runs/drive=walk/{name}") if name in ("drive.json", "run.json") else here.glob(name)
 
@@ -301,7 +301,3 @@ def test_a_table_without_its_settings_is_said_in_one_line(settings: str | None, 
     pq.write_table(table.replace_schema_metadata(header | ({"vplog.settings": settings} if settings else {})), path)
     with pytest.raises(ResultError, match=r"keyframes\.parquet lacks its settings"):
         set_drive_id(path, "stroll")
-
-
-def test_a_lock_of_nested_brackets_names_no_holder() -> None:
-    assert lease_lock._holder(b"[" * 10**6) == {}

@@ -10,6 +10,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,8 +30,9 @@ from vplog.maps.joining.inter_session import DrivePair, likely_pairs
 from vplog.maps.joining.members import CameraTrust, Member, member_of, why_not_joined
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import damaged_table
-from vplog.maps.storage.layout import PICTURES
+from vplog.maps.storage.layout import PICTURES, folder_name
 from vplog.maps.storage.map_store import Store, reading, writing
+from vplog.maps.storage.snapshot import LostRaceError
 from vplog.pipeline import Pipeline
 from vplog.results import tables
 
@@ -39,7 +41,9 @@ if TYPE_CHECKING:
     from vplog.stages import PlaceState
 
 _FLUSH_EVERY_S = 300.0
-"""Interval at which ledgers are sent to a map on an object store, each time with a copy of those there."""
+"""Interval at which ledgers are sent to a map on an object store."""
+_TRIES = 5
+"""Joins of a map on an object store that other writers join too."""
 
 
 @dataclass(frozen=True)
@@ -77,21 +81,34 @@ def join(
     """Verify the pairs of drives that are new or changed, solve the groups that have them, and return the record.
     `urls` open the logs of drives given now: a map stores URLs without their queries.
 
-    The caller holds the map's lock. With an executor its processes verify, pair by pair; they must see the map and the
-    logs under the same paths. It does not count for the result. `places` gives the state of `load_places`, where that
-    was begun before. A pair that cannot be verified, as where a log is gone, is left out with a reason, and tried again
-    the next time. Raises VplogError where the map as a whole cannot be read or written.
+    The caller writes to the map. Where another writer joins drives of a map on an object store at the same time, what
+    it has done is taken over and the rest joined again. With an executor its processes verify, pair by pair; they must
+    see the map and the logs under the same paths. It does not count for the result. `places` gives the state of
+    `load_places`, where that was begun before. A pair that cannot be verified, as where a log is gone, is left out with
+    a reason, and tried again the next time. Raises VplogError where the map as a whole cannot be read or written.
     """
     if store.mirror is not None:  # what joins drives goes to and from an object store as a whole
         lean = pipeline.join.model_copy(update={"keep_features": False})
         pipeline = pipeline.model_copy(update={"join": lean})
 
     def joined() -> dict[str, Any]:
+        if store.mirror is not None:
+            store.mirror.rest()
         drives = read_drives(store, urls)
         new = [at for at in range(len(drives.members)) if not _is_up_to_date(store, drives, at, pipeline)]
         return _join(_Work(store, drives, new, pipeline, execution, executor), places)
 
-    return skip_damaged(store, joined)
+    def attempt() -> dict[str, Any]:
+        if store.mirror is not None:
+            store.mirror.refresh()  # with the drives of other writers
+        record = skip_damaged(store, joined)
+        store.flush()
+        return record
+
+    for _ in range(_TRIES - 1):
+        with suppress(LostRaceError):
+            return attempt()
+    return attempt()
 
 
 def join_map(root: Path, execution: Execution = Execution()) -> dict[str, Any]:
@@ -273,7 +290,8 @@ def _current_ledgers(store: Store, drives: Drives) -> list[PairLedger]:
             path = drive_pairs.ledger_path(store, member.drive, pair["match"])
             if pair["candidates"]:
                 pair_ledgers.append(PairLedger(member.drive, pair["match"], path, pair["ledger"], pair["verified"]))
+    known = {folder_name(drive) for drive in [*store.drives(), *store.damaged]}
     for folder in store.root.glob("joins/drive=*"):
-        if not (store.root / "runs" / folder.name).is_dir():
+        if folder.name not in known:
             shutil.rmtree(folder, ignore_errors=True)
     return pair_ledgers

@@ -77,6 +77,8 @@ def keyframe_poses(store: Store, joint: Mapping[str, Component], drive: str) -> 
         with reading_drive(drive):
             return tables.read_keyframes(store.file(drive, "keyframes.parquet"))[1]
     path = joint[drive].folder / folder_name(drive) / "keyframes.parquet"
+    if store.mirror is not None:
+        store.mirror.rest([path.relative_to(store.root).as_posix()])
     try:
         return tables.read_keyframes(path)[1]
     except ResultError:

@@ -91,7 +91,7 @@ def update_index(
 
 def content_of(store: Store, drive: str, key: str) -> Content:
     """The drive's content now; on an object store by its manifest. Raises ResultError."""
-    if store.mirror is not None and (entry := store.mirror.manifests[drive]["files"].get("descriptors.parquet")):
+    if store.mirror is not None and (entry := store.mirror.drives[drive]["files"].get("descriptors.parquet")):
         return Content(drive, key, entry["sha256"])
     with reading_drive(drive):
         return Content(drive, key, _footer_hash(store.file(drive, "descriptors.parquet")))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +21,7 @@ from vplog.maps.storage.damage import (
     rows_of,
 )
 from vplog.maps.storage.layout import FORMAT, HASH, RUN_TABLES, drive_record, folder_name, write_changed
-from vplog.maps.storage.upload import send_rest, write_json
+from vplog.maps.storage.upload import send_rest, update_failures, write_head
 from vplog.results import run_record
 from vplog.storage.folders import regular_files
 from vplog.storage.parquet_limits import check_version
@@ -98,58 +98,71 @@ class Store:
         if self.mirror is not None:
             self.mirror.evict(drive)
 
-    def library(self, digest: str) -> Path:
-        """The folder of a library."""
+    def library(self, digest: str, names: Collection[str] = ()) -> Path:
+        """The folder of a library; of a map on a store with all of its files, or these."""
         if self.mirror is not None:
-            self.mirror.library(digest)
+            self.mirror.library(digest, names)
         return self.root / "libraries" / digest
 
     def sizes(self, drive: str) -> dict[str, int]:
         """Bytes of each file of a run folder, by name."""
         if self.mirror is not None:
-            return {name: about["bytes"] for name, about in self.mirror.manifests[drive]["files"].items()}
+            return {name: about["bytes"] for name, about in self.mirror.drives[drive]["files"].items()}
         run = self.run(drive)
         return {name: (run / name).lstat().st_size for name in regular_files(run)}
 
     def damaged_files(self, drive: str) -> list[str]:
-        """A line for each file of a drive that is not as it was written; of a map on a store, of those in AT_HAND and
-        of those that are gone. Raises UnreachableError."""
-        return damaged_files(self.run(drive)) if self.mirror is None else self.mirror.damaged_files(drive, RUN_TABLES)
+        """A line for each file of a drive that is not as it was written; of a map on a store, by what the store says of
+        them. Raises UnreachableError."""
+        return damaged_files(self.run(drive)) if self.mirror is None else self.mirror.damaged_files(drive)
 
     def is_present(self, drive: str) -> bool:
-        """Whether nothing of a drive is removed yet. Of one that failed there is only its entry in failures.json."""
-        if self.mirror is None:
-            return (self.root / "runs" / folder_name(drive)).is_dir() or drive in self.failures()
-        return drive in self.mirror.manifests or drive in self.failures()
+        """Whether nothing of a drive of a folder is removed yet. Of one that failed there is its failure alone."""
+        return (self.root / "runs" / folder_name(drive)).is_dir() or drive in self.failures()
 
     def rows(self, name: str, drive: str) -> int:
         """Rows of a table of a drive, by its footer. Raises DamagedDriveError."""
         if self.mirror is not None:
-            return int(self.mirror.manifests[drive]["files"].get(f"{name}.parquet", {}).get("rows", 0))
+            return int(self.mirror.drives[drive]["files"].get(f"{name}.parquet", {}).get("rows", 0))
         with reading_drive(drive):
             return rows_of(self.run(drive) / f"{name}.parquet")
 
     def earth(self, drive: str) -> Earth | None:
         """The georeference of a drive, None where it has none. Raises DamagedDriveError."""
         with reading_drive(drive):
-            about = drive_record(self.root / "runs" / folder_name(drive))
+            about = self.record(drive)
             return earth_from_record(about["earth"]) if "earth" in about else earth_of_run(self.full_run(drive))
 
-    def check_lock(self) -> None:
-        """Raises ResultError where another writer has the map on a store now."""
-        if self.mirror is not None:
-            self.mirror.check_lock()
+    def record(self, drive: str) -> dict[str, Any]:
+        """drive.json of a drive. Raises ResultError."""
+        if self.mirror is None:
+            return drive_record(self.root / "runs" / folder_name(drive))
+        if drive not in self.mirror.drives:
+            raise ResultError(self.mirror.damaged.get(drive, f"{self} has no drive {drive!r}."))
+        return self.mirror.drives[drive]["record"]
+
+    def figures(self, drive: str) -> dict[str, Any]:
+        """run.json of a drive; of a map on a store its counts, totals and warnings. Raises ResultError."""
+        known = None if self.mirror is None else self.mirror.drives[drive].get("run")
+        return known or run_record.read_run_json(self.file(drive, "run.json"))
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is a map yet."""
+        return (self.root / "map.json").exists() if self.mirror is None else self.mirror.exists
 
     def flush(self) -> None:
         """Upload what was written so far beside drives to a map on an object store; where that fails, later.
-        Raises ResultError where another writer has the map now."""
-        self.check_lock()
+        Raises LostRaceError where another writer has changed the same."""
         if self.mirror is not None:
             with suppress(UnreachableError):
                 send_rest(self.mirror)
 
     def drives(self) -> dict[str, dict[str, Any]]:
         """drive.json of every finished drive, by ID in order, but for those that are damaged. Raises NewerError."""
+        if self.mirror is not None:
+            known = self.mirror.drives
+            return {drive: known[drive]["record"] for drive in sorted(known) if drive not in self.damaged}
         removed = set(map(folder_name, self.removed()))
         found = dict[str, dict[str, Any]]()
         for folder in sorted(self.root.glob("runs/drive=*")):
@@ -169,14 +182,13 @@ class Store:
     def _checked_record(self, folder: Path) -> dict[str, Any]:
         """drive.json of a run folder whose tables are there. Raises ResultError."""
         record = drive_record(folder)
-        if self.mirror is None:
-            try:
-                check_run_tables(folder, record)
-            except ResultError:
-                if _identity(folder) is None:
-                    raise
-                record = drive_record(folder)  # of a folder that was replaced meanwhile
-                check_run_tables(folder, record)
+        try:
+            check_run_tables(folder, record)
+        except ResultError:
+            if _identity(folder) is None:
+                raise
+            record = drive_record(folder)  # of a folder that was replaced meanwhile
+            check_run_tables(folder, record)
         return record
 
     def read(self, drive: str, reader: Callable[[Path], T], names: Iterable[str] = RUN_TABLES) -> T:
@@ -184,7 +196,7 @@ class Store:
         where a writer replaced the folder meanwhile. Raises ResultError."""
         folder = self.run(drive, names)
         if self.mirror is not None:
-            return reader(folder)  # of one generation, always
+            return reader(folder)  # of one snapshot, always
         for number in range(_TRIES):
             time.sleep(_PAUSE_S * (2**number - 1))
             before = _identity(folder)
@@ -209,7 +221,7 @@ class Store:
 
     def write_removed(self, drives: Sequence[str]) -> None:
         """Decide that these drives are removed; none: that this is done."""
-        self._write("removed.json", {"drives": list(drives)})
+        write_changed(self.root / "removed.json", {"drives": list(drives)})
         if not drives:
             with suppress(OSError):
                 (self.root / "removed.json").unlink()
@@ -224,6 +236,8 @@ class Store:
         return self._failures()[1]
 
     def _failures(self) -> tuple[dict[str, dict[str, Any]], str]:
+        if self.mirror is not None:
+            return self.mirror.manifest.now["failures"], ""
         path = self.root / "failures.json"
         try:
             found = run_record.read_run_json(path) if path.exists() else {}
@@ -237,6 +251,8 @@ class Store:
 
     def head(self) -> Head:
         """map.json. Raises ResultError where the folder is no map, or one of another version."""
+        if self.mirror is not None and self.exists:
+            return Head(self.mirror.manifest.now["library"], self.mirror.manifest.now["settings"])
         path = self.root / "map.json"
         if not path.is_file():
             if (self.root / "run.json").is_file():
@@ -261,7 +277,7 @@ class Store:
         except NewerError:
             raise
         except ResultError:
-            if not (self.root / "map.json").is_file():
+            if self.mirror is not None or not (self.root / "map.json").is_file():
                 raise
             drives = self.drives()
             found = [run_record.read_run_json(self.run(drive) / "run.json").get("settings") for drive in drives]
@@ -272,16 +288,21 @@ class Store:
 
     def write_head(self, head: Head) -> None:
         """Write map.json, unless it holds that already."""
+        if self.mirror is not None:
+            write_head(self.mirror, head.library, head.settings)
+            return
         record = {"format": FORMAT, "vplog": __version__, "library": head.library, "settings": head.settings}
-        self._write("map.json", record)
+        write_changed(self.root / "map.json", record)  # a finished map is not touched
 
-    def write_failures(self, failures: dict[str, dict[str, Any]]) -> None:
-        self._write("failures.json", dict(sorted(failures.items())))
-
-    def _write(self, name: str, record: dict[str, Any]) -> None:
-        """Write JSON, or leave the file as it is where it holds the same: a finished map is not touched."""
-        if write_changed(self.root / name, record) and self.mirror is not None:
-            write_json(self.mirror, name)
+    def update_failures(self, changes: dict[str, dict[str, Any] | None]) -> None:
+        """Note why drives failed; None: that they did not."""
+        if self.mirror is not None:
+            update_failures(self.mirror, changes)
+            return
+        known = self.failures() | changes
+        if known or (self.root / "failures.json").exists():
+            failures = {drive: known[drive] for drive in sorted(known) if known[drive] is not None}
+            write_changed(self.root / "failures.json", failures)
 
 
 def skip_damaged(store: Store, work: Callable[[], T]) -> T:

@@ -1,18 +1,16 @@
-"""A user's cache of maps on object stores, so that the next query reads nothing but their manifests.
+"""A user's cache of maps on object stores, so that the next query reads nothing but its manifest.
 
-    CACHE/maps/objects/SHA256       files of drives and of libraries, by content
-    CACHE/maps/libraries/HASH.json  sha256 of each file of a library
-    CACHE/maps/index/ID/...         the index of a map, by where the map is
-    CACHE/maps/open/...             the folders of processes that read at the moment, with links to the above
+    CACHE/maps/objects/SHA256   files of drives and of libraries, by content
+    CACHE/maps/index/ID/...     the index of a map, by where the map is
+    CACHE/maps/open/...         the folders of processes that read at the moment, with links to the above
 
-Nothing in it is taken on trust: an object must have the hash that its manifest names, a library the hash that it is
-called by, a segment of an index its checksum; else it is fetched or made again. The folder may be removed at any time.
+Nothing in it is taken on trust: an object must have the hash that the manifest names, a segment of an index its
+checksum; else it is fetched or made again. The folder may be removed at any time.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import threading
 from collections.abc import Callable
@@ -21,11 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vplog.cache.user_cache import cache_folder, max_bytes, trim
-from vplog.maps.storage.layout import HASH, link, sha256_of
+from vplog.maps.storage.layout import link, sha256_of
 from vplog.storage.remote_path import RemotePath, s3_place
-
-_RECORD_BYTES = 10**5
-"""Longest record of a library's few files."""
 
 
 @dataclass(frozen=True)
@@ -63,34 +58,10 @@ class Cache:
         """Keep a file that has this sha256. Where that fails it is fetched again another time."""
         _replace(self.root / "objects" / digest, lambda part: link(source, part))
 
-    def take_library(self, digest: str, target: Path) -> bool:
-        """Link the files of a library into a folder; False where one is missing."""
-        record = self._record(digest)
-        try:
-            target.mkdir(parents=True, exist_ok=True)
-            data = record.read_bytes()
-            os.utime(record)
-            files = json.loads(data)["files"] if len(data) <= _RECORD_BYTES else {}
-            sound = "library.json" in files and all(
-                name == Path(name).name and HASH.fullmatch(content) for name, content in files.items()
-            )
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            return False
-        return sound and all(self.fetch_to(content, target / name) for name, content in files.items())
-
-    def keep_library(self, digest: str, files: dict[str, str], source: Path) -> None:
-        """Keep the files of a library, whose sha256 are given by name."""
-        for name, content in files.items():
-            self.keep(content, source / name)
-        _replace(self._record(digest), lambda part: part.write_text(json.dumps({"files": files})))
-
-    def _record(self, digest: str) -> Path:
-        return self.root / "libraries" / f"{digest}.json"
-
     def trim(self) -> None:
         """Remove least recently used files until the rest is within `max_bytes`, and within half of what the disk
         would have free without it. Other processes keep their links until they end."""
-        trim([self.root / name for name in ("objects", "libraries", "index")], self.max_bytes)
+        trim([self.root / name for name in ("objects", "index")], self.max_bytes)
 
 
 def _replace(path: Path, write: Callable[[Path], object]) -> None:

@@ -53,11 +53,7 @@ def quoted(drive: str) -> str:
 
 def drive_record(folder: Path) -> dict[str, Any]:
     """drive.json of a run folder in a map. Raises ResultError."""
-    return checked_record(run_record.read_run_json(folder / "drive.json"), folder)
-
-
-def checked_record(record: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The record of drive.json in `folder`, checked. Raises ResultError."""
+    record = run_record.read_run_json(folder / "drive.json")
     wanted = {"drive": str, "log": str, "key": str, "library": str, "inputs": dict}
     if any(not isinstance(record.get(name), kind) for name, kind in wanted.items()):
         raise ResultError(

@@ -8,10 +8,10 @@
     MAP/failures.json                          drives that could not be run, each with its error
     MAP/removed.json                           drives that are being removed, while that is not done
 
-A drive is in the map when its run folder is: that is one rename (local.py); on an object store, when its manifest is
-(remote_map.py). No byte is stored twice, and both names of a table always show the same bytes, since every writer here
-replaces a file and never changes one. Naming drives in removed.json removes them all in one step; their files are
-deleted afterwards, by the next writer where this one is killed.
+A drive is in the map when its run folder is: that is one rename (local.py); on an object store, when the newest
+snapshot names it (remote_map.py). No byte is stored twice, and both names of a table always show the same bytes, since
+every writer here replaces a file and never changes one. Naming drives in removed.json removes them all in one step;
+their files are deleted afterwards, by the next writer where this one is killed.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vplog.errors import LibraryError, ResultError, VplogError
-from vplog.maps.storage import lease_lock, local, upload
+from vplog.errors import LibraryError, ResultError, SettingsError, VplogError
+from vplog.maps.storage import local, upload
 from vplog.maps.storage.contents import Head, Store, common_library
-from vplog.maps.storage.damage import complete_record, damaged_table
-from vplog.maps.storage.layout import HASH, TABLES, drive_record, folder_name
+from vplog.maps.storage.damage import UnreachableError, complete_record, damaged_table
+from vplog.maps.storage.layout import HASH, TABLES, folder_name, free_name, renamed, set_drive_id
 from vplog.maps.storage.remote_map import Mirror
 from vplog.results import run_record
 from vplog.storage.folders import check_regular, regular_files
@@ -53,7 +53,7 @@ def reading(root: Path, cache: Cache | None = None) -> Iterator[Store]:
         raise ResultError(f"{root} is no map: a web server lists no folders. A map is a folder, s3://, gs:// or az://.")
     try:
         with scratch("map", None if cache is None else cache.open_folders) as folder:
-            mirror = Mirror(root, folder, cache=cache)
+            mirror = Mirror(root, folder, cache)
             yield Store(folder, mirror, mirror.damaged)
     finally:
         if cache is not None:
@@ -62,9 +62,10 @@ def reading(root: Path, cache: Cache | None = None) -> Iterator[Store]:
 
 @contextmanager
 def writing(root: Path) -> Iterator[Store]:
-    """The map for one writer, made where it is not there yet; drives that a killed writer had finished are put in.
+    """The map for a writer, made where it is not there yet; drives that a killed writer had finished are put in.
 
-    Raises SettingsError where the folder holds other things, or where another process writes.
+    A folder has one writer at a time, an object store any number. Raises SettingsError where the folder holds other
+    things, or where another process writes.
     """
     if isinstance(root, RemotePath):
         with _writing_remote(root) as store:
@@ -81,12 +82,13 @@ def writing(root: Path) -> Iterator[Store]:
 @contextmanager
 def _writing_remote(root: RemotePath) -> Iterator[Store]:
     check_writable(root)
-    with lease_lock.held(root) as lock, scratch("map") as folder:
-        mirror = Mirror(root, folder, lock)
+    with scratch("map") as folder:
+        try:
+            mirror = Mirror(root, folder, writable=True)
+            upload.begin(mirror)
+        except UnreachableError as error:
+            raise SettingsError(f"{error} Choose another place with -o.") from None
         store = Store(folder, mirror, mirror.damaged)
-        _finish_removals(store)
-        mirror.rest()
-        upload.begin(mirror)
         store.staging.mkdir()
         try:
             yield store
@@ -94,30 +96,38 @@ def _writing_remote(root: RemotePath) -> Iterator[Store]:
             with suppress(VplogError, OSError):
                 upload.send_rest(mirror)
             raise
-        upload.send_rest(mirror)
+        upload.finish(mirror)
 
 
-def publish(store: Store, drive: str, made: Path) -> None:
+def publish(store: Store, drive: str, made: Path) -> str:
     """Make a finished run folder, with its drive.json, the drive's, in place of the one it may have. Where it is on
-    earth is noted with it. Raises ResultError; then the map has the drive as before.
+    earth is noted with it. The ID that the drive has in the map: another one where another writer has meanwhile put
+    another drive of that ID into a map on a store. Raises ResultError; then the map has the drive as before.
     """
     store.damaged.pop(drive, None)
     if store.mirror is None:
         local.publish(store, drive, made)
-    else:
-        complete_record(made, hashed=False)
-        upload.publish(store.mirror, drive, made)
+        return drive
+    complete_record(made, hashed=False)
+    try:
+        return upload.publish(store.mirror, drive, made)
+    except upload.TakenError:
+        record = run_record.read_run_json(made / "drive.json")
+        free = free_name(drive, record["log"], store.mirror.manifest.now["drives"])
+        set_drive_id(made / "keyframes.parquet", free)
+        run_record.write_run_json(made / "drive.json", renamed(record, free))
+        return publish(store, free, made)
 
 
 def relocate(store: Store, drive: str, log: str) -> None:
     """Note where the log of a drive is now, if it was moved; nothing else of the drive depends on it. Raises
     ResultError."""
-    run = store.root / "runs" / folder_name(drive)
-    record = drive_record(run)
+    record = store.record(drive)
     if record["log"] == log:
         return
     if store.mirror is None:
-        run_record.write_run_json(run / "drive.json", {**record, "log": log})
+        path = store.root / "runs" / folder_name(drive) / "drive.json"
+        run_record.write_run_json(path, {**record, "log": log})
     else:
         upload.relocate(store.mirror, drive, log)
 
@@ -125,9 +135,11 @@ def relocate(store: Store, drive: str, log: str) -> None:
 def remove(store: Store, drives: Sequence[str]) -> None:
     """Take drives out with all that bears their names, and forget their failures: all of them or none, whatever ends
     this. Raises ResultError, which says whether they are out."""
+    if store.mirror is not None:
+        upload.remove(store.mirror, drives)
+        return
     named = f"{', '.join(drives)} {'is' if len(drives) == 1 else 'are'}"
-    if store.mirror is None:
-        local.check_removable(store, drives)
+    local.check_removable(store, drives)
     store.write_removed(drives)
     try:
         _finish_removals(store)
@@ -145,18 +157,13 @@ def _finish_removals(store: Store) -> None:
     drives = store.removed()
     if not drives:
         return
-    if store.mirror is None:
-        try:
-            local.remove_drives(store, drives)
-        except OSError as error:
-            where = error.filename or store
-            raise ResultError(f"Cannot remove {where}: {error.strerror}. Check its permissions.") from None
-    else:
-        for drive in drives:
-            upload.remove(store.mirror, drive)
-    failures = store.failures()
-    if failures.keys() & set(drives):
-        store.write_failures({drive: why for drive, why in failures.items() if drive not in drives})
+    try:
+        local.remove_drives(store, drives)
+    except OSError as error:
+        where = error.filename or store
+        raise ResultError(f"Cannot remove {where}: {error.strerror}. Check its permissions.") from None
+    if store.failures().keys() & set(drives):
+        store.update_failures(dict.fromkeys(drives))
     store.write_removed([])
 
 

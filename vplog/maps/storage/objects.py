@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from contextlib import suppress
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
 
@@ -27,8 +26,6 @@ class Versioned(NamedTuple):
 
     data: bytes
     version: Version
-    written: datetime
-    """By the store's clock."""
 
 
 def put_if(path: RemotePath, data: bytes, version: Version | None) -> Version | None:
@@ -57,24 +54,15 @@ def get_with_version(path: RemotePath) -> Versioned | None:
     """An object, all of one state also while it is replaced; None where there is none. Raises OSError."""
     with suppress(FileNotFoundError), plain_errors():
         found = path.ask("get")
-        return Versioned(bytes(found.bytes()), _version(found.meta), found.meta["last_modified"])
+        return Versioned(bytes(found.bytes()), _version(found.meta))
     return None
 
 
-def server_time(path: RemotePath) -> datetime:
-    """The store's own clock, by an object that is written for it; those of writers may be wrong. Raises OSError."""
-    path.ask("put", b"")
-    written = path.ask("head")["last_modified"]
-    path.ask("delete")
-    return written
-
-
-def send(path: RemotePath, source: Path) -> str:
-    """A local file as an object; sha256 of what was sent. Raises OSError."""
+def send(path: RemotePath, source: Path) -> tuple[str, PutResult]:
+    """A local file as an object; sha256 of what was sent, and the store's answer. Raises OSError."""
     with source.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    remote_path.send(path, source)
-    return digest
+    return digest, remote_path.send(path, source)
 
 
 def fetch(path: RemotePath, target: Path, most: int) -> str:
@@ -101,8 +89,3 @@ def remove(path: RemotePath) -> None:
     for names in ([f"{name}/{below}" for below in remote_path.objects_below(path)], [name]):
         with suppress(FileNotFoundError), plain_errors():  # S3 says nothing of what is not there
             store.delete(names)
-
-
-def files_below(path: RemotePath) -> dict[str, datetime]:
-    """When each object with this prefix was written, by its name behind the prefix. Raises OSError."""
-    return {name: about["last_modified"] for name, about in remote_path.objects_below(path).items()}

@@ -1,212 +1,163 @@
 """A map on an object store, through a local folder that has the names of a map and of its files those asked for.
 
-    MAP/map.json, failures.json, libraries/HASH/...   as in a folder
+    MAP/map.json, snapshots/...                       the manifest, which names all below with length and sha256
+    MAP/libraries/HASH/...                            as in a folder
     MAP/runs/drive=ID/GENERATION/...                  the run folder; its generation is a random name, never used twice
-    MAP/runs/drive=ID/drive.json                      the manifest: what a folder's drive.json says, the generation, and
-                                                      length and sha256 of each of its files; written when all are there
-    MAP/keyframes/drive=ID/keyframes.parquet          its tables as data sets, copied within the store
-    MAP/rest/GENERATION/..., MAP/rest.json            all else that a map's folder has, as what joins its drives
+    MAP/rest/GENERATION/...                           all else that a map's folder has, as what joins its drives
+    MAP/keyframes/drive=ID/keyframes.parquet          tables as data sets, and what joins drives by its own name; copied
+                                                      within the store, after the manifest
 
-An object store has no rename and no links, but an object appears whole or not at all. So a manifest is the one thing
-that changes, and what it names never does: a reader has the drive of the old manifest or that of the new one. What the
-old one named is removed afterwards, by the writer that replaced it; a reader that comes too late for it reads the new
-manifest. No writer removes what it did not itself replace, so nothing breaks even where two write at once: the last
-manifest counts. A killed writer leaves objects that no manifest names; a later one removes them after a day.
+An object store has no rename and no links, but an object appears whole or not at all. So the manifest is the one thing
+that changes (snapshot.py), and what it names never does. What a snapshot replaced, and what a killed writer sent for
+none, is removed by `map vacuum` a day later.
 """
 
 from __future__ import annotations
 
-import json
 import shutil
 import threading
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Annotated, Any, cast
-from urllib.parse import unquote
+from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, Field, StrictInt
-
-from vplog.errors import NewerError, ResultError
+from vplog.errors import ResultError
 from vplog.maps.storage import objects
 from vplog.maps.storage.damage import DamagedDriveError, UnreachableError
-from vplog.maps.storage.layout import ADD_AGAIN, HASH, TABLES, checked_record, folder_name
-from vplog.storage.folders import is_below
-from vplog.storage.json_records import has_checksum
-from vplog.storage.remote_path import RemotePath, names_below, reason
+from vplog.maps.storage.layout import ADD_AGAIN, RUN_TABLES, TABLES, folder_name
+from vplog.maps.storage.snapshot import Manifest, Snapshot, store_errors
+from vplog.results import run_record
+from vplog.storage.remote_path import RemotePath, objects_below, reason
+from vplog.storage.scratch import files_in
 
 if TYPE_CHECKING:
     from vplog.maps.storage.download_cache import Cache
-    from vplog.maps.storage.lease_lock import Lock
 
+Copies = dict[str, str | None]
+"""Objects to copy within the store, by the new name; None: to remove."""
 _REQUESTS = 16
 """At once: a store answers each in some 20 to 50 ms, whatever its size."""
-_NOT_IN_FOLDER = ("generation", "replaces", "files")
-"""Fields of a manifest that the drive.json of a folder does not have."""
-_LIBRARY_FILE_BYTES = 2**34
-"""Longest file of a library that is fetched: 16 GB, more than load_references takes."""
-Generation = Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
-
-
-class _File(BaseModel):
-    bytes: StrictInt
-    sha256: Annotated[str, Field(pattern=f"^{HASH.pattern}$")]
-    rows: StrictInt = 0
-
-
-class _Manifest(BaseModel):
-    """The fields of a manifest beside those of drive.json."""
-
-    generation: Generation
-    replaces: Generation | None
-    files: dict[str, _File]
 
 
 class Mirror:
-    """The drives of a map on a store, and the local folder that they are read and made through."""
+    """The drives of a map on a store, and the local folder that they are read and made through. A reader has them as of
+    one snapshot; so has a writer, with its own changes, until `refresh`."""
 
-    def __init__(
-        self, remote: RemotePath, local: Path, lock: Lock | None = None, *, cache: Cache | None = None
-    ) -> None:
-        """With a lock it may be written to; with a cache nothing is fetched that is there. Raises ResultError where the
-        store cannot be read."""
-        self.remote, self.local, self.lock, self.cache = remote, local, lock, cache
-        self.manifests: dict[str, dict[str, Any]] = {}
-        self.versions: dict[str, objects.Version | None] = {}
-        """State of each object as it was read or written last, None where there was none: no other one is replaced."""
-        self.damaged: dict[str, str] = {}
-        """Drives whose manifest is damaged or missing, and why."""
-        self.rest_manifest: dict[str, Any] = {}
+    def __init__(self, remote: RemotePath, local: Path, cache: Cache | None = None, *, writable: bool = False) -> None:
+        """With a cache nothing is fetched that is there. Raises ResultError where the store cannot be read."""
+        self.remote, self.local, self.cache, self.writable = remote, local, cache, writable
+        self.manifest = Manifest(remote)
+        self.drives: dict[str, dict[str, Any]] = dict(self.manifest.now["drives"])
+        """As the snapshot has them."""
+        self.damaged = dict(self.manifest.damaged)
+        """Drives of an older map that cannot be read, and why."""
+        self.held: dict[str, dict[str, Any]] = {}
+        """Files beside drives that were fetched or sent, by name."""
         self.rest_damage = ""
-        """Damage of the files beside drives, where a writer goes on without them."""
-        self._fetched: set[str] = set()
+        """Damage of these, where a writer goes on without them."""
+        self.copied: Copies = {}
+        """Copies within the store that are made, and not noted as such in the manifest."""
         self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
-        with store_errors(remote):
-            for name in ("map.json", "failures.json", "removed.json"):
-                if (data := self.read(name)) is not None:
-                    (local / name).write_bytes(data)
-            runs = names_below(remote / "runs")
-            folders = sorted(name for name, has_below in runs.items() if has_below and name.startswith("drive="))
-            with ThreadPoolExecutor(_REQUESTS) as pool:
-                list(pool.map(self._open, folders))
 
-    def read(self, name: str) -> bytes | None:
-        """An object of the map, None where there is none. Raises OSError."""
-        found = objects.get_with_version(self.remote / name)
-        self.versions[name] = None if found is None else found.version
-        return None if found is None else found.data
+    @property
+    def exists(self) -> bool:
+        return self.manifest.version is not None
 
-    def write(self, name: str, data: bytes) -> None:
-        """Replace an object as it was read or written last. Raises ResultError where another writer has been there, and
-        OSError."""
-        self.check_lock()
-        place = self.remote / name
-        version = objects.put_if(place, data, self.versions.get(name))
-        if version is None:
-            found = objects.get_with_version(place)
-            if found is None or found.data != data:  # else the response was lost, and this is a repetition
-                raise ResultError(f"Another writer has replaced {place}, which stays as it is. Run again.")
-            version = found.version
-        self.versions[name] = version
-
-    def check_lock(self) -> None:
-        """Raises ResultError where the map is open for reading, or another writer has taken the lock over."""
-        if self.lock is None:
+    def commit(self, what: str, change: Callable[[Snapshot], object]) -> None:
+        """Make a change to the map. Raises ResultError where it is open for reading alone, or the change does."""
+        if not self.writable:
             raise ResultError(f"{self.remote} is open for reading alone.")
-        self.lock.check()
 
-    def _open(self, drive_folder: str) -> None:
-        """Read the manifest of a drive. One that is missing was there where a table has a copy: that comes after it."""
-        drive, place = unquote(drive_folder.removeprefix("drive=")), self.remote / "runs" / drive_folder
-        try:
-            found = self.read_manifest(drive_folder)
-        except NewerError:
-            raise
-        except ResultError as error:
-            self.damaged[drive] = str(error)
-            return
-        if found is not None:
-            self.write_drive_record(found)
-        elif any(objects.files_below(self.remote / name / drive_folder) for name in TABLES):
-            self.damaged[drive] = f"{place}/drive.json is not there."
+        def changed(snapshot: Snapshot) -> None:
+            snapshot["copies"] = {
+                name: source for name, source in snapshot["copies"].items() if self.copied.get(name, "") != source
+            }
+            change(snapshot)
+
+        self.manifest.commit(what, changed)
+        self.copied.clear()
+
+    def refresh(self) -> None:
+        """Take the map as the newest snapshot that is known has it, with what joins its drives."""
+        newest = self.manifest.now["drives"]
+        for drive, entry in self.drives.items():
+            if newest.get(drive, {}).get("generation") != entry["generation"]:
+                shutil.rmtree(self.run(drive), ignore_errors=True)
+        self.drives = dict(newest)
+        ledgers = {name for name in self.local_rest() if name.startswith("joins/") and name.endswith(".parquet")}
+        for name in self.local_rest():
+            if name in self.held or name not in ledgers - self.manifest.now["rest"].keys():  # what was verified counts
+                (self.local / name).unlink()
+        self.held.clear()
+
+    def local_rest(self) -> list[str]:
+        """Names of the files beside drives and libraries in the local folder."""
+        return [name for name in files_in(self.local) if name.split("/")[0] not in ("runs", "libraries", *TABLES)]
 
     def fetch(self, drive: str, names: Iterable[str]) -> None:
-        """Download these files of a drive into the local folder, all of one generation. Raises DamagedDriveError where
-        one is gone or damaged, and ResultError."""
+        """Download these files of a drive into the local folder. Raises DamagedDriveError where one is gone or damaged,
+        and ResultError."""
         with self._locks[drive]:
-            for _ in range(3):
-                if (manifest := self.manifests.get(drive)) is None:
-                    return
-                place = self.remote / "runs" / folder_name(drive) / manifest["generation"]
+            if (about := self.drives.get(drive)) is None:
+                return
+            folder, place = self.run(drive), self.place(drive)
+            if not folder.exists():
+                folder.mkdir(parents=True)
+                run_record.write_run_json(folder / "drive.json", about["record"])
+            for name in names:
                 try:
-                    for name in names:
-                        if why := self._fetch_file(place / name, self.run(drive) / name, manifest["files"].get(name)):
-                            raise DamagedDriveError(f"{why}. Copy it back, or {ADD_AGAIN}", drive)
+                    why = self._fetch_file(place / name, folder / name, about["files"].get(name))
                 except FileNotFoundError:
-                    self._reread_manifest(drive)
-                else:
-                    self._fetched.add(drive)
-                    return
-            raise ResultError(f"{self.remote}: {drive} is replaced faster than it can be read. Try again later.")
+                    self._check_current(drive)
+                    why = f"{place / name} is not there"
+                if why:
+                    raise DamagedDriveError(f"{why}. Copy it back, or {ADD_AGAIN}", drive)
 
-    def damaged_files(self, drive: str, names: Iterable[str]) -> list[str]:
-        """A line for each file of a drive that is gone, and for the first of `names` that is damaged: these are
-        fetched. Raises UnreachableError."""
-        manifest = self.manifests[drive]
-        place = self.remote / "runs" / folder_name(drive) / manifest["generation"]
+    def _check_current(self, drive: str) -> None:
+        """Raises ResultError where the files of a drive are gone because another snapshot has replaced it."""
+        newest = Manifest(self.remote).now["drives"].get(drive)
+        if newest is None or newest["generation"] != self.drives[drive]["generation"]:
+            raise ResultError(
+                f"{drive} was {'removed from' if newest is None else 'replaced in'} {self.remote} while it was read, "
+                "and what it was is removed. Run again."
+            )
+
+    def place(self, drive: str) -> RemotePath:
+        """Where the files of a drive are."""
+        return self.remote / "runs" / folder_name(drive) / self.drives[drive]["generation"]
+
+    def damaged_files(self, drive: str) -> list[str]:
+        """A line for each file of a drive that is gone, and for the first that is damaged: read are those that are not
+        as the store had them after they were sent. Raises UnreachableError."""
+        place, files = self.place(drive), self.drives[drive]["files"]
         with store_errors(self.remote):
-            gone = [f"{place / name} is not there." for name in manifest["files"].keys() - objects.files_below(place)]
+            there = {name: (meta["size"], tag_of(meta)) for name, meta in objects_below(place).items()}
+        gone = [f"{place / name} is not there." for name in files.keys() - there.keys()]
+        doubtful = [
+            name for name, about in files.items()
+            if there.get(name, "") not in ("", (about["bytes"], about.get("tag")))
+            and (name in RUN_TABLES or about["bytes"] != there[name][0])
+        ]  # fmt: skip
         try:
-            self.fetch(drive, names)
+            self.fetch(drive, doubtful)
         except DamagedDriveError as error:
-            return sorted({*gone, str(error)})
+            gone.append(str(error))
         return sorted(gone)
 
     def evict(self, drive: str) -> None:
         """Delete the local copies of a drive's files; they are fetched again when they are needed."""
         with self._locks[drive]:
             shutil.rmtree(self.run(drive), ignore_errors=True)
-            self._fetched.discard(drive)
-            if drive in self.manifests:
-                self.write_drive_record(self.manifests[drive])
 
-    def _reread_manifest(self, drive: str) -> None:
-        """Read the manifest of a drive whose files are gone. Raises ResultError where some of them were handed out."""
-        place = self.remote / "runs" / folder_name(drive)
-        with store_errors(self.remote):
-            found = self.read_manifest(place.name)
-        old = self.manifests[drive]
-        if found is not None and found["generation"] == old["generation"]:
-            raise DamagedDriveError(
-                f"{place} has lost files that its drive.json names. Copy them back, or {ADD_AGAIN}", drive
-            )
-        del self.manifests[drive]
-        shutil.rmtree(self.run(drive), ignore_errors=True)
-        if found is None:
-            raise ResultError(f"{drive} was removed from {self.remote} while it was read. Run again.")
-        if drive in self._fetched:
-            raise ResultError(f"{drive} was replaced in {self.remote} while it was read. Run again.")
-        self.write_drive_record(found)
-
-    def library(self, digest: str) -> None:
-        """Download a library into the local folder, if the map has it. Raises ResultError."""
-        target, place = self.local / "libraries" / digest, self.remote / "libraries" / digest
-        if target.exists() or not HASH.fullmatch(digest):
-            return
-        part, files = target.with_name(f".{digest}.part"), dict[str, str]()
-        if self.cache is None or not self.cache.take_library(digest, part):
-            with store_errors(self.remote):
-                names = sorted(objects.files_below(place))
-                if "library.json" not in names:  # it is sent last
-                    return
-                for name in filter(is_below, names):
-                    (part / name).parent.mkdir(parents=True, exist_ok=True)
-                    files[name] = objects.fetch(place / name, part / name, _LIBRARY_FILE_BYTES)
-            if self.cache is not None:
-                self.cache.keep_library(digest, files, part)
-        part.rename(target)
+    def library(self, digest: str, names: Collection[str] = ()) -> None:
+        """Download a library into the local folder, if the map has it, or these files of it. Raises ResultError."""
+        with self._locks[digest], store_errors(self.remote):
+            for name, about in self.manifest.now["libraries"].get(digest, {}).items():
+                if not names or name in names:
+                    file = f"libraries/{digest}/{name}"
+                    if why := self._fetch_file(self.remote / file, self.local / file, about):
+                        raise ResultError(f"{why}. Copy it back.")
 
     def rest(self, names: Collection[str] = ()) -> None:
         """Download all other files of the map into the local folder, or those of these names.
@@ -214,52 +165,26 @@ class Mirror:
         Raises ResultError where some of it is damaged. A writer goes on without that and without the joint graphs,
         which `map join` makes again; `rest_damage` says why.
         """
-        if self.rest_damage:
-            return
-        damage = self._fetch_rest(names)
-        if damage and self.lock is None:
-            raise ResultError(f"{damage}. Join the drives again: vplog map join {self.remote}")
-        if damage:
-            self.rest_damage = damage
-            if not self.rest_manifest:  # of the copies that joins have by their own names; their hashes are unknown
-                with store_errors(self.remote):
-                    below = {top: objects.files_below(self.remote / top) for top in ("joint", "joins")}
-                left = ["joint.json", *(f"{top}/{name}" for top in below for name in below[top])]
-                self.rest_manifest = {"files": {name: {"sha256": ""} for name in left}}
+        known = {folder_name(drive) for drive in self.drives}  # files of other drives are not wanted
+        files = {name: about for name, about in self.manifest.now["rest"].items() if name in names or not names}
+        wanted = [name for name in files if name not in self.held and not drives_in(name) - known]
+
+        def fetched(name: str) -> str:
+            place = self.remote / "rest" / files[name]["generation"] / name
+            try:
+                return self._fetch_file(place, self.local / name, files[name])
+            except FileNotFoundError:
+                return f"{place} is not there"
+
+        with ThreadPoolExecutor(_REQUESTS) as pool:
+            damaged = [why for why in pool.map(fetched, wanted) if why]
+        if damaged and not self.writable:
+            raise ResultError(f"{damaged[0]}. Join the drives again: vplog map join {self.remote}")
+        self.held |= {name: files[name] for name in wanted}
+        if damaged:
+            self.rest_damage = damaged[0]
             (self.local / "joint.json").unlink(missing_ok=True)
             shutil.rmtree(self.local / "joint", ignore_errors=True)
-
-    def _fetch_rest(self, names: Collection[str]) -> str:
-        """The first damage of it, if any. Raises ResultError."""
-        before = None
-        for _ in range(3):
-            try:
-                with store_errors(self.remote):
-                    data = self.read("rest.json")
-                if data is None:
-                    return ""
-                manifest = checked_manifest(data, self.remote / "rest.json")
-            except UnreachableError:
-                raise
-            except ResultError as error:
-                return str(error).partition(". ")[0]
-            self.rest_manifest, place = manifest, self.remote / "rest" / manifest["generation"]
-            known = {folder_name(drive) for drive in self.manifests}  # files of other drives are not wanted
-            parts = {name: PurePosixPath(name).parts for name in manifest["files"] if name in names or not names}
-            wanted = {one for one in parts if {part for part in parts[one] if part.startswith("drive=")} <= known}
-            damaged, gone = list[str](), list[str]()
-            for name in sorted(wanted):
-                try:
-                    if why := self._fetch_file(place / name, self.local / name, manifest["files"][name]):
-                        damaged.append(why)
-                except FileNotFoundError:
-                    gone.append(f"{place / name} is not there")
-            if not gone or manifest["generation"] == before:
-                return "; ".join((gone + damaged)[:1])
-            before = manifest["generation"]
-            for name in wanted:
-                (self.local / name).unlink(missing_ok=True)
-        raise ResultError(f"{self.remote}/rest is replaced faster than it can be read. Try again later.")
 
     def _fetch_file(self, place: RemotePath, target: Path, about: dict[str, Any] | None) -> str:
         """Fetch an object, if the manifest names it and it is not here yet; what is wrong with it, if anything. Raises
@@ -267,7 +192,7 @@ class Mirror:
         if about is None or target.exists():
             return ""
         target.parent.mkdir(parents=True, exist_ok=True)
-        if self.cache is not None and self.cache.fetch_to(about["sha256"], target):
+        if self.cache is not None and about["sha256"] and self.cache.fetch_to(about["sha256"], target):
             return ""
         part = target.with_name(f".{target.name}.part")
         try:
@@ -276,7 +201,7 @@ class Mirror:
             raise
         except OSError as error:
             raise UnreachableError(f"Cannot read {place}: {reason(error)}. Try again later.") from None
-        if (digest, part.stat().st_size) != (about["sha256"], about["bytes"]):
+        if (about["sha256"] or digest, about["bytes"]) != (digest, part.stat().st_size):
             part.unlink()
             return f"{place} does not have the length and sha256 that its manifest names"
         part.replace(target)
@@ -284,54 +209,25 @@ class Mirror:
             self.cache.keep(digest, target)
         return ""
 
-    def read_manifest(self, drive_folder: str) -> dict[str, Any] | None:
-        """The current manifest of a drive, None without one. Raises OSError, and ResultError where it is damaged."""
-        place = self.remote / "runs" / drive_folder
-        data = self.read(f"runs/{drive_folder}/drive.json")
-        return (
-            None if data is None else checked_record(checked_manifest(data, place / "drive.json"), cast("Path", place))
-        )
-
-    def write_drive_record(self, manifest: dict[str, Any]) -> None:
-        """Make the drive's local folder with its drive.json."""
-        folder = self.run(manifest["drive"])
-        folder.mkdir(parents=True, exist_ok=True)
-        own = {key: manifest[key] for key in manifest if key not in _NOT_IN_FOLDER}
-        text = json.dumps(own, indent=2, ensure_ascii=False) + "\n"  # as write_run_json has it
-        (folder / "drive.json").write_text(text, encoding="utf-8")
-        self.manifests[manifest["drive"]] = manifest
-
-    def adopt(self, manifest: dict[str, Any], made: Path) -> None:
+    def adopt(self, drive: str, entry: dict[str, Any], made: Path) -> None:
         """Move the folder of a drive that was just uploaded into the local folder."""
-        folder = self.run(manifest["drive"])
+        folder = self.run(drive)
         shutil.rmtree(folder, ignore_errors=True)
         folder.parent.mkdir(parents=True, exist_ok=True)
         made.rename(folder)
-        self.manifests[manifest["drive"]] = manifest
-        self.damaged.pop(manifest["drive"], None)
-        self._fetched.add(manifest["drive"])
+        self.drives[drive] = entry
+        self.damaged.pop(drive, None)
 
     def run(self, drive: str) -> Path:
         """The drive's local folder."""
         return self.local / "runs" / folder_name(drive)
 
 
-@contextmanager
-def store_errors(remote: RemotePath) -> Iterator[None]:
-    """Raises UnreachableError where a store refuses."""
-    try:
-        yield
-    except OSError as error:
-        raise UnreachableError(f"Cannot read or write {remote}: {reason(error)}.") from None
+def tag_of(meta: Any) -> str:
+    """ETag of an object; some stores quote it."""
+    return (meta["e_tag"] or "").strip('"')
 
 
-def checked_manifest(data: bytes, place: RemotePath) -> dict[str, Any]:
-    """A manifest whose names stay within the map. Raises ResultError."""
-    try:
-        manifest = json.loads(data)
-        sound = has_checksum(manifest) and all(map(is_below, _Manifest.model_validate(manifest).files))
-    except (ValueError, TypeError, AttributeError, RecursionError):
-        sound, manifest = False, {}
-    if not sound:
-        raise ResultError(f"{place} is not a manifest of vplog. Move it out of the map, and {ADD_AGAIN}")
-    return manifest
+def drives_in(name: str) -> set[str]:
+    """Folders of drives that a file is in."""
+    return {part for part in PurePosixPath(name).parts if part.startswith("drive=")}

@@ -1,192 +1,325 @@
-"""Writes to a map on an object store: first the files, then the manifest that names them."""
+"""Writes to a map on an object store: first the files, then a snapshot that names them."""
 
 from __future__ import annotations
 
-import json
 import secrets
 import shutil
-from collections.abc import Iterable
+import time
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from vplog.errors import SettingsError
-from vplog.maps.storage import objects
+from vplog.errors import ResultError, SettingsError
+from vplog.maps.storage import objects, older_maps
 from vplog.maps.storage.damage import rows_of
-from vplog.maps.storage.layout import RUN_TABLES, TABLES, folder_name, sha256_of
-from vplog.maps.storage.remote_map import Mirror, store_errors
-from vplog.results import run_record
-from vplog.storage.json_records import with_checksum
-from vplog.storage.remote_path import RemotePath, names_below
+from vplog.maps.storage.layout import RUN_TABLES, TABLES, drive_record, folder_name, renamed, sha256_of
+from vplog.maps.storage.remote_map import Copies, Mirror, drives_in, tag_of
+from vplog.maps.storage.snapshot import LostRaceError, Snapshot, now, store_errors
+from vplog.results import run_record, tables
+from vplog.storage.remote_path import RemotePath, names_below, objects_below
 from vplog.storage.scratch import files_in
 
-_LEFT_OVER = timedelta(days=1)
-"""Age from which an object that no manifest names is removed: far beyond any upload."""
 _SENT_AT_ONCE = 4
 """Files: each holds a part of some MB in memory, and more do not fill the line any better."""
-_KNOWN = ("runs", "libraries", "map.json", "failures.json", "removed.json", *TABLES)
-"""Names in a map's folder that have a place of their own on a store; the rest goes together."""
+VACUUM_S = 86_400
+"""Age below which nothing is removed: no upload of a drive takes a day."""
+_PROBE = ".conditional-writes"
+"""An empty object that no write may replace, for the store itself to show that it heeds conditions."""
+_OWN = ("runs", "rest", "libraries", "snapshots", "joins", "joint", *TABLES, *older_maps.NAMES)
+"""Names in a map's folder that are of vplog."""
+_FIGURES = ("counts", "totals", "warnings", "descriptor_bits")
+"""Fields of run.json that `map info` shows."""
+
+
+class TakenError(ResultError):
+    """Another writer has put another drive of this ID into the map."""
 
 
 def begin(mirror: Mirror) -> None:
-    """Finish what a killed writer began. Raises SettingsError where other things than a map are there."""
-    remote = mirror.remote
+    """Finish what a killed writer began. Raises SettingsError where other things than a map are there, or where the
+    store has no conditional writes."""
+    remote, never = mirror.remote, {"e_tag": '"0"', "version": "1"}
     with store_errors(remote):
-        known = (mirror.local / "map.json").exists()
-        if others := [] if known else sorted(name for name in names_below(remote) if not name.startswith(".")):
+        if others := [] if mirror.exists else sorted(name for name in names_below(remote) if not name.startswith(".")):
             raise SettingsError(f"{remote} holds other things ({others[0]}), not a map. Choose another place with -o.")
-        there = {name: objects.files_below(remote / name) for name in ("runs", "rest", *TABLES)}
-        for drive, manifest in mirror.manifests.items():
-            named = folder_name(drive)
-            copied = all(f"{named}/{name}.parquet" in there[name] for name in TABLES)
-            if not copied or any(name.startswith(f"{named}/{manifest['replaces']}/") for name in there["runs"]):
-                _finish_publish(mirror, drive, manifest)
-        rest = mirror.rest_manifest
-        before = f"{rest.get('replaces')}/"
-        if known := [name.removeprefix(before) for name in there["rest"] if name.startswith(before)]:
-            _finish_rest(remote, rest, rest["files"], known)
-        damaged = {folder_name(drive) for drive in mirror.damaged}  # what their manifests name is not known
-        drives = {folder_name(drive): one["generation"] for drive, one in mirror.manifests.items()}
-        current = {"runs": {f"{drive}/{one}" for drive, one in drives.items()}, "rest": {rest.get("generation")}}
-        for top, files in there.items():
-            for left in _abandoned(files, 2 if top == "runs" else 1, current.get(top, set(drives))):
-                if left.split("/")[0] not in damaged:
-                    objects.remove(remote / top / left)
+        new = objects.put_if(remote / _PROBE, b"", None) is not None
+        if objects.put_if(remote / _PROBE, b"", never) or (new and objects.put_if(remote / _PROBE, b"", None)):
+            raise SettingsError(
+                f"Cannot write to {remote}: its store has no conditional writes, by which no writer undoes what "
+                "another does. Write to a folder or another store."
+            )
+    _copy(mirror, mirror.manifest.now["copies"])
 
 
-def _abandoned(files: dict[str, datetime], depth: int, named: set[Any]) -> list[str]:
-    """Folders, `depth` names deep, that no manifest names and that were not written to for a day."""
-    newest: dict[str, datetime] = {}
-    for name, written in files.items():
-        parts = name.split("/")
-        if len(parts) > depth:
-            folder = "/".join(parts[:depth])
-            newest[folder] = max(written, newest.get(folder, written))
-    now = datetime.now(UTC)
-    return sorted(one for one, written in newest.items() if one not in named and now - written > _LEFT_OVER)
+def _copy(mirror: Mirror, copies: Copies) -> None:
+    """Copy files to their names in data sets. Idempotent; the next commit notes what is done."""
+    for name, source in copies.items():
+        with store_errors(mirror.remote):
+            if source is None:
+                objects.remove(mirror.remote / name)
+            else:
+                with suppress(FileNotFoundError):  # replaced once more, and vacuumed
+                    objects.copy(mirror.remote / source, mirror.remote / name)
+        mirror.copied[name] = source
 
 
-def publish(mirror: Mirror, drive: str, made: Path) -> None:
-    """Send a finished run folder and then its manifest. Raises ResultError; then the store has the drive as before."""
-    mirror.check_lock()
-    place, generation = mirror.remote / "runs" / folder_name(drive), secrets.token_hex(8)
+def finish(mirror: Mirror) -> None:
+    """Send what was written beside drives, and note what copies are made. Raises ResultError."""
+    send_rest(mirror)
+    if mirror.copied:
+        mirror.commit("tables copied", lambda _: None)
+
+
+def publish(mirror: Mirror, drive: str, made: Path) -> str:
+    """Send a finished run folder and then a snapshot with it; the ID under which the map has it, another one where a
+    writer put the same drive in meanwhile. Raises TakenError, and ResultError; then the map has the drive as before."""
+    record, generation, began = drive_record(made), secrets.token_hex(8), time.time()
+    place = f"runs/{folder_name(drive)}/{generation}"
     rows = {f"{name}.parquet": {"rows": rows_of(made / f"{name}.parquet")} for name in TABLES}
-    with store_errors(mirror.remote):
-        sent = _send_all(files_in(made), made, place / generation)
-        manifest = {
-            **run_record.read_run_json(made / "drive.json"),
-            "generation": generation,
-            "replaces": mirror.manifests.get(drive, {}).get("generation"),
-            "files": {name: {**about, **rows.get(name, {})} for name, about in sent.items()},
-        }
-        mirror.write(f"runs/{place.name}/drive.json", _json_of(manifest))
+    stamps = tables.read_keyframes(made / "keyframes.parquet")[0].stamp_ns
+    run = run_record.read_run_json(made / "run.json")
+    names = [name for name in files_in(made) if name != "drive.json"]
+    sent = _send_all(names, made, mirror.remote / place)
+    entry = {
+        "record": record,
+        "generation": generation,
+        "files": {name: {**about, **rows.get(name, {})} for name, about in sent.items()},
+        "run": {name: run[name] for name in _FIGURES if name in run},
+        "stamps_ns": [int(stamps[0]), int(stamps[-1])] if len(stamps) else None,
+    }
+    copies: Copies = {f"{name}/{folder_name(drive)}/{name}.parquet": f"{place}/{name}.parquet" for name in TABLES}
+    found = list[str]()
+
+    def change(snapshot: Snapshot) -> None:
+        _check_recent(began)
+        found[:] = _same_drive(mirror, snapshot["drives"], record)
+        if not found:
+            _check_untouched(mirror, snapshot, drive)
+            _replace_drive(snapshot, drive)
+            snapshot["drives"][drive] = entry
+            snapshot["copies"] |= copies
+            snapshot["failures"].pop(drive, None)
+
+    try:
+        mirror.commit(f"{drive} {'replaced' if drive in mirror.drives else 'added'}", change)
+    except (TakenError, LostRaceError):
+        _remove_quietly(mirror.remote / place)
+        raise
+    if found:  # the other writer's is as good
+        _remove_quietly(mirror.remote / place)
+        mirror.drives[found[0]] = mirror.manifest.now["drives"][found[0]]
+        shutil.rmtree(made)
+        return found[0]
     for name in sent:
-        if name not in (*RUN_TABLES, "drive.json"):  # a batch would fill the disk
+        if name not in RUN_TABLES:  # a batch would fill the disk
             (made / name).unlink()
-    mirror.adopt(manifest, made)
-    _finish_publish(mirror, drive, manifest)
+    mirror.adopt(drive, entry, made)
+    _copy(mirror, copies)
+    return drive
+
+
+def _check_recent(began: float) -> None:
+    """Raises ResultError where what was sent may be removed as that of a killed writer."""
+    if not 0 <= time.time() - began < VACUUM_S:
+        raise ResultError("This writer was stopped for too long, so what it sent may be gone. Run again.")
+
+
+def _same_drive(mirror: Mirror, drives: dict[str, Any], record: dict[str, Any]) -> list[str]:
+    """The ID of a drive that is made from the same and that another writer has put in since this one looked."""
+    known = {drive: entry["generation"] for drive, entry in mirror.drives.items()}
+    new = [drive for drive, entry in drives.items() if entry["generation"] != known.get(drive)]
+    return [drive for drive in new if renamed(record, drive)["key"] == drives[drive]["record"]["key"]][:1]
+
+
+def _check_untouched(mirror: Mirror, snapshot: Snapshot, drive: str) -> None:
+    """Raises TakenError or LostRaceError where another writer has put a drive in, or replaced it, since this one
+    looked."""
+    theirs, known = snapshot["drives"].get(drive), mirror.drives.get(drive)
+    if theirs is not None and known is None:
+        raise TakenError(f"Another writer has put another drive named {drive} into {mirror.remote}. Run again.")
+    if theirs is not None and known is not None and theirs["generation"] != known["generation"]:
+        raise LostRaceError(f"Another writer has replaced {drive} in {mirror.remote}, which stays so. Run again.")
+
+
+def _replace_drive(snapshot: Snapshot, drive: str) -> None:
+    """Take a drive out, and note when."""
+    if (old := snapshot["drives"].pop(drive, None)) is not None:
+        snapshot["replaced"][f"runs/{folder_name(drive)}/{old['generation']}"] = now()
+
+
+def _remove_quietly(place: RemotePath) -> None:
+    """Remove objects that no snapshot names; where that fails `map vacuum` does it."""
+    with suppress(OSError):
+        objects.remove(place)
 
 
 def relocate(mirror: Mirror, drive: str, log: str) -> None:
-    """Write the manifest with another place of the drive's log. Raises ResultError."""
-    manifest = {**mirror.manifests[drive], "log": log}
-    with store_errors(mirror.remote):
-        mirror.write(f"runs/{folder_name(drive)}/drive.json", _json_of(manifest))
-    mirror.write_drive_record(manifest)
+    """Note another place of the drive's log. Raises ResultError."""
+
+    def change(snapshot: Snapshot) -> None:
+        _check_untouched(mirror, snapshot, drive)
+        if entry := snapshot["drives"].get(drive):
+            snapshot["drives"][drive] = {**entry, "record": {**entry["record"], "log": log}}
+
+    mirror.commit(f"log of {drive}", change)
+    mirror.drives[drive] = mirror.manifest.now["drives"].get(drive, mirror.drives[drive])
 
 
-def _send_all(names: list[str], folder: Path, place: RemotePath) -> dict[str, dict[str, Any]]:
-    """Send files of a folder: length and sha256, by name."""
+def _send_all(names: Collection[str], folder: Path, place: RemotePath) -> dict[str, dict[str, Any]]:
+    """Send files of a folder: length, sha256 and ETag, by name. Raises ResultError."""
 
     def send(name: str) -> dict[str, Any]:
         file = folder / name
-        return {"bytes": file.stat().st_size, "sha256": objects.send(place / name, file)}
+        digest, result = objects.send(place / name, file)
+        return {"bytes": file.stat().st_size, "sha256": digest, "tag": tag_of(result)}
 
-    with ThreadPoolExecutor(_SENT_AT_ONCE) as pool:
+    with store_errors(place), ThreadPoolExecutor(_SENT_AT_ONCE) as pool:
         return dict(zip(names, pool.map(send, names), strict=True))
 
 
-def _finish_publish(mirror: Mirror, drive: str, manifest: dict[str, Any]) -> None:
-    """Copy the tables to their data sets, then remove the generation that was replaced. Idempotent."""
-    named, remote = folder_name(drive), mirror.remote
-    place, old = remote / "runs" / named, manifest["replaces"]
-    with store_errors(remote):
-        for name in TABLES:
-            file = f"{name}.parquet"
-            objects.copy(place / manifest["generation"] / file, remote / name / named / file)
-        if old:
-            objects.remove(place / str(old))
+def write_head(mirror: Mirror, library: str | None, settings: dict[str, Any]) -> None:
+    """Set the library, once, and the settings of the map. Raises ResultError where it has another library."""
+
+    def change(snapshot: Snapshot) -> None:
+        if snapshot["library"] not in (None, library):
+            raise LostRaceError(
+                f"Another writer has given {mirror.remote} the library {snapshot['library'][:12]}. Run again."
+            )
+        snapshot["library"], snapshot["settings"] = library, settings
+
+    mirror.commit("settings", change)
 
 
-def write_json(mirror: Mirror, name: str) -> None:
-    """Send map.json or failures.json of the local folder. Raises ResultError where another writer has changed it."""
-    with store_errors(mirror.remote):
-        mirror.write(name, (mirror.local / name).read_bytes())
+def update_failures(mirror: Mirror, changes: dict[str, dict[str, Any] | None]) -> None:
+    """Note failures of drives; None: that a drive has not failed. Raises ResultError."""
 
+    def change(snapshot: Snapshot) -> None:
+        known = snapshot["failures"] | changes
+        snapshot["failures"] = {drive: known[drive] for drive in sorted(known) if known[drive] is not None}
 
-def _json_of(record: dict[str, Any]) -> bytes:
-    """A record with its checksum."""
-    return (json.dumps(with_checksum(record), ensure_ascii=False, allow_nan=False) + "\n").encode()
+    mirror.commit("failures", change)
 
 
 def send_library(mirror: Mirror, digest: str) -> None:
-    """Send a library, library.json last. It is named by its content, so what is there stays."""
+    """Send a library. It is named by its content, so what is there stays. Raises ResultError."""
+    if digest in mirror.manifest.now["libraries"]:
+        return
     folder, place = mirror.local / "libraries" / digest, mirror.remote / "libraries" / digest
-    with store_errors(mirror.remote):
-        if objects.get(place / "library.json") is not None:
-            return
-        for name in sorted(files_in(folder), key=lambda name: name == "library.json"):
-            objects.send(place / name, folder / name)
+    sent = _send_all(files_in(folder), folder, place)
+    mirror.commit("library", lambda snapshot: snapshot["libraries"].setdefault(digest, sent))
 
 
-def remove(mirror: Mirror, drive: str) -> None:
-    """Take a drive out: its manifest first, then all that bears its name. Raises ResultError."""
-    named, remote = folder_name(drive), mirror.remote
-    mirror.check_lock()
-    with store_errors(remote):
-        objects.remove(remote / "runs" / named / "drive.json")
-        mirror.versions.pop(f"runs/{named}/drive.json", None)
-        mirror.manifests.pop(drive, None)
-        objects.remove(remote / "runs" / named)
-        for name, has_below in sorted(names_below(remote).items()):
-            if has_below:
-                objects.remove(remote / name / named)
-    for folder in mirror.local.glob(f"*/{named}"):
+def remove(mirror: Mirror, drives: Sequence[str]) -> None:
+    """Take drives out, with all that bears their names, all in one step. Raises ResultError."""
+    named = set(map(folder_name, drives))
+
+    def change(snapshot: Snapshot) -> None:
+        for drive in drives:
+            _replace_drive(snapshot, drive)
+            snapshot["failures"].pop(drive, None)
+        gone = [name for name in snapshot["rest"] if drives_in(name) & named]
+        _replace_rest(snapshot, dict.fromkeys(gone))
+        snapshot["copies"] |= {f"{name}/{folder}/{name}.parquet": None for folder in named for name in TABLES}
+
+    mirror.commit(f"{', '.join(drives)} removed", change)
+    for drive in drives:
+        mirror.drives.pop(drive, None)
+    for name in [name for name in mirror.held if drives_in(name) & named]:
+        del mirror.held[name]
+    for folder in [folder for name in named for folder in mirror.local.glob(f"*/{name}")]:
         shutil.rmtree(folder)
+    _copy(mirror, {name: source for name, source in mirror.manifest.now["copies"].items() if drives_in(name) & named})
 
 
 def send_rest(mirror: Mirror) -> None:
-    """Send all that the local folder has beside drives and libraries, if it changed; tables and records also by their
-    own names, for those who read them as data sets."""
-    old = mirror.rest_manifest
-    known: dict[str, dict[str, Any]] = old.get("files", {})
-    now = {name: sha256_of(mirror.local / name) for name in files_in(mirror.local) if name.split("/")[0] not in _KNOWN}
-    if now == {name: one["sha256"] for name, one in known.items()}:
+    """Send what the local folder has beside drives and libraries, if it changed; tables and records also by their own
+    names, for those who read them as data sets. Raises LostRaceError where another writer has changed the same."""
+    known, hashes = mirror.held, {name: sha256_of(mirror.local / name) for name in mirror.local_rest()}
+    new = [name for name in hashes if hashes[name] != known.get(name, {}).get("sha256")]
+    gone = [name for name in known if name not in hashes]
+    if not new and not gone:
         return
-    mirror.check_lock()
-    remote, generation = mirror.remote, secrets.token_hex(8)
-    place = remote / "rest" / generation
-    with store_errors(remote):
-        same = {name: known[name] for name in now if name in known and known[name]["sha256"] == now[name]}
-        for name in same:
-            objects.copy(remote / "rest" / old["generation"] / name, place / name)
-        files = {**same, **_send_all([name for name in now if name not in same], mirror.local, place)}
-        manifest = {"generation": generation, "replaces": old.get("generation"), "files": dict(sorted(files.items()))}
-        mirror.write("rest.json", _json_of(manifest))
-        mirror.rest_manifest = manifest
-        _finish_rest(remote, manifest, [name for name in files if name not in same], known)
+    generation, began = secrets.token_hex(8), time.time()
+    sent = _send_all(new, mirror.local, mirror.remote / "rest" / generation)
+    changes = {**{name: {**about, "generation": generation} for name, about in sent.items()}, **dict.fromkeys(gone)}
+    components = _components(mirror.local / "joint.json") if {"joint.json"} & changes.keys() else None
+
+    def change(snapshot: Snapshot) -> None:
+        _check_recent(began)
+        contested = set(changes)
+        if any(map(_of_order, changes)):  # drives are joined one after the other
+            contested |= set(filter(_of_order, snapshot["rest"]))
+        for name in contested:
+            theirs = snapshot["rest"].get(name)
+            if theirs != known.get(name) and (theirs or {}).get("sha256") != hashes.get(name):
+                raise LostRaceError(f"Another writer has joined drives of {mirror.remote} at the same time. Run again.")
+        there = set(map(folder_name, snapshot["drives"]))
+        _replace_rest(snapshot, {name: about for name, about in changes.items() if not drives_in(name) - there})
+        if components is not None:
+            for drive, entry in list(snapshot["drives"].items()):
+                if entry.get("component") != (found := components.get(drive)):
+                    snapshot["drives"][drive] = {**entry, "component": found}
+
+    try:
+        mirror.commit("joins", change)
+    except LostRaceError:
+        _remove_quietly(mirror.remote / "rest" / generation)
+        raise
+    mirror.held = {name: mirror.manifest.now["rest"][name] for name in hashes if name in mirror.manifest.now["rest"]}
+    _copy(mirror, {name: source for name, source in mirror.manifest.now["copies"].items() if name in changes})
 
 
-def _finish_rest(remote: RemotePath, manifest: dict[str, Any], new: Iterable[str], known: Iterable[str]) -> None:
-    """Copy what is `new` to its own name, remove what was `known` before and is gone, and last the generation that was
-    replaced: while it exists, a later writer repeats this."""
-    place = remote / "rest" / manifest["generation"]
-    for name in new:
+def _of_order(name: str) -> bool:
+    """Whether a file says which drives a join has come to."""
+    return name.rpartition("/")[2] in ("joins.json", "joint.json")
+
+
+def _replace_rest(snapshot: Snapshot, changes: dict[str, Any]) -> None:
+    """Put files beside drives in, or take them out (None)."""
+    for name, about in changes.items():
+        if (old := snapshot["rest"].pop(name, None)) is not None:
+            snapshot["replaced"][f"rest/{old['generation']}/{name}"] = now()
+        if about is not None:
+            snapshot["rest"][name] = about
         if name.endswith((".parquet", ".json")):
-            objects.copy(place / name, remote / name)
-    for name in known:
-        if name not in manifest["files"]:
-            objects.remove(remote / name)
-    if manifest["replaces"]:
-        objects.remove(remote / "rest" / manifest["replaces"])
+            snapshot["copies"][name] = None if about is None else f"rest/{about['generation']}/{name}"
+
+
+def _components(path: Path) -> dict[str, str]:
+    """Folder of the joint graph of each drive that is in one."""
+    with suppress(ResultError, KeyError, TypeError):
+        groups = run_record.read_run_json(path)["groups"] if path.exists() else []
+        found = [component for group in groups for component in group["components"]]
+        return {drive: str(component["folder"]) for component in found for drive in component["drives"]}
+    return {}
+
+
+def vacuum(mirror: Mirror, hours: float) -> dict[str, int]:
+    """Remove what was replaced more than `hours` ago, and what no snapshot names and is as old; how many objects and
+    bytes. Raises ResultError."""
+    snapshot, before = mirror.manifest.now, datetime.now(UTC) - timedelta(hours=hours)
+    kept = {name for name, when in snapshot["replaced"].items() if datetime.fromisoformat(when) > before}
+    kept |= {f"runs/{folder_name(drive)}/{entry['generation']}" for drive, entry in snapshot["drives"].items()}
+    kept |= {f"rest/{about['generation']}/{name}" for name, about in snapshot["rest"].items()}
+    kept |= {f"libraries/{digest}" for digest in snapshot["libraries"]}
+    kept |= {row["object"] for row in [*mirror.manifest.log[:1], *(row for row, _ in mirror.manifest.layers)]}
+    kept |= {f"{name}/{folder_name(drive)}/{name}.parquet" for drive in snapshot["drives"] for name in TABLES}
+    kept |= snapshot["rest"].keys()
+    removed = {"objects": 0, "bytes": 0}
+    with store_errors(mirror.remote):
+        for name, meta in objects_below(mirror.remote).items():
+            parts = name.split("/")
+            above = {"/".join(parts[:count]) for count in range(1, len(parts) + 1)}
+            if parts[0] in _OWN and not above & kept and meta["last_modified"] < before:
+                objects.remove(mirror.remote / name)
+                removed = {"objects": removed["objects"] + 1, "bytes": removed["bytes"] + meta["size"]}
+
+    def change(snapshot: Snapshot) -> None:
+        left = snapshot["replaced"].items()
+        snapshot["replaced"] = {name: when for name, when in left if datetime.fromisoformat(when) > before}
+
+    mirror.commit("vacuum", change)
+    return removed

@@ -1,0 +1,348 @@
+"""The manifest of a map on an object store: a snapshot names every file of the map, and one write makes it the newest.
+
+    MAP/map.json                           names of the last snapshots, newest first: the one object that is replaced
+    MAP/snapshots/VERSION-TOKEN.json.gz    settings, library, failures; drives with their files, lengths and sha256
+
+A writer sends files, then a snapshot that names them, then map.json if it is still as it was read. Where another writer
+was first, it reads the new snapshot, makes the same change to that, and tries again. So writers do not exclude each
+other, and a reader has the map of one snapshot, whatever comes later.
+
+A snapshot holds the drives that are not in its layers, at most two objects of the same kind that snapshots have in
+common. So a change of a large map writes little, and its readers make four requests.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import random
+import secrets
+import time
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from hashlib import sha256
+from typing import TYPE_CHECKING, Annotated, Any, NotRequired, cast
+from urllib.parse import unquote
+
+from pydantic import ConfigDict, Field, StrictInt, TypeAdapter, with_config
+from typing_extensions import TypedDict  # as pydantic needs it below Python 3.12
+
+from vplog.errors import ResultError
+from vplog.maps.storage import objects, older_maps
+from vplog.maps.storage.damage import UnreachableError
+from vplog.maps.storage.layout import ADD_AGAIN, FORMAT, folder_name
+from vplog.storage.folders import is_below
+from vplog.storage.json_records import has_checksum, with_checksum
+from vplog.storage.parquet_limits import check_version
+from vplog.storage.remote_path import RemotePath, reason
+from vplog.version import __version__
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+STORE_FORMAT = FORMAT + 1
+"""Version of this manifest. Before it each drive had one of its own (older_maps.py)."""
+LISTED = 100
+"""Snapshots that map.json names, 200 bytes each."""
+_TRIES, _PAUSE_S = 100, 0.02
+"""Attempts of a commit, with a random pause of up to 2 s that doubles: each time one of the writers gets in."""
+_MOST_BYTES = 1 << 31
+"""Longest snapshot or layer, uncompressed: 700,000 drives at 3 kB."""
+_LAYERED = ("drives", "rest")
+"""Fields of which layers hold the most."""
+_MOST_CHANGES = 64
+"""Entries of a snapshot above its layers, 60 kB; with more it gets an upper layer of up to the square of that, 4 MB."""
+
+Generation = Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
+Snapshot = dict[str, Any]
+"""Fields as in `_Snapshot`, as plain values. What is in it is replaced, never changed."""
+
+
+class LostRaceError(ResultError):
+    """Another writer has changed the same part of the map."""
+
+
+class _File(TypedDict):
+    bytes: StrictInt
+    sha256: Annotated[str, Field(pattern="^([0-9a-f]{64})?$")]
+    """Empty where it is not known, in a library that an older vplog sent."""
+    tag: NotRequired[str]
+    """ETag."""
+    rows: NotRequired[StrictInt]
+    generation: NotRequired[Generation]
+    """Of a file beside drives: MAP/rest/GENERATION/NAME."""
+
+
+@with_config(ConfigDict(extra="allow"))
+class _Record(TypedDict):
+    """The fields of drive.json that are relied on."""
+
+    drive: str
+    log: str
+    key: str
+    library: str
+    inputs: dict[str, Any]
+
+
+class _Drive(TypedDict):
+    record: _Record
+    generation: Generation
+    """Its files are in MAP/runs/drive=ID/GENERATION, a random name that is never used twice."""
+    files: dict[str, _File]
+    run: NotRequired[dict[str, Any]]
+    """Figures of its run.json."""
+    stamps_ns: NotRequired[list[StrictInt] | None]
+    """First and last keyframe."""
+    component: NotRequired[str | None]
+    """Folder of its joint graph."""
+
+
+class _Layer(TypedDict):
+    """What is changed against the layers below; None: what is not there any more."""
+
+    drives: dict[str, _Drive | None]
+    rest: dict[str, _File | None]
+    """All else that a map's folder has, as what joins its drives."""
+
+
+class _Row(TypedDict):
+    """An object of map.json or a snapshot."""
+
+    object: str
+    bytes: StrictInt
+    sha256: str
+    version: StrictInt
+    time: str
+    drives: StrictInt
+    change: str
+
+
+class _Snapshot(_Layer):
+    library: str | None
+    settings: dict[str, Any]
+    libraries: dict[str, dict[str, _File]]
+    failures: dict[str, dict[str, Any]]
+    copies: dict[str, str | None]
+    """Objects that are to be copied within the store, by the new name; None: that are to be removed."""
+    replaced: dict[str, str]
+    """When folders and files that earlier snapshots name were replaced, in UTC."""
+    layers: list[_Row]
+    """From the lowest on."""
+
+
+_ROWS, _LAYER, _SNAPSHOT = TypeAdapter(list[_Row]), TypeAdapter(_Layer), TypeAdapter(_Snapshot)
+
+
+def empty() -> Snapshot:
+    """The snapshot of a map that is not there yet."""
+    names = ("libraries", "drives", "failures", "rest", "copies", "replaced")
+    return {"library": None, "settings": {}, **{name: {} for name in names}}
+
+
+class Manifest:
+    """The newest snapshot of a map as this process has read or written it last."""
+
+    def __init__(self, remote: RemotePath) -> None:
+        """Raises ResultError where it is damaged, NewerError, and UnreachableError."""
+        self.remote = remote
+        self.version: objects.Version | None = None
+        """State of map.json; None where there is none."""
+        self.log: list[dict[str, Any]] = []
+        """The last snapshots, newest first."""
+        self.now: Snapshot
+        self.layers: list[tuple[dict[str, Any], dict[str, Any]]] = []
+        """Name and content of those of the newest snapshot."""
+        self.damaged: dict[str, str] = {}
+        """Why drives of an older map cannot be read."""
+        self.read()
+
+    def read(self) -> None:
+        """Read the newest snapshot. Raises as the constructor."""
+        place = self.remote / "map.json"
+        with store_errors(self.remote):
+            found = objects.get_with_version(place)
+            self.version = None if found is None else found.version
+            if found is None:
+                self.log, self.now, self.layers = [], empty(), []
+                return
+            head = _json(found.data, place)
+            check_version(cast("Path", place), head.get("format"), STORE_FORMAT, head.get("vplog"))
+            if head["format"] < STORE_FORMAT:
+                self._read_older(head)
+                return
+            rows = _validated(_ROWS, head.get("snapshots"), place)
+            if not rows:
+                raise ResultError(f"{place} names no snapshot: it is damaged. Copy it back from a backup.")
+            if self.log[:1] != rows[:1]:
+                top = self._object(rows[0], _SNAPSHOT)
+                known = {row["object"]: layer for row, layer in self.layers}
+                self.layers = [
+                    (row, known.get(row["object"]) or self._object(row, _LAYER)) for row in top.pop("layers")
+                ]
+                self.now = top | _merged([*(layer for _, layer in self.layers), top])
+            self.log, self.damaged = rows, {}
+
+    def _object(self, row: dict[str, Any], kind: TypeAdapter[Any]) -> dict[str, Any]:
+        """A snapshot or a layer. Raises ResultError, and OSError."""
+        place = self.remote / row["object"]
+        data = objects.get(place) if is_below(row["object"]) else None
+        if data is None or (len(data), sha256(data).hexdigest()) != (row["bytes"], row["sha256"]):
+            raise ResultError(f"{place} is gone, or damaged. Copy it back from a backup.")
+        try:
+            return _checked(kind.validate_json(zlib.decompressobj(31).decompress(data, _MOST_BYTES)), place)
+        except (ValueError, zlib.error):
+            raise _no_snapshot(place) from None
+
+    def _read_older(self, head: dict[str, Any]) -> None:
+        """Take a map of the format before snapshots as one, but for drives that cannot be read."""
+        found, drives = older_maps.read(self.remote, head)
+        self.damaged, sound = {}, dict[str, Any]()
+        for folder, entry in drives.items():
+            place = self.remote / "runs" / folder / "drive.json"
+            try:
+                drive = entry["record"].get("drive", "")
+                checked({**empty(), "drives": {drive: entry}}, place)
+                if folder != folder_name(drive):
+                    raise ResultError("")
+                sound[drive] = entry
+            except ResultError:
+                self.damaged[unquote(folder.removeprefix("drive="))] = (
+                    f"{place} is not a manifest of vplog. Move it out of the map, and {ADD_AGAIN}"
+                )
+        self.now = checked({**empty(), **found, "drives": sound}, self.remote / "map.json")
+
+    def commit(self, what: str, change: Callable[[Snapshot], object]) -> None:
+        """Make `change` to the newest snapshot; it is called again where another writer comes in between, and may raise
+        ResultError. `what` is shown by `map log`. What changes nothing in the map as it was read last is not written.
+        Raises ResultError."""
+        for number in range(_TRIES):
+            if number:
+                time.sleep(random.uniform(0, min(_PAUSE_S * 2**number, 2)))
+            wanted = {name: dict(part) if isinstance(part, dict) else part for name, part in self.now.items()}
+            change(wanted)
+            with store_errors(self.remote):
+                if (wanted == self.now and self.version is not None) or self._write(what, wanted):
+                    return
+        raise ResultError(f"{self.remote} is written to by others without a pause. Run again.")
+
+    def _write(self, what: str, wanted: Snapshot) -> bool:
+        """Whether no other writer came first; else the newest snapshot is read."""
+        layers, drives = self.layers, len(wanted["drives"])
+        changed = _difference(wanted, layers)
+        if _entries(changed) > _MOST_CHANGES:
+            layers, changed = layers[:1], _difference(wanted, layers[:1])
+            if _entries(changed) > _MOST_CHANGES**2 or not layers:
+                layers, changed = [], _difference(wanted, [])
+            layers = [*layers, (self._send(changed, drives, "layer"), changed)]
+            changed = _difference(wanted, layers)
+        left = {row["object"] for row, _ in self.layers} - {row["object"] for row, _ in layers}
+        wanted["replaced"] = wanted["replaced"] | dict.fromkeys(left, now())
+        row = self._send({**wanted, **changed, "layers": [row for row, _ in layers]}, drives, what)
+        rows = [row, *self.log][:LISTED]
+        head = with_checksum({"format": STORE_FORMAT, "vplog": __version__, "snapshots": rows})
+        version = objects.put_if(self.remote / "map.json", json.dumps(head, indent=1).encode(), self.version)
+        if version is not None:
+            self.version, self.log, self.now, self.layers, self.damaged = version, rows, wanted, layers, {}
+            return True
+        self.read()
+        if row in self.log:  # the response was lost, and this is a repetition
+            return True
+        (self.remote / row["object"]).ask("delete")
+        return False
+
+    def _send(self, content: dict[str, Any], drives: int, what: str) -> dict[str, Any]:
+        """Write a snapshot or a layer; its row."""
+        number = self.log[0]["version"] + 1 if self.log else 1
+        data = gzip.compress(json.dumps(content, ensure_ascii=False, allow_nan=False).encode(), 1, mtime=0)
+        row = {
+            "version": number, "object": f"snapshots/{number:08d}-{secrets.token_hex(8)}.json.gz", "bytes": len(data),
+            "sha256": sha256(data).hexdigest(), "time": now(), "drives": drives, "change": what[:200],
+        }  # fmt: skip
+        objects.put_if(self.remote / row["object"], data, None)
+        return row
+
+
+def _merged(layers: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """What layers say together, the last one first."""
+    found: dict[str, dict[str, Any]] = {}
+    for name in _LAYERED:
+        every: dict[str, Any] = {}
+        for layer in layers:
+            every |= layer[name]
+        found[name] = {key: entry for key, entry in every.items() if entry is not None}
+    return found
+
+
+def _difference(wanted: Snapshot, layers: Sequence[tuple[Any, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
+    """The layer that is missing above others."""
+    below = _merged([layer for _, layer in layers])
+    return {
+        name: {key: entry for key, entry in wanted[name].items() if below[name].get(key) != entry}
+        | dict.fromkeys(below[name].keys() - wanted[name].keys())
+        for name in _LAYERED
+    }
+
+
+def _entries(layer: dict[str, dict[str, Any]]) -> int:
+    return sum(len(layer[name]) for name in _LAYERED)
+
+
+def now() -> str:
+    """The time in UTC, to the second."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+@contextmanager
+def store_errors(remote: RemotePath) -> Iterator[None]:
+    """Raises UnreachableError where a store refuses."""
+    try:
+        yield
+    except OSError as error:
+        raise UnreachableError(f"Cannot read or write {remote}: {reason(error)}.") from None
+
+
+def _json(data: bytes, place: RemotePath) -> dict[str, Any]:
+    try:
+        record = json.loads(data)
+        sound = isinstance(record, dict) and has_checksum(record)
+    except (ValueError, RecursionError):
+        sound, record = False, {}
+    if not sound:
+        raise ResultError(f"{place} is damaged. Copy it back from a backup.")
+    return record
+
+
+def _validated(kind: TypeAdapter[Any], value: Any, place: RemotePath) -> Any:
+    try:
+        return kind.validate_python(value)
+    except ValueError:
+        raise _no_snapshot(place) from None
+
+
+def checked(snapshot: Snapshot, place: RemotePath) -> Snapshot:
+    """A snapshot without layers, as `Manifest.now` has it. Raises ResultError where it is none."""
+    found = _checked(_validated(_SNAPSHOT, {**snapshot, "layers": []}, place), place)
+    return {name: found[name] for name in snapshot}
+
+
+def _checked(found: dict[str, Any], place: RemotePath) -> dict[str, Any]:
+    """A snapshot or a layer whose names stay within the map. Raises ResultError."""
+    drives = {drive: entry for drive, entry in found["drives"].items() if entry is not None}
+    names = {*found["rest"], *(name for entry in drives.values() for name in entry["files"])}
+    for name in ("copies", "libraries"):
+        names |= found.get(name, {}).keys()
+    names |= {*filter(None, found.get("copies", {}).values())}
+    names |= {name for files in found.get("libraries", {}).values() for name in files}
+    if (
+        not all(map(is_below, names))
+        or any(drive != entry["record"]["drive"] for drive, entry in drives.items())
+        or any(about is not None and "generation" not in about for about in found["rest"].values())
+    ):
+        raise _no_snapshot(place)
+    return found
+
+
+def _no_snapshot(place: RemotePath) -> ResultError:
+    return ResultError(f"{place} is no snapshot of vplog. Copy it back from a backup.")
