@@ -110,33 +110,41 @@ def best_hypothesis(
         found.append(replace(alone, log_evidence=alone.log_evidence + margin))
     best = _likeliest(found)[0] if cost is None else _least_cost(claimed, found, cost)
     if best.weight[loops].any():
-        return _with_the_claimed(claimed, best, optimiser) if isinstance(optimiser, GncSettings) else best
-    if log_odds is None:
-        return best
-    some = _likeliest([one for one in found if one.weight[loops].any()])
-    return next((one for one in some if _recognised(claimed, one, chain, log_odds, cost)), best)
+        others = attempted(lambda: _readmitted(claimed, best, optimiser, cost))
+    else:
+        some = _likeliest([one for one in found if one.weight[loops].any()])
+        others = attempted(lambda: [one for one in some if _recognised(claimed, one, chain, log_odds, cost)])
+    return next(iter(others), best)
 
 
-def _with_the_claimed(claimed: Factors, best: Hypothesis, gnc: GncSettings) -> Hypothesis:
+def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: Cost | None) -> list[Hypothesis]:
     """The hypothesis with the closures that it predicts within the noise that the log claims, where noise of heavy
     tails makes that far likelier: estimated from those that fit best, noise is too small for the others."""
+
+    def value(one: Hypothesis) -> float:
+        other = 0.0 if cost is None else cost(_times(claimed, one.sigmas), one.weight, one.poses)
+        return one.log_evidence + one.by_heavy_tails(claimed) - other
+
     rejected = np.flatnonzero(best.weight == 0)
-    if not len(rejected):
-        return best
+    if not len(rejected) or not isinstance(optimiser, GncSettings):
+        return []
     poses = descend(claimed, best.weight, best.poses, _STEPS, _TOLERANCE).world_from_body
     apart, _ = distance(claimed, best.weight, poses, rejected)
     weight = np.array(best.weight)
-    weight[rejected[apart <= chi2_quantile(gnc.inlier_probability, degrees_of_freedom(claimed.graph))]] = 1.0
+    weight[rejected[apart <= chi2_quantile(optimiser.inlier_probability, degrees_of_freedom(claimed.graph))]] = 1.0
     if (weight == best.weight).all():
-        return best
-    least = best.log_evidence + best.by_heavy_tails(claimed) + _VERY_STRONG
-    more = attempted(lambda: [_refit(claimed, weight, best.poses, best.sigmas)])
-    return next((one for one in more if one.log_evidence + one.by_heavy_tails(claimed) > least), best)
+        return []
+    more = _refit(claimed, weight, best.poses, best.sigmas)
+    return [more] if value(more) > value(best) + _VERY_STRONG else []
 
 
-def _recognised(claimed: Factors, one: Hypothesis, chain: OdometryChain, log_odds: Floats, cost: Cost | None) -> bool:
+def _recognised(
+    claimed: Factors, one: Hypothesis, chain: OdometryChain, log_odds: Floats | None, cost: Cost | None
+) -> bool:
     """Whether recognition is very sure of its runs of closures, less what speaks against them where odometry drifts as
     it claims: how well it agrees with itself along a run does not tell what it gathers over the drive."""
+    if log_odds is None:
+        return False
     at = AtSigmas.of(claimed, Sigmas())
     true = at.hypothesis(one.weight, one.poses)
     none = at.hypothesis(np.where(is_loop(claimed.graph), 0.0, 1.0), chain.poses)
