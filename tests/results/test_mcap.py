@@ -109,9 +109,11 @@ def test_transforms_put_the_body_in_the_map_and_the_camera_on_the_body(tmp_path:
         found = matrix(transform.translation, transform.rotation)
         np.testing.assert_allclose(found, RUN.solution.world_from_body[row], atol=1e-12)
     [(_, static)] = of(messages, "/tf_static")
-    root, fixed = static.transforms
+    root, fixed, *pictures = static.transforms
     assert (root.parent_frame_id, root.child_frame_id) == ("tf#/", "map")  # where rerun's 3D view begins
     np.testing.assert_array_equal(matrix(root.translation, root.rotation), np.eye(4))
+    # where pictures that no camera took are shown
+    assert [(one.parent_frame_id, one.child_frame_id) for one in pictures] == [("map", "reference"), ("map", "closure")]
     assert (fixed.parent_frame_id, fixed.child_frame_id) == ("base_link", "camera")
     found = matrix(fixed.translation, fixed.rotation)
     np.testing.assert_allclose(found, RUN.camera.body_from_camera, atol=1e-12)
@@ -177,7 +179,7 @@ def test_rerun_opens_it(tmp_path: Path) -> None:
         ("/path/optimised_points", 1, "Points3D:positions"),
         ("/path/odometry_points", 1, "Points3D:positions"),
         ("/tf", COUNT, "Transform3D:translation"),
-        ("/tf_static", 2, "Transform3D:child_frame"),
+        ("/tf_static", 4, "Transform3D:child_frame"),
         ("/graph", 1, "foxglove.SceneUpdate:message"),
         ("/loop_closures", len(RUN.closures), "vplog.LoopClosure:message"),
     ):
