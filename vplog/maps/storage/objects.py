@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 _BLOCK_BYTES = 1 << 20
 """Bytes copied from the store at once."""
+AT_ONCE = 16
+"""Requests at once: a store answers each in some 20 to 50 ms, whatever its size."""
 Version = dict[str, str]
 """State of an object: its ETag, on gs:// its generation."""
 

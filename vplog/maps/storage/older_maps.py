@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 NAMES = ("failures.json", "removed.json", "rest.json", "joint.json")
 """Objects that such a map has beside folders."""
-_REQUESTS = 16
-"""At once: a store answers each in some 20 to 50 ms, whatever its size."""
 
 
 def read(remote: RemotePath, head: dict[str, Any]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
@@ -32,7 +30,7 @@ def read(remote: RemotePath, head: dict[str, Any]) -> tuple[dict[str, Any], dict
     removed = set(map(folder_name, _record(remote / "removed.json").get("drives", [])))
     folders = [name for name in sorted(names_below(remote / "runs")) if name.startswith("drive=")]
     folders = [name for name in folders if name not in removed]
-    with ThreadPoolExecutor(_REQUESTS) as pool:
+    with ThreadPoolExecutor(objects.AT_ONCE) as pool:
         drives = dict(zip(folders, pool.map(partial(_drive, remote), folders), strict=True))
     libraries = dict[str, dict[str, Any]]()
     for name, meta in objects_below(remote / "libraries").items():

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
 Copies = dict[str, str | None]
 """Objects to copy within the store, by the new name; None: to remove."""
-_REQUESTS = 16
-"""At once: a store answers each in some 20 to 50 ms, whatever its size."""
 
 
 class Mirror:
@@ -176,7 +174,7 @@ class Mirror:
             except FileNotFoundError:
                 return f"{place} is not there"
 
-        with ThreadPoolExecutor(_REQUESTS) as pool:
+        with ThreadPoolExecutor(objects.AT_ONCE) as pool:
             damaged = [why for why in pool.map(fetched, wanted) if why]
         if damaged and not self.writable:
             raise ResultError(f"{damaged[0]}. Join the drives again: vplog map join {self.remote}")

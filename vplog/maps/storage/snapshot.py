@@ -72,7 +72,7 @@ class _File(TypedDict):
     """ETag."""
     rows: NotRequired[StrictInt]
     generation: NotRequired[Generation]
-    """Of a file beside drives: MAP/rest/GENERATION/NAME."""
+    """Folder of a file beside drives, MAP/rest/GENERATION/NAME: a random name."""
 
 
 @with_config(ConfigDict(extra="allow"))
@@ -100,7 +100,7 @@ class _Drive(TypedDict):
 
 
 class _Layer(TypedDict):
-    """What is changed against the layers below; None: what is not there any more."""
+    """Entries that differ from those of the layers below, by name; None: the entry is removed."""
 
     drives: dict[str, _Drive | None]
     rest: dict[str, _File | None]
@@ -265,7 +265,7 @@ class Manifest:
 
 
 def _merged(layers: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """What layers say together, the last one first."""
+    """Entries of all layers together, by name; those of later layers replace those of earlier ones."""
     found: dict[str, dict[str, Any]] = {}
     for name in _LAYERED:
         every: dict[str, Any] = {}
