@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import threading
 from collections import Counter
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -18,13 +19,23 @@ def serving() -> Iterator[None]:
     """With a bucket named `bucket`, found by all that ask for S3."""
     moto = pytest.importorskip("moto.server", reason="moto speaks S3 on loopback: pip install 'moto[server]'")
     from moto import backends
+    from moto.moto_server.werkzeug_app import DomainDispatcherApplication
     from obstore.store import HTTPStore
+
+    answer, one_at_a_time = DomainDispatcherApplication.__call__, threading.Lock()
+
+    def answer_in_turn(self: DomainDispatcherApplication, environ: dict[str, str], start: Any) -> Any:
+        if environ["REQUEST_METHOD"] != "PUT":
+            return answer(self, environ, start)
+        with one_at_a_time:  # moto checks a condition in one step and writes in another: two writers pass at once
+            return answer(self, environ, start)
 
     modules = list(backends.list_of_moto_modules())  # which moto lists by the folders on disk, twice a request
     started = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     started.start()
     host, port = started.get_host_and_port()
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as cache:
+        patch.setattr(DomainDispatcherApplication, "__call__", answer_in_turn)
         patch.setattr(backends, "list_of_moto_modules", lambda: modules)
         patch.setenv("VPLOG_CACHE", cache)  # not the user's
         patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")

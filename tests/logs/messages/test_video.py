@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import builtins
 import ctypes
+import os
 import re
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
@@ -67,11 +68,26 @@ def encoded(encoder: Any, codec: str, b_frames: int, params: str) -> Iterator[An
         "vp9": {"crf": "8", "b": "0", "lag-in-frames": "0", "deadline": "realtime"},
         "av1": {"crf": "16", "preset": "8", "svtav1-params": "scd=0" if b_frames else "pred-struct=1:scd=0"},
     }[codec]  # fmt: skip
-    for i, picture in enumerate(pictures()):
-        frame = av.VideoFrame.from_ndarray(np.repeat(picture[:, :, None], 3, axis=2), format="rgb24")
-        frame.pts = i
-        yield from encoder.encode(frame)
-    yield from encoder.encode(None)
+    with scheduled_as_before():
+        for i, picture in enumerate(pictures()):
+            frame = av.VideoFrame.from_ndarray(np.repeat(picture[:, :, None], 3, axis=2), format="rgb24")
+            frame.pts = i
+            yield from encoder.encode(frame)
+        yield from encoder.encode(None)
+
+
+@contextmanager
+def scheduled_as_before() -> Iterator[None]:
+    """SVT-AV1 gives the thread that it is opened in the highest real-time priority, where it may, as root does: what
+    runs beside then starves, and so do processes that busy ones are started beside."""
+    if not hasattr(os, "sched_getscheduler"):  # on macOS
+        yield
+        return
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, *before)
 
 
 @cache
