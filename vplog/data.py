@@ -303,6 +303,10 @@ class Closures:
     """(C,) sigma: the same after the solve."""
     weight: Floats
     """(C,) 0..1 of the robust solve, NaN where not in the graph."""
+    query_camera: Int32s
+    """(C,) the camera of the query's picture, by its number among those of the drive; 0 is the first."""
+    match_camera: Int32s
+    """(C,) that of the match's picture."""
 
     def __len__(self) -> int:
         return len(self.query)

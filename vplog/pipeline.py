@@ -34,13 +34,14 @@ from vplog.results.previews import PictureSettings
 from vplog.results.run_record import CACHE
 from vplog.run import provenance
 from vplog.run.back_end import solve
+from vplog.run.cameras import View, describe_cameras, name_shared, read_cameras, verify_cameras
 from vplog.run.decisions import DecisionSettings, decide, read_decisions
 from vplog.run.false_rate import rate_closures
 from vplog.run.feature_extraction import decoded, extract
 from vplog.run.keyframes import KeyframeSettings
 from vplog.run.odometry import read
 from vplog.run.outputs import Run, finish, report, write
-from vplog.run.place_recognition import describe, find_candidates, name_shared
+from vplog.run.place_recognition import describe, find_candidates
 from vplog.run.reference_library import check_library, cover, given_references, learn, own_images, own_references
 from vplog.run.run_folder import CacheOptions, staged_run
 from vplog.run.verification import DriveFeatures, verify
@@ -178,9 +179,11 @@ def run(
         features = do(extract, log, topics, selected, pipeline)
         keyframes = decoded(selected, features, pipeline.features)
         decisions = read_decisions(Path(pipeline.decisions.file), keyframes) if pipeline.decisions.file else None
+        views = do(read_cameras, log, path, odometry, keyframes, pipeline, library is None)
         if library is None:
             images = do(own_images, log, selected, keyframes, features, pipeline.library)
             references = own_references(keyframes, features, images)
+            references += [one for view in views for one in view.references]
         else:
             references = do(given_references, library)
         state = do(learn, pipeline.places, references, library)
@@ -189,15 +192,17 @@ def run(
         proposals = do(find_candidates, state, descriptors, keyframes, pipeline.propose, pipeline.sequence)
         drive = DriveFeatures(keyframes, camera, features, pipeline.verify)
         closures = do(verify, proposals, drive)
+        views = [View.of(log, drive, descriptors), *do(describe_cameras, views, state)]
+        closures = do(verify_cameras, closures, views, state, pipeline)
         closures = do(
             rate_closures, closures, odometry, drive, pipeline.null_pairs, pipeline.propose, pipeline.noise
         )  # fmt: skip
         if decisions is not None:
             closures = do(decide, closures, decisions, drive)
-        closures = name_shared(closures, state, descriptors)
+        closures = name_shared(closures, state, views)
         solved = do(solve, odometry, keyframes, closures, log.gps(), pipeline)
         result = Run(
-            log, odometry, camera, keyframes, features, library, references, state, coverage, descriptors, solved
+            log, odometry, camera, keyframes, features, library, references, state, coverage, descriptors, solved, views
         )
         header = tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash)
         do(write, folder, result, pipeline.verify, pipeline.pictures, header)

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
     from vplog import data
     from vplog.execution.execution import Execution
+    from vplog.logs import TopicChoice
 
 
 class EncodedFrame(Protocol):
@@ -39,6 +40,10 @@ class Log(Protocol):
     def info(self) -> data.LogInfo: ...
 
     def camera(self) -> data.Camera: ...
+
+    def further_cameras(self) -> list[TopicChoice]:
+        """The choice of topics by which the same log has each further camera of the body as its own."""
+        ...
 
     def stamps(self) -> data.Ints:
         """(F,) header stamps of the chosen camera's frames in ns, increasing, without decoding one."""

@@ -116,6 +116,8 @@ class Steps:
 
     def count(self, name: str, parts: int, reused: int) -> None:
         """Record of a step in parts how many of them were found."""
+        before = self._results.get(name, {})
+        parts, reused = parts + before.get("parts", 0), reused + before.get("parts_reused", 0)
         result = "computed" if not reused else "reused" if reused == parts else "partly reused"
         self._results[name] = {"result": result, "parts": parts, "parts_reused": reused}
 

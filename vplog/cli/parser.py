@@ -248,6 +248,8 @@ def topics_of(arguments: argparse.Namespace) -> TopicChoice:
     from vplog.logs import TopicChoice
 
     chosen = {role.replace("-", "_"): getattr(arguments, f"{role.replace('-', '_')}_topic") for role in _ROLES}
+    first, *more = chosen["image"] or [None]
+    chosen |= {"image": first, "cameras": more or None}
     others = ("odometry_file", "calibration_file", "start_s", "stop_s", "wheelbase_m", "track_m", "wheel_radius_m")
     return TopicChoice(**chosen, masks=dict(arguments.mask), **{name: getattr(arguments, name) for name in others})
 
@@ -259,7 +261,10 @@ def topic_options() -> argparse.ArgumentParser:
         names = "--odometry --odometry-topic" if role == "odometry" else f"--{role}-topic"
         source = ", or a source: twist, gps, visual, lidar, truth" if role == "odometry" else ""
         what = f"use this {role} topic{source}"
-        option(topics, names, str, "TOPIC", what, dest=f"{role.replace('-', '_')}_topic")
+        if role == "image":
+            what = "use these images; several times for several cameras (all calibrated ones if none is given)"
+        action = "append" if role == "image" else "store"
+        option(topics, names, str, "TOPIC", what, dest=f"{role.replace('-', '_')}_topic", action=action)
     for name, what in (("wheelbase", "axles"), ("track", "left and right wheels"), ("wheel-radius", "hub and road")):
         option(topics, f"--{name}-m", positive, "M", f"metres between {what}, for odometry of wheels")
     option(topics, "--start", not_negative, "S", "leave out images before S seconds of the log", dest="start_s")

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from vplog.data import Bytes, Camera, Float32s, Floats, Trajectory
 from vplog.demo import route
-from vplog.demo.scene import BODY_FRAME, CAMERA_FRAME, Scene, make_scene, take_picture
+from vplog.demo.scene import BODY_FRAME, CAMERA_FRAME, REAR_FRAME, Scene, make_scene, rear_mount, take_picture
 from vplog.demo.settings import DemoSettings
 from vplog.errors import ResultError
 from vplog.execution.cores import allowed
@@ -33,13 +33,15 @@ LEFT = "/camera/left/image_raw/compressed"
 LEFT_INFO = "/camera/left/camera_info"
 RIGHT = "/camera/right/image_raw/compressed"
 RIGHT_INFO = "/camera/right/camera_info"
+REAR = "/rear/image_raw/compressed"
+REAR_INFO = "/rear/camera_info"
 ODOMETRY = "/odom"
 GPS = "/gps/fix"
 TF_STATIC = "/tf_static"
 _IMAGE_TYPE, _CALIBRATION_TYPE = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
 TYPES = {
-    **dict.fromkeys((IMAGE, DEPTH, LEFT, RIGHT), _IMAGE_TYPE),
-    **dict.fromkeys((CAMERA_INFO, DEPTH_INFO, LEFT_INFO, RIGHT_INFO), _CALIBRATION_TYPE),
+    **dict.fromkeys((IMAGE, DEPTH, LEFT, RIGHT, REAR), _IMAGE_TYPE),
+    **dict.fromkeys((CAMERA_INFO, DEPTH_INFO, LEFT_INFO, RIGHT_INFO, REAR_INFO), _CALIBRATION_TYPE),
     ODOMETRY: "nav_msgs/msg/Odometry",
     GPS: "sensor_msgs/msg/NavSatFix",
     TF_STATIC: "tf2_msgs/msg/TFMessage",
@@ -93,7 +95,7 @@ def _check_own(path: Path, mark: bytes) -> None:
 
 def _write_log(path: Path, settings: DemoSettings, scene: Scene, execution: Execution) -> None:
     """All messages in the order in which they reach the recorder."""
-    messages = [*_mounting(scene.camera), *_odometry(settings), *_fixes(settings), *_frames(scene, execution)]
+    messages = [*_mounting(scene), *_odometry(settings), *_fixes(settings), *_frames(scene, execution)]
     delays = np.random.default_rng([settings.seed, 5]).integers(*_DELAY_NS, len(messages), endpoint=True).tolist()
     logged = sorted((stamp + delay, i) for i, ((_, stamp, _), delay) in enumerate(zip(messages, delays, strict=True)))
     with path.open("wb") as stream:
@@ -137,11 +139,18 @@ def _pose(world_from_frame: Floats, translation: str, rotation: str) -> dict[str
     return {name: dict(zip("xyzw", v.tolist(), strict=False)) for name, v in ((translation, point), (rotation, turn))}
 
 
-def _mounting(camera: Camera) -> Iterator[tuple[str, int, Any]]:
-    at = _pose(camera.body_from_camera, "translation", "rotation")
-    fields = {"header": _header(route.START_NS, BODY_FRAME), "child_frame_id": CAMERA_FRAME, "transform": at}
-    stamped = _message("geometry_msgs/msg/TransformStamped", **fields)
-    yield TF_STATIC, route.START_NS, _message(TYPES[TF_STATIC], transforms=[stamped])
+def _mounting(scene: Scene) -> Iterator[tuple[str, int, Any]]:
+    mounts = {CAMERA_FRAME: scene.camera.body_from_camera}
+    if scene.settings.rear_camera:
+        mounts[REAR_FRAME] = rear_mount(scene.camera)
+    stamped = [
+        _message(
+            "geometry_msgs/msg/TransformStamped", header=_header(route.START_NS, BODY_FRAME), child_frame_id=frame,
+            transform=_pose(mount, "translation", "rotation"),
+        )
+        for frame, mount in mounts.items()
+    ]  # fmt: skip
+    yield TF_STATIC, route.START_NS, _message(TYPES[TF_STATIC], transforms=stamped)
 
 
 def _odometry(settings: DemoSettings) -> Iterator[tuple[str, int, Any]]:
@@ -169,31 +178,33 @@ def _fixes(settings: DemoSettings) -> Iterator[tuple[str, int, Any]]:
 
 
 def _frames(scene: Scene, execution: Execution) -> Iterator[tuple[str, int, Any]]:
-    """Image, calibration and, if enabled, depth and the right image of every frame."""
+    """Image, calibration and, if enabled, depth, the right and the rear image of every frame."""
     settings, baseline_m = scene.settings, scene.settings.stereo_baseline_m
 
     def jpeg(image: Bytes) -> Bytes:
         return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].ravel()
 
-    def encoded(frame: int) -> tuple[Bytes, Bytes | None, Bytes | None]:
+    def encoded(frame: int) -> tuple[Bytes, Bytes | None, Bytes | None, Bytes | None]:
         image, depth = take_picture(scene, frame)
         right = jpeg(take_picture(scene, frame, baseline_m)[0]) if baseline_m else None
-        return jpeg(image), _compressed_depth(depth) if settings.depth else None, right
+        rear = jpeg(take_picture(scene, frame, rear=True)[0]) if settings.rear_camera else None
+        return jpeg(image), _compressed_depth(depth) if settings.depth else None, right, rear
 
     count = len(scene.stamp_ns)
     # One frame first: numba compiles in one thread while the others would only wait for it.
     frames = chain([encoded(0)], execution.map(encoded, range(1, count)))
     rendered = execution.counted("render", frames, count)
-    for stamp, (left, depth, right) in zip(scene.stamp_ns.tolist(), rendered, strict=True):
-        header = _header(stamp, CAMERA_FRAME)
+    for stamp, (left, depth, right, rear) in zip(scene.stamp_ns.tolist(), rendered, strict=True):
         jpegs = "mono8; jpeg compressed mono8"
         topics = (LEFT, LEFT_INFO) if baseline_m else (IMAGE, CAMERA_INFO)
         for (topic, calibration), data, kind, right_m in (
             (topics, left, jpegs, 0.0),
             ((DEPTH, DEPTH_INFO), depth, "16UC1; compressedDepth png", 0.0),
             ((RIGHT, RIGHT_INFO), right, jpegs, baseline_m),
+            ((REAR, REAR_INFO), rear, jpegs, 0.0),
         ):
             if data is not None:
+                header = _header(stamp, REAR_FRAME if topic == REAR else CAMERA_FRAME)
                 yield topic, stamp, _message(_IMAGE_TYPE, header=header, format=kind, data=data)
                 yield calibration, stamp, _calibration(header, scene.camera, right_m)
 

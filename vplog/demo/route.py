@@ -30,6 +30,9 @@ _LATERAL_OFFSET_M = 0.8
 SHIFT_LENGTH_M = 10.0
 """Distance before the end of the first lap over which the car moves to its new track and the light changes."""
 
+TURN_LENGTH_M = 18.0
+"""Metres that the car would drive while it turns back on the spot."""
+
 
 def lap_length(settings: DemoSettings) -> float:
     """Metres of one round along the axis: a rectangle with rounded corners."""
@@ -73,13 +76,25 @@ def track_point(settings: DemoSettings, distance_m: Floats) -> Floats:
     return point + left_m[..., None] * np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
 
 
+def _turned_back(settings: DemoSettings, driven_m: Floats) -> tuple[Floats, Floats]:
+    """Distance along the street (T,) in m, and by how much the car looks back (T,), 0 to pi, by metres driven: it turns
+    in the time of TURN_LENGTH_M."""
+    if not settings.turn_back_m:
+        return driven_m, np.zeros_like(driven_m)
+    turn = np.clip((driven_m - settings.turn_back_m) / TURN_LENGTH_M, 0, 1)
+    ahead_m = np.minimum(driven_m, settings.turn_back_m)
+    return ahead_m - np.maximum(driven_m - settings.turn_back_m - TURN_LENGTH_M, 0), np.pi * turn * turn * (
+        3 - 2 * turn
+    )
+
+
 def world_from_body(settings: DemoSettings, stamp_ns: Ints) -> Floats:
     """(T, 4, 4) truth: along the street at constant speed, with the small sway of a car on its springs."""
     time_s: Floats = (stamp_ns - START_NS).astype(np.float64) * 1e-9
-    distance_m = settings.speed_m_s * time_s
+    distance_m, back_rad = _turned_back(settings, settings.speed_m_s * time_s)
     step_m = 0.05  # short against every curve, long against rounding
     forward = track_point(settings, distance_m + step_m) - track_point(settings, distance_m - step_m)
-    yaw = np.arctan2(forward[:, 1], forward[:, 0])[:, None] * [0, 0, 1]
+    yaw = (np.arctan2(forward[:, 1], forward[:, 0]) + back_rad)[:, None] * [0, 0, 1]
     # Sway: 0.4 and 0.3 degrees, 1.5 cm, at periods of the order of a second that share no multiple.
     roll, pitch, height = (
         size * np.sin(time_s * rate + phase)

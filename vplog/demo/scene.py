@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from vplog.demo.settings import DemoSettings
 
 CAMERA_FRAME = "camera_optical"
+REAR_FRAME = "rear_optical"
 BODY_FRAME = "base_link"
 _FIELD_OF_VIEW_DEG, _IMAGE_NOISE = 80.0, 1.5
 """Horizontal field of view; standard deviation of the sensor noise in grey levels."""
@@ -81,19 +82,25 @@ def make_scene(settings: DemoSettings) -> Scene:
     return Scene(settings, build_world(settings), camera, stamp_ns, route.world_from_body(settings, stamp_ns))
 
 
-def take_picture(scene: Scene, frame: int, right_m: float = 0.0) -> tuple[Bytes, Float32s]:
+def rear_mount(camera: Camera) -> Floats:
+    """body_from_camera of the rear camera: the first one's, turned about the body's vertical."""
+    return pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)) @ camera.body_from_camera
+
+
+def take_picture(scene: Scene, frame: int, right_m: float = 0.0, rear: bool = False) -> tuple[Bytes, Float32s]:
     """Grey image (H, W) with sensor noise and depth (H, W) in m, NaN for sky, of one frame of the drive.
 
-    `right_m` moves the camera so far to its right.
+    `right_m` moves the camera so far to its right; `rear` takes the one that looks back.
     """
     settings = scene.settings
     time_s = float(scene.stamp_ns[frame] - route.START_NS) * 1e-9
     later = float(route.second_lap_share(settings, np.array(time_s * settings.speed_m_s)))
     light: Any = [(1 - later) * a + later * b for a, b in zip(FIRST_LIGHT, LATER_LIGHT, strict=True)]
-    mount = scene.camera.body_from_camera @ pose(np.eye(3), np.array([right_m, 0.0, 0.0]))
+    mount = rear_mount(scene.camera) if rear else scene.camera.body_from_camera
+    mount = mount @ pose(np.eye(3), np.array([right_m, 0.0, 0.0]))
     occluders = traffic(settings, time_s)
     image, depth = render(scene.world, scene.camera, scene.world_from_body[frame] @ mount, Light(*light), occluders)
-    rng = np.random.default_rng([settings.seed, 8 if right_m else 4, frame])
+    rng = np.random.default_rng([settings.seed, 8 if right_m else 9 if rear else 4, frame])
     noise = rng.standard_normal(image.shape, np.float32) * np.float32(_IMAGE_NOISE)
     return np.clip(np.round(image + noise), 0, 255).astype(np.uint8), depth
 

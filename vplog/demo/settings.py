@@ -34,6 +34,10 @@ class DemoSettings(Settings):
     """Also write a depth image for every frame, in mm, registered to the grey image."""
     stereo_baseline_m: float = Field(default=0.0, ge=0, le=2)
     """Also write the images of a second camera so far to the right; 0 writes none."""
+    rear_camera: bool = False
+    """Also write the images of a second camera that looks back."""
+    turn_back_m: float = Field(default=0.0, ge=0, le=1e6)
+    """Metres after which the car turns on the spot and drives back the way it came; 0 never turns."""
     odometry_rate_hz: float = Field(default=20.0, gt=1, le=1000)
     """Odometry samples per second."""
     odometry_scale_error: float = Field(default=0.01, ge=-0.5, le=0.5)

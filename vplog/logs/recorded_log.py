@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from vplog.data import LogInfo, Topic, Trajectory
 from vplog.errors import LogError
 from vplog.logs.calibration_file import SidecarFiles
-from vplog.logs.cameras import body_from_camera, camera_of
+from vplog.logs.cameras import BODY, body_from_camera, camera_of
 from vplog.logs.content import read_content
 from vplog.logs.formats.container import Notes
 from vplog.logs.formats.ros2_folder import messages_unpacked
@@ -21,7 +21,7 @@ from vplog.logs.rectification import CHECKED_FRAMES, MOST_ROWS_PX, NoPairError, 
 from vplog.logs.scans import ScanReader
 from vplog.logs.stamps import rows_of
 from vplog.logs.topic_candidates import read_candidates
-from vplog.logs.topic_selection import Candidate, TopicChoice, select, wheel_options
+from vplog.logs.topic_selection import Candidate, TopicChoice, further_cameras, select, wheel_options
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -110,6 +110,17 @@ class RecordedLog:
 
     def odometry(self) -> Odometry | None:
         return self._sidecar.odometry or self._content.odometry
+
+    def further_cameras(self) -> list[TopicChoice]:
+        choice, content = self._choice, self._content
+        topics = choice.cameras
+        if topics is None:
+            known = [] if choice.image is not None else further_cameras(self._candidates, self._selection)
+            mounted = (c for c in known if content.tree.between(self._body or BODY, c.frame) is not None)
+            topics = tuple(c.channel.topic for c in mounted)
+        own = {"depth": None, "right": None, "camera_info": None, "cameras": (), "mask": None}
+        masks = {topic: path for topic, path in choice.masks.items() if topic}
+        return [choice.model_copy(update={**own, "image": topic, "masks": masks}) for topic in topics]
 
     def has_depth(self) -> bool:
         return self._pair is not None or self._depth is not None

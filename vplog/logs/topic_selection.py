@@ -52,6 +52,9 @@ class TopicChoice(Settings):
 
     image: str | None = None
     """Topic of the camera's images; of a folder with those of several cameras the group of one, or `*` for all."""
+    cameras: tuple[str, ...] | None = None
+    """Image topics of further cameras on the body. None takes every calibrated one whose mount is known, unless `image`
+    is chosen, and then none."""
     depth: str | None = None
     """Topic of the depth images; an empty string uses none."""
     right: str | None = None
@@ -226,6 +229,21 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     return Selection(
         **found, sources=tuple(c.channel for c in sources), tf_static=static, tf=tf, kind=kind, geometry=geometry
     )
+
+
+def further_cameras(candidates: list[Candidate], used: Selection) -> list[Candidate]:
+    """Calibrated cameras beside the one in use, each by its best topic: with another frame_id than any before it, and
+    not the right one of a pair."""
+    usable = sorted((c for c in candidates if c.count), key=lambda c: (-c.count, c.channel))
+    taken = {c.frame for c in usable if c.channel in (used.image, used.right)}
+    found = []
+    for c in usable:
+        info = _calibration(c, usable) if c.role == "image" and c.supported else None
+        is_right = _partner(c, usable, back=True) is not None
+        if info and info.calibrated and c.frame and c.frame not in taken and not is_right and c.channel != used.mask:
+            taken.add(c.frame)
+            found.append(c)
+    return found
 
 
 def _check_files(choice: TopicChoice) -> None:

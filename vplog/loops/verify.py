@@ -147,6 +147,8 @@ def _ledger(proposals: Proposals, rows: list[Row], later: Drive, earlier: Drive,
         residual_before=np.full(count, np.nan),
         residual_after=np.full(count, np.nan),
         weight=np.full(count, np.nan),
+        query_camera=np.zeros(count, np.int32),
+        match_camera=np.zeros(count, np.int32),
     )
 
 
@@ -157,5 +159,5 @@ def no_closures() -> Closures:
         query=rows, match=rows, rank=rows, score=shares, support=rows, shared_references=[], shared_overlap=[],
         matches=rows, landmarks=rows, inliers=rows, spread=shares, reverse_inliers=rows, scale=[],
         match_from_query=np.empty((0, 4, 4)), information=np.empty((0, 6, 6)), verdict=[], p_false=none,
-        residual_before=none, residual_after=none, weight=none,
+        residual_before=none, residual_after=none, weight=none, query_camera=rows, match_camera=rows,
     )  # fmt: skip

@@ -143,6 +143,8 @@ CLOSURES = pa.schema(
         column("residual_before", pa.float64(), "sigma", "Mahalanobis distance to the odometry, null if unused.", True),
         column("residual_after", pa.float64(), "sigma", "Mahalanobis distance to the solution, null if unused.", True),
         column("weight", pa.float64(), "1", "Weight of the robust solve, 0 to 1, null if unused.", True),
+        column("query_camera", pa.int32(), "", "The query's camera by its number in run.json; 0 is the first.", True),
+        column("match_camera", pa.int32(), "", "The match's camera by its number in run.json; 0 is the first.", True),
     ]
 )
 JOINS = pa.schema(
@@ -306,7 +308,7 @@ def _ledger_columns(closures: Closures, query: Keyframes, match: Keyframes) -> d
 
 _PLAIN_LEDGER = (
     *("query", "match", "rank", "score", "support", "matches", "landmarks", "inliers", "spread", "reverse_inliers"),
-    *("p_false", "residual_before", "residual_after", "weight"),
+    *("p_false", "residual_before", "residual_after", "weight", "query_camera", "match_camera"),
 )
 """Fields of the ledger that are one column as they are."""
 
@@ -630,8 +632,11 @@ def read_poses(table: pa.Table, prefix: str) -> Floats:
 
 
 def _values(table: pa.Table, name: str) -> np.ndarray:
-    """A column as an array of its own, which may be written to."""
-    return np.array(table[name].to_numpy())
+    """A column as an array of its own, which may be written to; whole numbers that an older table lacks are 0."""
+    column = table[name]
+    if column.null_count and pa.types.is_integer(column.type):
+        return np.zeros(len(column), column.type.to_pandas_dtype())
+    return np.array(column.to_numpy())
 
 
 def _members(table: pa.Table, name: str, kind: type[T], path: Path | str) -> list[T]:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from vplog.loops.verify import VerifySettings
     from vplog.places.coverage import Coverage
     from vplog.results.previews import PictureSettings
+    from vplog.run.cameras import View
     from vplog.stages import Log, PlaceState
 
 
@@ -47,6 +48,8 @@ class Run:
     places: Sequence[Any]
     """Descriptors of the keyframes."""
     solved: Solved
+    views: Sequence[View]
+    """The pictures of every camera, the first one's first."""
     record: dict[str, Any] = field(default_factory=dict)
     """Content of run.json."""
 
@@ -135,6 +138,7 @@ def _results_record(run: Run) -> dict[str, Any]:
     solution, refined, verdicts = run.solution, run.solved.refined, run.closures.verdict
     constrained = set(run.graph.kind) - {EdgeKind.ODOMETRY} or run.solved.refined.fixes
     return {
+        "cameras": [view.camera.name for view in run.views],
         "library": {
             "hash": run.state.hash,
             "from": provenance.library_of(run.library),

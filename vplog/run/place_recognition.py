@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog.cache.codecs import columns_codec, descriptors_codec
 from vplog.cache.steps import step
-from vplog.data import Closures, Int32s, Keyframes, SharedReferences
+from vplog.data import Int32s, Keyframes, SharedReferences
 from vplog.loops.propose import Proposals, ProposeSettings, candidate_stops, propose
 from vplog.places.sequence import SequenceSettings, rank_places
 from vplog.places.views import views_of
@@ -46,12 +45,6 @@ def find_candidates(
     """The earlier keyframes that each may be a return to, by sequences of views or view by view."""
     index, stops = state.index(descriptors), candidate_stops(keyframes, settings)
     return propose(rank_places(index, descriptors, stops, settings.ranked, sequence, execution), settings)
-
-
-def name_shared(closures: Closures, state: PlaceState, descriptors: Sequence[Any]) -> Closures:
-    """The ledger with the references that explain both places of a candidate, where the recogniser has boxes."""
-    found = shared_of(state, descriptors, closures.query, closures.match)
-    return replace(closures, shared_references=found.references, shared_overlap=found.overlap)
 
 
 def shared_of(state: PlaceState, descriptors: Sequence[Any], query: Int32s, match: Int32s) -> SharedReferences:

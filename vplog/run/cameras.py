@@ -1,0 +1,227 @@
+"""Several cameras on one body: their pictures at the keyframes, and the closures between pictures of any two of them.
+
+A keyframe has one pose, and a picture of each camera near its stamp. Every picture is described and verified as its own
+camera has it; its closure is carried to the keyframes by the odometry of the moment between the stamps.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from vplog import logs
+from vplog.cache.codecs import closures_codec
+from vplog.cache.input_hashes import files_of
+from vplog.cache.steps import Steps, step
+from vplog.data import Bytes, Camera, Closures, Ints, Keyframes, Odometry, Reference
+from vplog.errors import LogError
+from vplog.geometry import se3
+from vplog.loops.propose import Proposals, ProposeSettings, candidate_stops, propose
+from vplog.loops.verify import VerifySettings, verify_between
+from vplog.places.sequence import SequenceSettings, rank_places
+from vplog.run.feature_extraction import Extraction, decoded, extract
+from vplog.run.place_recognition import describe, shared_of
+from vplog.run.reference_library import own_images, own_references
+from vplog.run.verification import DriveFeatures, calibrated, for_verification, merged
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vplog.execution.execution import Execution
+    from vplog.places.reference_choice import LibrarySettings
+    from vplog.stages import Log, PlaceState
+
+_log = logging.getLogger(__name__)
+_VIEW_BY_VIEW = SequenceSettings(length=1)
+"""Between two cameras the places of a way may come in either order."""
+
+
+class RigSettings(Extraction, Protocol):
+    """The settings that these steps take, as the pipeline has them."""
+
+    @property
+    def library(self) -> LibrarySettings: ...
+    @property
+    def propose(self) -> ProposeSettings: ...
+    @property
+    def sequence(self) -> SequenceSettings: ...
+    @property
+    def verify(self) -> VerifySettings: ...
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The pictures of one camera of the body."""
+
+    log: Log
+    """The log with this camera's images as its own."""
+    pictures: DriveFeatures
+    """V pictures: their stamps, the odometry's poses there, and their features."""
+    row: Ints
+    """(V,) keyframe of each picture, increasing."""
+    images: Sequence[tuple[int, Bytes]] = ()
+    """Row (of the V) and image of those that become references."""
+    places: Sequence[Any] = ()
+    """(V,) descriptors, once they are described."""
+
+    @classmethod
+    def of(cls, log: Log, drive: DriveFeatures, places: Sequence[Any]) -> View:
+        """The view of the first camera, by whose stamps the keyframes are selected."""
+        return cls(log, drive, np.arange(len(drive.keyframes.stamp_ns)), places=places)
+
+    @property
+    def camera(self) -> Camera:
+        return self.pictures.camera
+
+    @property
+    def references(self) -> list[Reference]:
+        return own_references(self.pictures.keyframes, self.pictures.features, self.images)
+
+    def at(self, keyframe: int) -> int:
+        """The picture of a keyframe that has one."""
+        return int(np.searchsorted(self.row, keyframe))
+
+
+@step("extract", items=lambda log, path, odometry, keyframes, *_: len(log.further_cameras()) * len(keyframes.stamp_ns))
+def read_cameras(
+    log: Log, path: Path | Sequence[Path], odometry: Odometry, keyframes: Keyframes, settings: RigSettings,
+    own_library: bool, *, steps: Steps, execution: Execution,
+) -> list[View]:  # fmt: skip
+    """The pictures of every camera but the first, extracted, those with fewer than two left out with a warning."""
+    found = []
+    for choice in log.further_cameras():
+        try:
+            other = logs.open_drive(files_of(path), choice)
+            row, selected = pictures_at(keyframes, other.stamps(), odometry)
+            features = extract(other, choice, selected, settings, steps=steps, execution=execution)
+        except LogError as error:
+            _log.warning("Camera %s is not used: %s", choice.image, error)
+            continue
+        pictures = decoded(selected, features, settings.features)
+        images = steps.part(own_images, other, selected, pictures, features, settings.library) if own_library else ()
+        row = row[np.searchsorted(selected.stamp_ns, pictures.stamp_ns)]
+        found.append(View(other, DriveFeatures(pictures, other.camera(), features, settings.verify), row, images))
+        for warning in other.warnings:
+            if warning not in log.warnings:
+                _log.warning(warning)
+    return found
+
+
+def pictures_at(keyframes: Keyframes, stamp_ns: Ints, odometry: Odometry) -> tuple[Ints, Keyframes]:
+    """Rows of the keyframes that have a picture among those with these (F,) stamps no further than their period away,
+    and these pictures. Raises LogError where there are fewer than two."""
+    inside = (stamp_ns >= odometry.stamp_ns[0]) & (stamp_ns <= odometry.stamp_ns[-1])
+    stamp_ns = stamp_ns[inside]
+    if len(stamp_ns) < 2:
+        raise LogError(f"{len(stamp_ns)} of its images have odometry at their stamps.")
+    after = np.clip(np.searchsorted(stamp_ns, keyframes.stamp_ns), 1, len(stamp_ns) - 1)
+    before_is_nearer = keyframes.stamp_ns - stamp_ns[after - 1] <= stamp_ns[after] - keyframes.stamp_ns
+    nearest = after - before_is_nearer
+    near = np.abs(stamp_ns[nearest] - keyframes.stamp_ns) <= np.median(np.diff(stamp_ns))
+    row = np.flatnonzero(near)
+    taken, first = np.unique(nearest[row], return_index=True)
+    if len(taken) < 2:
+        raise LogError(f"{len(taken)} of its images are near the stamp of a keyframe.")
+    poses = se3.interpolate_at(odometry.stamp_ns, odometry.odom_from_body, stamp_ns[taken])
+    return row[first], Keyframes(keyframes.drive, stamp_ns[taken], poses)
+
+
+@step("describe", items=lambda views, *_: sum(len(view.row) for view in views))
+def describe_cameras(views: Sequence[View], state: PlaceState, *, steps: Steps) -> list[View]:
+    """The views with a descriptor for each picture."""
+    return [replace(view, places=steps.part(describe, state, view.log, view.pictures.features)) for view in views]
+
+
+@step("verify", items=lambda closures, views, *_: len(views) ** 2 - 1)
+def verify_cameras(
+    closures: Closures, views: Sequence[View], state: PlaceState, settings: RigSettings,
+    *, steps: Steps, execution: Execution,
+) -> Closures:  # fmt: skip
+    """The ledger of the first camera with the candidates of all other pairs of cameras, each pair of keyframes once: as
+    the two cameras have it with which it is accepted with most inliers."""
+    if len(views) == 1:
+        return closures
+    ledgers, indexes = [closures], [state.index(view.places) for view in views]
+    shares = [calibrated(view.pictures, steps) for view in views]
+    for q, m in product(range(len(views)), repeat=2):
+        if q or m:
+            later, earlier = views[q], views[m]
+            sequence = settings.sequence if q == m else _VIEW_BY_VIEW
+            stops = _stops(later, earlier, settings.propose)
+            ranked = rank_places(indexes[m], later.places, stops, settings.propose.ranked, sequence, execution)
+            proposals, share = propose(ranked, settings.propose), max(shares[q], shares[m])
+            if len(proposals.query):
+                found = steps.part(verify_pair, proposals, share, later.pictures, earlier.pictures)
+                ledgers.append(_of_keyframes(found, (later, q), (earlier, m), views[0].pictures.keyframes))
+    return _once(merged(ledgers, _numbered(ledgers)))
+
+
+@step("verify", lambda *_: closures_codec())
+def verify_pair(
+    proposals: Proposals, share: float, later: DriveFeatures, earlier: DriveFeatures, *, execution: Execution
+) -> Closures:
+    """The ledger of candidates between the pictures of two cameras."""
+    return verify_between(proposals, for_verification(later), for_verification(earlier), execution, share)
+
+
+def _stops(later: View, earlier: View, settings: ProposeSettings) -> Ints:
+    """(V,) int64: picture i of the later view may match pictures of the earlier one below stops[i] only, as early as
+    those of its own camera that it may match."""
+    stops, stamp_ns = candidate_stops(later.pictures.keyframes, settings), later.pictures.keyframes.stamp_ns
+    latest = stamp_ns[np.maximum(stops - 1, 0)]
+    found = np.searchsorted(earlier.pictures.keyframes.stamp_ns, latest, side="right")
+    return np.where(stops > 0, found, 0).astype(np.int64)
+
+
+def _of_keyframes(
+    found: Closures, later: tuple[View, int], earlier: tuple[View, int], keyframes: Keyframes
+) -> Closures:
+    """The ledger of two views with rows, poses and information of keyframes instead of pictures."""
+    (queries, query_camera), (matches, match_camera) = later, earlier
+    query, match = queries.row[found.query], matches.row[found.match]
+    to_query, to_match = (
+        se3.between(keyframes.odom_from_body[row], view.pictures.keyframes.odom_from_body[picture])
+        for view, row, picture in ((queries, query, found.query), (matches, match, found.match))
+    )
+    Ad = se3.adjoint(se3.inverse(to_query))  # T exp(d) inv(Q) = T inv(Q) exp(Ad_Q d)
+    return replace(
+        found,
+        query=query.astype(np.int32),
+        match=match.astype(np.int32),
+        match_from_query=to_match @ found.match_from_query @ se3.inverse(to_query),
+        information=np.swapaxes(Ad, -1, -2) @ found.information @ Ad,
+        query_camera=np.full(len(found), query_camera, np.int32),
+        match_camera=np.full(len(found), match_camera, np.int32),
+    )
+
+
+def _numbered(ledgers: Sequence[Closures]) -> list[Ints]:
+    """Numbers of the candidates of several ledgers one after the other."""
+    ends = np.cumsum([0, *map(len, ledgers)])
+    return [np.arange(begin, end) for begin, end in zip(ends, ends[1:], strict=False)]
+
+
+def _once(closures: Closures) -> Closures:
+    """Every pair of keyframes once, ordered by query, then rank: accepted rather than not, then with most inliers, then
+    of the first cameras."""
+    order = np.lexsort([-closures.inliers, -closures.accepted.astype(int), closures.match, closures.query])
+    pair = np.stack([closures.query, closures.match])[:, order]
+    best = order[np.insert((np.diff(pair) != 0).any(axis=0), 0, True)] if len(order) else order
+    return closures.rows(best[np.lexsort([closures.match[best], closures.rank[best], closures.query[best]])])
+
+
+def name_shared(closures: Closures, state: PlaceState, views: Sequence[View]) -> Closures:
+    """The ledger with the references that explain both places of a candidate, where the recogniser has boxes."""
+    places = [place for view in views for place in view.places]
+    begin = np.cumsum([0, *(len(view.row) for view in views)])
+    query, match = (
+        np.array([begin[n] + views[n].at(row) for row, n in zip(rows.tolist(), of.tolist(), strict=True)], np.int32)
+        for rows, of in ((closures.query, closures.query_camera), (closures.match, closures.match_camera))
+    )
+    found = shared_of(state, places, query, match)
+    return replace(closures, shared_references=found.references, shared_overlap=found.overlap)
