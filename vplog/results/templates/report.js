@@ -145,8 +145,7 @@
       trace(is("matrix") ? [ends[0], [columns.query[row], columns.match[row], 0], ends[1]] : ends, ink, [], 2);
       for (const at of is("matrix") ? [dotOf(row)] : ends.map(place)) disc(at, 6, ink);
     }
-    const at = [moment, ...["query", "match"].map((end) => columns[end][selected] ?? -1)].filter((keyframe) => keyframe >= 0);
-    for (const one of marks) one.setAttribute("d", at.map((keyframe) => "M" + (left + across * seconds[keyframe] / end_s) + " " + top + "V" + foot).join(""));
+    place_marks();
   };
   const round = (most) => {  // the largest 1, 2 or 5 times a power of ten up to it
     const power = 10 ** Math.floor(Math.log10(most));
@@ -182,13 +181,13 @@
     const size = clear(layer), by = $("colour").value, error = by === "path_error_m" ? data.map.error_m : null;
     for (const { kind, points } of paths) {
       if (kind === "gps") points.forEach((point) => disc(place(point), 2, colour("gps")));
-      else if (kind !== "after" || !error) trace(points, colour(kind), { before: [6, 4], truth: [2, 3], other: [6, 3] }[kind] ?? [], 2);
+      else if (kind !== "after" || !error) trace(points, colour(kind), dashes[kind] ?? [], 2);
       else for (let at = 0; at < last; at++) trace(spots.slice(at, at + 2), scaled(by, error[at]), [], 4);
     }
     drawAxes(...size);
     for (const kind of ["before", "yes", "no", "false"]) for (const row of rows) {
       if (kindOf(row) !== kind) continue;
-      const paint = colour({ false: "no" }[kind] ?? kind);
+      const paint = colour(kind);
       pen.globalAlpha = kind === "yes" || kind === "before" ? .35 : 1;
       if (!is("matrix")) trace([spots[columns.match[row]], spots[columns.query[row]]], paint, kind === "no" ? [3, 2] : [], kind === "false" ? 3 : 1);
       pen.globalAlpha = 1;
@@ -251,23 +250,57 @@
     event.preventDefault(); zoom(Math.exp(-event.deltaY / 400), event.offsetX, event.offsetY);
   }, { passive: false });
 
-  // Charts over time: the pointer's moment is shown on all of them and on the map, a click selects the closure nearest
-  const { start, end_s, left, across, top, foot } = data.time, seconds = stamps.map((stamp) => Number(BigInt(stamp) - BigInt(start)) / 1e9);
-  const marks = [...document.querySelectorAll("svg.time")].map((svg) => {
-    const mark = document.createElementNS(svg.namespaceURI, "path"), apart = (row) => Math.abs(columns.query[row] - moment);
-    mark.setAttribute("class", "mark"); svg.append(mark);
-    svg.addEventListener("pointermove", (event) => {
-      const box = svg.getBoundingClientRect(), share = ((event.clientX - box.left) / box.width * svg.viewBox.baseVal.width - left) / across;
-      const after = seconds.findIndex((one) => one >= share * end_s);
+  // Charts: over time they share the pointer, whose moment the map shows; a click selects the closure nearest
+  const seconds = data.seconds, dashes = { before: [6, 4], truth: [2, 3], other: [6, 3] };
+  const axis = { stroke: () => colour("quiet"), grid: { stroke: () => colour("line"), width: 1 }, ticks: { show: false }, font: "12px system-ui" };
+  const draw = (figure) => {
+    const { kind, lines, thresholds, x, x_label } = JSON.parse($("charts").textContent)[figure.dataset.chart], time = kind === "time";
+    const bars = kind === "bar" || kind === "mirrored", mirrored = kind === "mirrored", most = (u, at) => Math.max(...u.data[at].map(Math.abs), 1);
+    const series = lines.map(([paint, label], at) => {
+      const name = paint.replace("dot ", ""), dots = paint !== name, stroke = () => colour(name);
+      return { label, stroke, dash: dots || bars ? [] : dashes[name], width: bars ? 0 : 2, spanGaps: kind === "curve", fill: bars ? stroke : null,
+        scale: mirrored && at ? "down" : "y", paths: dots ? () => null : bars ? uPlot.paths.bars({ size: [.9], align: 1 }) : null,
+        value: (u, value) => value === null ? "-" : +Math.abs(value).toPrecision(5) * (mirrored ? 1 : Math.sign(value)),
+        points: { show: dots, size: 6, fill: stroke, width: 0 } };
+    });
+    const upright = { ...axis, size: 54, space: 34 }, down = { ...upright, scale: "down", side: 1, grid: { show: false } };
+    const half = (sign) => (u, values) => values.map((value) => value * sign < 0 ? "" : Math.abs(value));
+    const plot = new uPlot({
+      width: figure.clientWidth, height: 230, series: [{ label: x_label, value: (u, value) => value === null ? "-" : +value.toPrecision(6) }, ...series],
+      scales: { x: { time: false }, ...(mirrored ? { y: { range: (u) => [-most(u, 1), most(u, 1)] }, down: { range: (u) => [-most(u, 2), most(u, 2)] } } : {}) },
+      axes: [{ ...axis, size: 30 }, ...(mirrored ? [{ ...upright, values: half(1) }, { ...down, values: half(-1) }] : [upright])],
+      legend: { markers: { stroke: (u, at) => `var(--${lines[at - 1]?.[0].replace("dot ", "")})`, fill: "none", width: 2 } },
+      cursor: { y: false, drag: { x: true, y: false }, ...(time ? { sync: { key: "time", scales: ["x", null] } } : {}) },
+      hooks: { setScale: [() => place_marks()], drawAxes: [(u) => thresholds.forEach(([text, at]) => {
+        const place = Math.round(u.valToPos(at, "x", true)), { left, top, width, height } = u.bbox, ratio = devicePixelRatio;
+        u.ctx.fillStyle = colour("ink"); u.ctx.fillRect(place, top, ratio, height); u.ctx.font = 12 * ratio + "px system-ui";
+        u.ctx.textAlign = place > left + width / 2 ? "right" : "left"; u.ctx.fillText(text, place + (u.ctx.textAlign === "left" ? 5 : -5) * ratio, top + 12 * ratio);
+      })] },
+    }, [x, ...lines.map(([, , values]) => values)], figure);
+    if (!time) return { figure, plot, marks: [] };
+    const apart = (row) => Math.abs(columns.query[row] - moment);
+    plot.over.addEventListener("pointermove", (event) => {
+      const after = seconds.findIndex((one) => one >= plot.posToVal(event.offsetX, "x"));
       moment = after < 0 ? last : after; highlight();
     });
-    svg.addEventListener("pointerleave", () => { moment = -1; highlight(); });
-    svg.addEventListener("click", () => {
+    plot.over.addEventListener("pointerleave", () => { moment = -1; highlight(); });
+    plot.over.addEventListener("click", () => {
       const least = rows.reduce((most, row) => Math.min(most, apart(row)), Infinity), near = rows.filter((row) => apart(row) === least);
       if (near.length) select(near[(near.indexOf(selected) + 1) % near.length]);
     });
-    return mark;
-  });
+    const marks = ["query", "match"].map((end) => Object.assign(document.createElement("i"), { className: "mark " + end }));
+    plot.over.append(...marks);
+    return { figure, plot, marks };
+  };
+  const plots = [];
+  const place_marks = () => {  // both keyframes of the closure that is hovered, else selected
+    const row = hovered >= 0 ? hovered : selected;
+    for (const { plot, marks } of plots) marks.forEach((mark, at) => {
+      const x = row < 0 ? -1 : plot.valToPos(seconds[columns[["query", "match"][at]][row]], "x");
+      mark.hidden = x < 0 || x > plot.over.clientWidth; mark.style.left = x + "px";
+    });
+  };
+  plots.push(...[...document.querySelectorAll("figure[data-chart]")].map(draw));
 
   // The selected closure
   const show = () => {
@@ -337,6 +370,8 @@
   });
   window.addEventListener("beforeunload", (event) => { if (unsaved) event.preventDefault(); });
   $("copy").addEventListener("click", () => { $("command").select(); navigator.clipboard?.writeText($("command").value); });
+  for (const [kind, row] of [["pointerover", (tr) => +tr.dataset.row], ["pointerleave", () => -1]])
+    body.addEventListener(kind, (event) => { const tr = event.target.closest("tr[data-row]"); hovered = tr || kind === "pointerleave" ? row(tr) : -1; highlight(); });
   body.addEventListener("click", (event) => { const tr = event.target.closest("tr[data-row]"); if (tr) select(+tr.dataset.row); });
   box.addEventListener("scroll", drawLedger);
   document.querySelectorAll("#closures th button").forEach((button) => button.addEventListener("click", () => {
@@ -350,7 +385,11 @@
   $("view").addEventListener("change", () => { look(); drawMap(); });
   for (const [id, factor] of [["zoom-in", 1.5], ["zoom-out", 1 / 1.5]]) $(id).addEventListener("click", () => zoom(factor, canvas.clientWidth / 2, canvas.clientHeight / 2));
   $("fit").addEventListener("click", () => { fit(); drawMap(); });
-  window.addEventListener("resize", () => { if (fitted) fit(); drawMap(); drawLedger(); });
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawMap);
+  window.addEventListener("resize", () => {
+    if (fitted) fit();
+    drawMap(); drawLedger();
+    for (const { figure, plot } of plots) plot.setSize({ width: figure.clientWidth, height: plot.height });
+  });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { drawMap(); plots.forEach(({ plot }) => plot.redraw()); });
   order();
 })();
