@@ -105,9 +105,9 @@ def test_thumbnails_are_of_keyframes_of_closures_first(finished: Path, monkeypat
     closures = tables.read_closures(finished / "closures.parquet")
     used = closures.accepted
     ends = set(closures.query[used].tolist()) | set(closures.match[used].tolist())
-    assert ends <= set(gather(finished, {}).thumbnails)
+    assert ends <= set(gather(finished, {}).pictures.thumbnails)
     monkeypatch.setattr(sys.modules["vplog.run.report"], "_MOST_THUMBNAILS", 4)
-    few = gather(finished, {}).thumbnails
+    few = gather(finished, {}).pictures.thumbnails
     assert len(few) == 4
     assert set(few) <= ends
     for data in few.values():
@@ -116,33 +116,28 @@ def test_thumbnails_are_of_keyframes_of_closures_first(finished: Path, monkeypat
         assert 0 < image.size < 3 * 41_000
 
 
-def test_pictures_are_of_every_fate_and_the_browsers_own_kind(page: str, finished: Path) -> None:
+def test_every_closure_of_the_solution_has_a_view_of_its_matches(page: str, finished: Path) -> None:
     closures = tables.read_closures(finished / "closures.parquet")
-    pictures = mcap_read.read_pictures(finished / "result.mcap").pictures
-    assert ledger(page)["pictures"] == sorted(pictures)
-    assert {closures.verdict[row] for row in pictures} == set(closures.verdict)
-    for row, data in pictures.items():
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        assert image is not None
-        assert min(image.shape[:2]) > 100
-        assert f'id="closure-{row}"' in page
+    used, told = closures.of(*USED), ledger(page)
+    views = {int(row): view for row, view in told["views"].items()}
+    assert set(np.flatnonzero(used)) <= set(views)
+    assert np.median([view["agree"] for row, view in views.items() if used[row]]) > 10
+    assert len({closures.verdict[row] for row in views}) > 1  # nearest misses
+    for view in views.values():
+        assert len(base64.b64decode(view["lines"])) >= 4 * view["agree"]
+        assert set(map(str, view["references"])) <= set(told["references"])
+        assert [len(base64.b64decode(votes)) for votes in view["votes"]] in ([], [18 * 32, 18 * 32])
+    record = read_run_json(finished / "run.json")["pictures"]
+    assert record == {"drawn": record["drawn"], "views": len(views), "accepted_left_out": 0}
 
 
-def test_closures_without_a_picture_are_counted_and_the_page_holds_those_of_the_solution(
-    finished: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    record = read_run_json(finished / "run.json")
-    content = gather(finished, record)
-    used = content.closures.of(*USED)
-    assert record["pictures"]["drawn"] == len(content.pictures)
-    assert record["pictures"]["accepted_left_out"] == used.sum() - sum(used[row] for row in content.pictures)
-    each = max(map(len, content.pictures.values()))
-    shown = [row for row in content.pictures if used[row]][:2]
-    pictures = {row: bytes(each) if used[row] else jpeg for row, jpeg in content.pictures.items()}
-    monkeypatch.setattr("vplog.results.report.page._MOST_PICTURE_BYTES", len(shown) * each)
-    text = write_page(dataclasses.replace(content, pictures=pictures))
-    assert f"{len(shown)} of the {used.sum()} closures in the solution and 0 others have a picture." in text
-    assert used[ledger(text)["pictures"]].all()
+def test_the_page_holds_views_of_the_solution_first(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vplog.results.report.page._MOST_VIEW_BYTES", 60_000)
+    content = gather(finished, {})
+    told = ledger(write_page(content))
+    rows = [int(row) for row in told["views"]]
+    assert 0 < len(rows) < len(content.pictures.views)
+    assert content.closures.of(*USED)[rows].all()
 
 
 def test_the_certificate_and_the_sigma_of_keyframes_are_told(page: str, finished: Path) -> None:
@@ -291,11 +286,12 @@ def test_pictures_come_from_the_log_where_the_run_kept_none(
     (folder / "result.mcap").unlink()
     write_mcap(folder / "result.mcap", keyframes, world, graph, closures, tables.TableMetadata({}, ""))
     assert verb("report", folder).code == 0
-    assert "<img loading" not in (folder / "report.html").read_text()
+    assert not ledger((folder / "report.html").read_text())["thumbnails"]
     assert verb("report", folder, "--log", drive.log).code == 0
     text = (folder / "report.html").read_text()
-    kept = mcap_read.read_pictures(finished / "result.mcap").pictures
-    assert ledger(text)["pictures"] == sorted(kept)
+    told, views = ledger(text), mcap_read.read_pictures(finished / "result.mcap").views
+    assert told["views"] == {str(row): view for row, view in views.items()}
+    assert told["thumbnails"]
     (tmp_path / "empty").mkdir()
     cv2.imwrite(str(tmp_path / "empty" / "1.png"), np.zeros((80, 80), np.uint8))
     assert "stamps" in verb("report", folder, "--log", tmp_path / "empty").error
@@ -461,6 +457,11 @@ INNER_DOT = """() => {
 """Where on the map a dot of an accepted closure is."""
 
 
+PAINTED = """all => all.map((one) => one.width > 99 && one.getContext("2d").getImageData(0, 0, one.width, one.height)
+  .data.some((value) => value))"""
+"""Whether something is drawn on each canvas."""
+
+
 def test_closures_are_selected_and_rejected_and_the_next_run_knows(
     browser: str, finished: Path, drive: Drive, verb: Verb, tmp_path: Path
 ) -> None:
@@ -505,11 +506,10 @@ def test_closures_are_selected_and_rejected_and_the_next_run_knows(
         pairs = [tuple(map(int, re.findall(r"\d+", one))) for one in titles]
         assert all(at[row] and [before.query[row], before.match[row]] == ends for row, *ends in pairs)
         assert page.input_value("#command").endswith(f"--closure {pairs[-1][1]}:{pairs[-1][2]}")
-        drawn = ledger((run / "report.html").read_text())["pictures"]
-        for row in (next(row for row in drawn if at[row]), next(row for row in np.flatnonzero(at) if row not in drawn)):
-            page.fill("#search", f"row={row}")
-            page.locator("#rows tr[data-row]").first.click()
-            assert page.is_visible("#drawn") == (row in drawn) != page.is_visible("#query")
+        assert page.inner_text("#no-picture") == ""
+        painted = page.locator(".drawn canvas").evaluate_all(PAINTED)
+        assert len(painted) > 1
+        assert all(painted)
         page.fill("#search", "inliers>10")
         page.locator("#rows tr[data-row]").first.click()
         page.fill("#who", 'Jo "J", Doe')

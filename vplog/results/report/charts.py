@@ -73,7 +73,7 @@ def histogram(above: Floats, below: Floats, label: str, thresholds: Sequence[tup
     edges = np.linspace(low, high if high > low else low + 1.0, _BINS + 1)
     counts = [np.histogram(np.clip(group, low, edges[-1]), edges)[0] for group in groups]
     lines = [("yes", "accepted", counts[0]), ("no", "rejected", -counts[1])]
-    return _chart(label, label, edges, lines, "mirrored", list(thresholds))
+    return _chart(label, "value", edges, lines, "mirrored", list(thresholds))
 
 
 def curves(named: Mapping[str, Floats]) -> Chart:

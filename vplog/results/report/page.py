@@ -26,8 +26,8 @@ _AFTER_GEOMETRY = (Verdict.REJECTED_BY_SOLVER, Verdict.NOT_SIGNIFICANT, Verdict.
 """Verdicts of closures that geometry found and the solution leaves out."""
 _MOST_LOSSES = 100
 """Rows of the table of losses; run.json has them all."""
-_MOST_PICTURE_BYTES = 12_000_000
-"""Bytes of all pictures together: with thumbnails, table and base64 the page then stays below 60 MB."""
+_MOST_VIEW_BYTES = 16_000_000
+"""Bytes of matches, boxes, votes and references together: with thumbnails and table the page stays below 60 MB."""
 _DOUBTFUL_SIGMA = 6.5
 """Residuals of that much are red."""
 _MOST_SIGMA = 10.0
@@ -89,6 +89,18 @@ class Tracks:
 
 
 @dataclass(frozen=True, eq=False)
+class Pictures:
+    """What the page shows of closures."""
+
+    views: dict[int, dict[str, Any]]
+    """Matches, boxes and votes of a candidate closure by its row, see `closure_views.view`."""
+    references: dict[int, bytes] = field(default_factory=dict)
+    """JPEG of a reference by its number."""
+    thumbnails: dict[int, bytes] = field(default_factory=dict)
+    """Small JPEG of a keyframe by its row."""
+
+
+@dataclass(frozen=True, eq=False)
 class Question:
     """Neighbouring closures that agree with each other, as one question to a person."""
 
@@ -122,10 +134,7 @@ class Content:
     covariance: Floats
     """(N, 6, 6) of the solved keyframes, NaN where unknown."""
     closures: Closures
-    pictures: dict[int, bytes]
-    """JPEG of a candidate closure by its row."""
-    thumbnails: dict[int, bytes] = field(default_factory=dict)
-    """Small JPEG of a keyframe by its row."""
+    pictures: Pictures
     judged: TruthComparison | None = None
     changes: Changes | None = None
     questions: list[Question] = field(default_factory=list)
@@ -137,7 +146,6 @@ def page(content: Content) -> str:
     """The whole report: the same text for the same run, but for its timings."""
     record, closures, judged = content.record, content.closures, content.judged
     counts = [(verdict, closures.verdict.count(verdict)) for verdict in Verdict]
-    examples = _examples(content)
     legend, drawn = _map(content)
     curves = charts.curves(judged.curves) if judged and judged.curves else None
     over_time, distributions, references = _over_time(content), _distributions(content), _references(content)
@@ -158,9 +166,7 @@ def page(content: Content) -> str:
         curves=curves,
         verdicts=[(verdict.value, figure(count), verdict.sentence) for verdict, count in counts if count],
         candidates=len(closures),
-        examples=examples,
-        pictured=_pictured(content, [one["row"] for one in examples]),
-        audit=_audit(content, drawn, [one["row"] for one in examples]),
+        audit=_audit(content, drawn),
         charts={one.label: asdict(one) for one in shown if one},
         over_time=over_time,
         distributions=distributions,
@@ -344,38 +350,28 @@ def _truth(judged: TruthComparison) -> list[list[str]]:
     return [[f"{heading} ({alignment})" if "ATE" in heading else heading, *values] for heading, *values in rows]
 
 
-def _pictured(content: Content, rows: list[int]) -> tuple[str, str]:
-    """How many closures of the solution have a picture, and the command that draws the others."""
-    used = np.flatnonzero(content.closures.of(*USED))
-    shown = int(np.isin(used, rows).sum())
-    if not rows or shown == len(used):
-        return "", ""
-    log, drawn = shlex.quote(str(content.record.get("log"))), len(content.pictures) < 2 * len(used)
-    said = f"{shown} of the {len(used)} closures in the solution and {len(rows) - shown} others have a picture."
-    again = f"vplog run {log} -o RUN --set pictures.closures={2 * len(used)}"
-    return (f"{said} All, without reading the log again: ", again) if drawn else (f"{said} The page is full.", "")
-
-
-def _examples(content: Content) -> list[dict[str, Any]]:
-    """Closures with a picture, by row, until the page holds enough bytes of them: false ones first, then those of the
-    solution, then those of most inliers."""
-    closures, left, examples = content.closures, _MOST_PICTURE_BYTES, []
+def _views(content: Content) -> tuple[dict[str, Any], dict[str, str]]:
+    """Views by ledger row, and the references that they show in base64, until the page holds enough bytes of them:
+    false closures first, then those of the solution, then those of most inliers."""
+    closures, left = content.closures, _MOST_VIEW_BYTES
+    views, references = {}, {}
     order = np.lexsort((-closures.inliers, ~closures.of(*USED), ~false_closures(content))).tolist()
     for row in order:
-        jpeg = content.pictures.get(row)
-        if jpeg is None or len(jpeg) > left:
+        if (view := content.pictures.views.get(row)) is None:
             continue
-        left -= len(jpeg)
-        verdict = closures.verdict[row]
-        one = {"row": row, "jpeg": jpeg, "verdict": verdict.value}
-        one |= {"kind": "accepted" if verdict in USED else "rejected"}
-        one |= {name: getattr(closures, name)[row] for name in ("query", "match", "matches", "inliers", "score")}
-        examples.append(one)
-    return sorted(examples, key=lambda one: one["row"])
+        wanted = {str(one): jpeg for one in view["references"] if (jpeg := content.pictures.references.get(one))}
+        new = {one: base64.b64encode(jpeg).decode() for one, jpeg in wanted.items() if one not in references}
+        left -= len(str(view)) + sum(map(len, new.values()))
+        if left < 0:
+            break
+        views[str(row)] = view
+        references |= new
+    return views, references
 
 
-def _audit(content: Content, drawn: dict[str, Any], pictures: list[int]) -> dict[str, Any]:
-    """Data of the page's script; `pictures` are the ledger rows with a picture in the page."""
+def _audit(content: Content, drawn: dict[str, Any]) -> dict[str, Any]:
+    """Data of the page's script."""
+    views, references = _views(content)
     closures, log = content.closures, content.record.get("log")
     order = np.lexsort((-closures.score.astype(np.float64), ~closures.of(*USED)))
     columns = _columns(content, sorted(order[:_MOST_ROWS].tolist()))
@@ -389,9 +385,10 @@ def _audit(content: Content, drawn: dict[str, Any], pictures: list[int]) -> dict
         "stamps": list(map(str, content.tracks.keyframes.stamp_ns.tolist())),  # beyond 2^53, where JavaScript rounds
         "seconds": np.round((content.tracks.keyframes.stamp_ns - start_ns) / 1e9, 4).tolist(),
         "map": drawn,
-        "pictures": pictures,
+        "views": views,
+        "references": references,
         "questions": {str(one.rows[0]): one.rows for one in content.questions},
-        "thumbnails": {str(row): base64.b64encode(jpeg).decode() for row, jpeg in content.thumbnails.items()},
+        "thumbnails": {str(row): base64.b64encode(jpeg).decode() for row, jpeg in content.pictures.thumbnails.items()},
         "explain": "vplog explain RUN --closure ",
         "again": command,
     }
@@ -462,7 +459,7 @@ def _references(content: Content) -> dict[str, Any] | None:
     order = sorted(range(len(used)), key=lambda number: (-used[number], number))
     split = min(_MOST_USED, (len(order) + 1) // 2)
     ends = (("Most used", order[:split]), ("Least used", order[max(split, len(order) - _MOST_USED) :]))
-    jpegs, coverage = content.tracks.found.references, mapping(library.get("coverage"))
+    jpegs, coverage = content.pictures.references, mapping(library.get("coverage"))
     return {
         "count": len(used),
         "explained": coverage.get("explained") if coverage.get("frames") else None,
