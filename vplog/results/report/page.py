@@ -149,7 +149,7 @@ def page(content: Content) -> str:
     legend, drawn = _map(content)
     curves = charts.curves(judged.curves) if judged and judged.curves else None
     over_time, distributions, references = _over_time(content), _distributions(content), _references(content)
-    shown = [*over_time, curves, *(chart for _, chart in distributions), references and references["chart"]]
+    shown = [*over_time, curves, *(chart for _, chart in distributions), references["chart"] if references else None]
     return render(
         "report.html",
         record=record,
