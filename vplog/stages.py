@@ -179,8 +179,9 @@ class BoxState(PlaceState, Protocol):
 
     def boxes(self, place: Any) -> data.Boxes: ...
 
-    def voting_map(self, features: data.Features, reference: int) -> data.Floats:
-        """(rows, columns) votes of all features of an image for a reference, 1 at most; zeros without a vote."""
+    def voting_maps(self, features: data.Features, references: Sequence[int]) -> list[data.Floats]:
+        """(rows, columns) votes of the features of an image for each of these references, 1 at most; zeros without a
+        vote."""
         ...
 
     def shared(self, places: Sequence[Any], query: data.Int32s, match: data.Int32s) -> data.SharedReferences:

@@ -122,10 +122,11 @@ def test_boxes_of_any_recogniser_that_has_them(case: RecogniserContract, referen
     for q, m, numbers in zip(query, match, shared.references, strict=True):
         assert set(numbers.tolist()) == set(found[q].references.tolist()) & set(found[m].references.tolist())
     features = references[0].features
-    votes = state.voting_map(features, int(found[0].references[0]))
+    [votes, again] = state.voting_maps(features, [int(found[0].references[0])] * 2)
+    np.testing.assert_array_equal(votes, again)
     assert votes.min() >= 0
     assert votes.max() == 1.0
-    assert not state.voting_map(BLANK, 0).any()
+    assert not state.voting_maps(BLANK, [0])[0].any()
 
 
 def test_columns_of_another_kind_are_refused(case: RecogniserContract) -> None:

@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 from html import unescape
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -24,7 +25,7 @@ from vplog.evaluate.closures import score_closures
 from vplog.evaluate.truth import read_truth
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.results import mcap_read, tables
-from vplog.results.report.charts import over_time, round_ticks
+from vplog.results.report.charts import coverage, histogram, over_time
 from vplog.results.report.page import TruthComparison
 from vplog.results.report.page import page as write_page
 from vplog.results.run_record import read_run_json
@@ -33,7 +34,6 @@ from vplog.run.report import gather
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from conftest import Said
 
@@ -88,7 +88,7 @@ def test_the_page_is_whole_and_fetches_nothing(page: str) -> None:
     for source in read.sources:
         assert source.startswith(("data:", "#")), source[:80]
         assert not source.startswith("#") or source[1:] in read.ids
-    assert "://" not in re.sub(r'src="data:[^"]*"', "", page)
+    assert page.count("://") == 1 + len(re.findall(r'src="data:[^"]*://', page))  # the address of uPlot's sources
     assert len(page) < 10e6
 
 
@@ -105,9 +105,9 @@ def test_thumbnails_are_of_keyframes_of_closures_first(finished: Path, monkeypat
     closures = tables.read_closures(finished / "closures.parquet")
     used = closures.accepted
     ends = set(closures.query[used].tolist()) | set(closures.match[used].tolist())
-    assert ends <= set(gather(finished, {}).thumbnails)
+    assert ends <= set(gather(finished, {}).pictures.thumbnails)
     monkeypatch.setattr(sys.modules["vplog.run.report"], "_MOST_THUMBNAILS", 4)
-    few = gather(finished, {}).thumbnails
+    few = gather(finished, {}).pictures.thumbnails
     assert len(few) == 4
     assert set(few) <= ends
     for data in few.values():
@@ -116,33 +116,28 @@ def test_thumbnails_are_of_keyframes_of_closures_first(finished: Path, monkeypat
         assert 0 < image.size < 3 * 41_000
 
 
-def test_pictures_are_of_every_fate_and_the_browsers_own_kind(page: str, finished: Path) -> None:
+def test_every_closure_of_the_solution_has_a_view_of_its_matches(page: str, finished: Path) -> None:
     closures = tables.read_closures(finished / "closures.parquet")
-    pictures = mcap_read.read_pictures(finished / "result.mcap").pictures
-    assert ledger(page)["pictures"] == sorted(pictures)
-    assert {closures.verdict[row] for row in pictures} == set(closures.verdict)
-    for row, data in pictures.items():
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        assert image is not None
-        assert min(image.shape[:2]) > 100
-        assert f'id="closure-{row}"' in page
+    used, told = closures.of(*USED), ledger(page)
+    views = {int(row): view for row, view in told["views"].items()}
+    assert set(np.flatnonzero(used)) <= set(views)
+    assert np.median([view["agree"] for row, view in views.items() if used[row]]) > 10
+    assert len({closures.verdict[row] for row in views}) > 1  # nearest misses
+    for view in views.values():
+        assert len(base64.b64decode(view["lines"])) >= 4 * view["agree"]
+        assert set(map(str, view["references"])) <= set(told["references"])
+        assert [len(base64.b64decode(votes)) for votes in view["votes"]] in ([], [18 * 32, 18 * 32])
+    record = read_run_json(finished / "run.json")["pictures"]
+    assert record == {"drawn": record["drawn"], "views": len(views), "accepted_left_out": 0}
 
 
-def test_closures_without_a_picture_are_counted_and_the_page_holds_those_of_the_solution(
-    finished: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    record = read_run_json(finished / "run.json")
-    content = gather(finished, record)
-    used = content.closures.of(*USED)
-    assert record["pictures"]["drawn"] == len(content.pictures)
-    assert record["pictures"]["accepted_left_out"] == used.sum() - sum(used[row] for row in content.pictures)
-    each = max(map(len, content.pictures.values()))
-    shown = [row for row in content.pictures if used[row]][:2]
-    pictures = {row: bytes(each) if used[row] else jpeg for row, jpeg in content.pictures.items()}
-    monkeypatch.setattr("vplog.results.report.page._MOST_PICTURE_BYTES", len(shown) * each)
-    text = write_page(dataclasses.replace(content, pictures=pictures))
-    assert f"{len(shown)} of the {used.sum()} closures in the solution and 0 others have a picture." in text
-    assert used[ledger(text)["pictures"]].all()
+def test_the_page_holds_views_of_the_solution_first(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vplog.results.report.page._MOST_VIEW_BYTES", 60_000)
+    content = gather(finished, {})
+    told = ledger(write_page(content))
+    rows = [int(row) for row in told["views"]]
+    assert 0 < len(rows) < len(content.pictures.views)
+    assert content.closures.of(*USED)[rows].all()
 
 
 def test_the_certificate_and_the_sigma_of_keyframes_are_told(page: str, finished: Path) -> None:
@@ -152,45 +147,57 @@ def test_the_certificate_and_the_sigma_of_keyframes_are_told(page: str, finished
     assert f"median {np.median(sigma_m):.3f} m, largest {sigma_m.max():.3f} m" in page
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_ticks_stand_at_round_numbers(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    low = float(rng.choice([0.0, rng.normal(scale=10.0 ** rng.integers(-3, 5))]))
-    high = low + 10.0 ** float(rng.uniform(-4, 6))
-    most = int(rng.integers(2, 9))
-    ticks = round_ticks((low, high), most)
-    assert most / 2.5 - 1 <= len(ticks) <= most
-    assert all(-1e-6 <= share <= 1 + 1e-6 and text != "-0" for share, text in ticks)
-    shares, values = [share for share, _ in ticks], [float(text) for _, text in ticks]
-    assert np.allclose(low + np.array(shares) * (high - low), values, atol=1e-5 * max(abs(low), high - low))
-    if len(values) > 2:
-        steps = np.diff(shares) * (high - low)
-        assert float(f"{steps[0]:e}".split("e")[0]) == pytest.approx(float(f"{steps[-1]:e}".split("e")[0]), rel=1e-6)
-        assert round(float(f"{steps[0]:.3e}".split("e")[0])) in (1, 2, 5)
-
-
 def test_lines_over_time_have_gaps_where_values_are_unknown() -> None:
-    chart = over_time(
-        [("after", np.arange(7.0), np.array([2.0, 3.0, np.nan, np.nan, 5.0, 4.0, np.nan]))], "height", 7.0
-    )
+    values = np.array([2.0, np.nan, 5.0])
+    chart = over_time([("after", "z", values)], np.array([1.0, 2.0, 3.0]), "height", 7.0)
     assert chart is not None
-    [(_, line), _] = chart.paths
-    first, second = (np.array(re.findall(r"[\d.]+", piece), float).reshape(-1, 2) for piece in line.split("M")[1:])
-    assert (first[1, 0] - first[0, 0]) * 4 == pytest.approx(second[0, 0] - first[0, 0], abs=0.5)
-    assert first[0, 1] > first[1, 1] > second[1, 1] > second[0, 1]  # down is positive
-    assert over_time([("after", np.arange(3.0), np.full(3, np.nan))], "height", 2.0) is None
+    assert (chart.x, chart.lines) == ([0, 1, 2, 3, 7], [("after", "z", [None, 2, None, 5, None])])
+    assert over_time([("after", "z", np.full(3, np.nan))], np.arange(3.0), "height", 2.0) is None
+
+
+def test_references_are_numbered_by_their_first_use() -> None:
+    chart = coverage(np.array([[7, -1], [2, 7], [-1, 9]]), np.array([0.0, 1.0, 2.0]), "references", 3.0)
+    assert chart is not None
+    assert chart.lines[0][2][1:-1] == [1, None, 2, 1, None, 3]
+    assert coverage(np.full((2, 2), -1), np.arange(2.0), "references", 3.0) is None
+
+
+def test_every_candidate_is_in_a_distribution() -> None:
+    rng = np.random.default_rng(0)
+    chart = histogram(rng.normal(size=50), np.r_[rng.normal(size=900), np.nan], "score", [("least", 9.0)])
+    assert chart is not None
+    assert [sum(filter(None, values)) for _, _, values in chart.lines] == [50, -900]
+    assert chart.x[0] < 9.0 < chart.x[-1]
+
+
+def drawn(text: str) -> dict[str, Any]:
+    """Data of the page's charts by their label."""
+    found = re.search(r'<script type="application/json" id="charts">(.*?)</script>', text, re.DOTALL)
+    assert found is not None
+    return json.loads(found[1])
 
 
 def test_the_drive_over_time(page: str, finished: Path) -> None:
     for name in ("Height, z in m", "Heading, yaw in degrees", "Speed in m/s", "Position, one sigma in m"):
         assert f"<figcaption>{name}</figcaption>" in page
     closures = tables.read_closures(finished / "closures.parquet")
-    dots = re.findall(r'<path class="track dot (yes|no)" d="((?:M[\d. ]+h0){2,})"', page)
-    used = closures.of(*USED)
-    assert {kind: path.count("M") for kind, path in dots}["yes"] == int(
-        np.isfinite(closures.residual_after[used]).sum()
-    )
-    assert "Error of keyframes" not in page
+    lines = drawn(page)["residual of closures in sigma, cut at 10"]["lines"]
+    counts = {kind: sum(value is not None for value in values) for kind, _, values in lines}
+    solved, used = np.isfinite(closures.residual_after), closures.of(*USED)
+    assert counts == {"dot yes": (solved & used).sum(), "dot no": (solved & ~used).sum()}
+    assert "error of keyframes in m" not in drawn(page)
+
+
+def test_the_library_of_the_charts_is_that_of_the_lock(page: str) -> None:
+    import vplog.results
+
+    folder = Path(vplog.results.__file__).parent / "templates"
+    version = json.loads((folder / "package-lock.json").read_text())["packages"]["node_modules/uplot"]["version"]
+    assert f"/uPlot (v{version}) */" in (folder / "uPlot.iife.min.js").read_text()[:99]
+    for line in (folder / "uPlot.sha256").read_text().splitlines():
+        digest, name = line.split()
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest
+        assert (folder / name).read_text() in page
 
 
 def test_warnings_stages_and_thresholds_are_told(page: str, finished: Path) -> None:
@@ -198,7 +205,8 @@ def test_warnings_stages_and_thresholds_are_told(page: str, finished: Path) -> N
     for name in record["stages"]:
         if name != "report":  # it is written before it knows how long it took
             assert f"<td>{name}</td>" in page
-    assert f"least matches {record['settings']['verify']['min_matches']}" in page
+    least = record["settings"]["verify"]["min_matches"]
+    assert drawn(page)["feature matches"]["thresholds"] == [[f"least matches {least}", least]]
     assert sum(record["library"]["used"]) > 0
     for verdict in {Verdict(name) for name in record["counts"]["verdicts"]}:
         assert verdict.sentence in page
@@ -278,11 +286,12 @@ def test_pictures_come_from_the_log_where_the_run_kept_none(
     (folder / "result.mcap").unlink()
     write_mcap(folder / "result.mcap", keyframes, world, graph, closures, tables.TableMetadata({}, ""))
     assert verb("report", folder).code == 0
-    assert "<img loading" not in (folder / "report.html").read_text()
+    assert not ledger((folder / "report.html").read_text())["thumbnails"]
     assert verb("report", folder, "--log", drive.log).code == 0
     text = (folder / "report.html").read_text()
-    kept = mcap_read.read_pictures(finished / "result.mcap").pictures
-    assert ledger(text)["pictures"] == sorted(kept)
+    told, views = ledger(text), mcap_read.read_pictures(finished / "result.mcap").views
+    assert told["views"] == {str(row): view for row, view in views.items()}
+    assert told["thumbnails"]
     (tmp_path / "empty").mkdir()
     cv2.imwrite(str(tmp_path / "empty" / "1.png"), np.zeros((80, 80), np.uint8))
     assert "stamps" in verb("report", folder, "--log", tmp_path / "empty").error
@@ -323,7 +332,7 @@ def hostile(finished: Path, tmp_path: Path) -> Path:
 def test_what_strangers_wrote_is_text(verb: Verb, hostile: Path, page: str) -> None:
     assert verb("report", hostile).code == 0
     text = (hostile / "report.html").read_text()
-    assert Page(text).scripts == Page(page).scripts == 2
+    assert Page(text).scripts == Page(page).scripts == 4  # uPlot, two of data, ours
     assert "onerror=alert(1)&gt;" in text
     assert HOSTILE not in text
 
@@ -448,6 +457,11 @@ INNER_DOT = """() => {
 """Where on the map a dot of an accepted closure is."""
 
 
+PAINTED = """all => all.map((one) => one.width > 99 && one.getContext("2d").getImageData(0, 0, one.width, one.height)
+  .data.some((value) => value))"""
+"""Whether something is drawn on each canvas."""
+
+
 def test_closures_are_selected_and_rejected_and_the_next_run_knows(
     browser: str, finished: Path, drive: Drive, verb: Verb, tmp_path: Path
 ) -> None:
@@ -481,20 +495,21 @@ def test_closures_are_selected_and_rejected_and_the_next_run_knows(
             titles.append(page.inner_text("#closure-title"))
             page.keyboard.press("j")
             assert page.inner_text("#closure-title") != titles[-1]
-        chart = page.locator("svg.time").first
-        chart.click()
+        charts = page.locator("figure.chart:has(.mark)")
+        charts.first.locator(".u-over").click()
         titles.append(page.inner_text("#closure-title"))
-        assert (chart.locator(".mark").get_attribute("d") or "").count("M") == 3  # pointer, query and match
+        places = "all => new Set(all.map((one) => one.style.transform)).size"
+        assert charts.locator(".u-cursor-x").evaluate_all(places) == 1
+        assert charts.locator(".mark:visible").count() == 2 * charts.count()
         page.locator("#rows tr[data-row]").first.click()
         titles.append(page.inner_text("#closure-title"))
         pairs = [tuple(map(int, re.findall(r"\d+", one))) for one in titles]
         assert all(at[row] and [before.query[row], before.match[row]] == ends for row, *ends in pairs)
         assert page.input_value("#command").endswith(f"--closure {pairs[-1][1]}:{pairs[-1][2]}")
-        drawn = ledger((run / "report.html").read_text())["pictures"]
-        for row in (next(row for row in drawn if at[row]), next(row for row in np.flatnonzero(at) if row not in drawn)):
-            page.fill("#search", f"row={row}")
-            page.locator("#rows tr[data-row]").first.click()
-            assert page.is_visible("#drawn") == (row in drawn) != page.is_visible("#query")
+        assert page.inner_text("#no-picture") == ""
+        painted = page.locator(".drawn canvas").evaluate_all(PAINTED)
+        assert len(painted) > 1
+        assert all(painted)
         page.fill("#search", "inliers>10")
         page.locator("#rows tr[data-row]").first.click()
         page.fill("#who", 'Jo "J", Doe')

@@ -12,6 +12,7 @@ import pytest
 from vplog.data import Trajectory
 from vplog.errors import SettingsError
 from vplog.geometry import se3
+from vplog.maps.diff import diff_maps
 from vplog.results import tables
 from vplog.results.run_record import read_run_json, write_run_json
 from vplog.verbs.diff import FIGURES, check_limits, diff, exceeded
@@ -109,3 +110,21 @@ def test_limits_are_of_the_change(limit: str, fails: bool) -> None:
 def test_a_change_that_is_not_known_fails_no_limit_silently() -> None:
     with pytest.raises(SettingsError, match="not known"):
         exceeded({"figures": {"recall": [None, 0.9, None]}}, ["recall<0"])
+
+
+def test_two_maps(halves: Path, verb: Callable[..., Said], tmp_path: Path) -> None:
+    """One loses a drive, and with it its closures and those between both."""
+    assert diff_maps(halves, halves)["trajectory"]["max_m"] == pytest.approx(0.0, abs=1e-9)
+    less = tmp_path / "map"
+    shutil.copytree(halves, less)
+    assert verb("map", "remove", less, "before").code == 0
+    found = verb("diff", halves, less, "--json").json
+    assert found["drives"] == {"gained": [], "lost": ["before"]}
+    assert found["figures"]["drives"] == [2, 1, -1]
+    joins = [ends for ends in found["closures"]["lost"] if len({end.split("/")[0] for end in ends}) == 2]
+    assert len(joins) == found["figures"]["joins"][0] > 0
+    assert not found["closures"]["gained"]
+    assert found["settings"] == {}
+    assert "drives lost" in verb("diff", halves, less).out
+    assert verb("diff", halves, less, "--fail-on", "drives<0").code == 1
+    assert verb("diff", halves, tmp_path).code == 2

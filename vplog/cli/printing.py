@@ -104,7 +104,11 @@ def print_diff(found: dict[str, Any]) -> None:
     if named:
         print_table(("setting", "baseline", "run"), named)
     print_table(("figure", "baseline", "run", "change"), [(k, *map(cell, v)) for k, v in found["figures"].items()])
-    print_table(("stage", "seconds\nbaseline", "\nrun"), [(k, *map(cell, v)) for k, v in found["seconds"].items()])
+    if found["seconds"]:
+        print_table(("stage", "seconds\nbaseline", "\nrun"), [(k, *map(cell, v)) for k, v in found["seconds"].items()])
+    for kind, drives in found.get("drives", {}).items():
+        if drives:
+            print_line(f"drives {kind}", ", ".join(drives))
     for kind in ("gained", "lost"):
         pairs = [f"{query}:{match}" for query, match in found["closures"][kind]]
         if pairs:

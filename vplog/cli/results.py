@@ -88,7 +88,8 @@ def report(arguments: argparse.Namespace) -> None:
 
 
 def diff(arguments: argparse.Namespace) -> None:
-    """Compare two runs of one drive: settings, closures, trajectories, scores and times."""
+    """Compare two runs of one drive, or two maps: settings, closures, trajectories, scores and times."""
+    from vplog.maps.diff import diff_maps
     from vplog.verbs.diff import check_limits, exceeded, write_page
     from vplog.verbs.diff import diff as diff_runs
 
@@ -96,9 +97,12 @@ def diff(arguments: argparse.Namespace) -> None:
     if len(runs) != 2:
         arguments.refuse(f"two runs are compared, BASELINE RUN or RUN --baseline BASELINE, and {len(runs)} were given")
     check_limits(arguments.fail_on)
+    maps = [(run / "map.json").is_file() for run in runs]
+    if any(maps) and (not all(maps) or arguments.output or arguments.truth):
+        arguments.refuse("a map is compared with a map, without --truth and -o")
     with one_stage(arguments, "compare"):
         truth = arguments.truth, parser.topics_of(arguments), _truth_options(arguments)
-        found = diff_runs(runs[0], runs[1], *truth)
+        found = diff_maps(runs[0], runs[1]) if all(maps) else diff_runs(runs[0], runs[1], *truth)
         if arguments.output is not None:
             write_page(arguments.output, found, *truth)
     print_result(arguments, found, printing.print_diff)

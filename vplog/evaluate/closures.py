@@ -209,12 +209,12 @@ def closure_sentences(closures: dict[str, Any]) -> list[str]:
         f"between optical axes (precision {share['place_precision']})",
     ]
     for name, text in (
-        ("not_judged", "are not judged: the truth has a gap there, or is too coarse"),
+        ("not_judged", "not judged: the truth has a gap there, or is too coarse"),
         (
             "overconfident",
-            "true ones are outside 99.9 % of their covariance: it, or the truth between two visits, is wrong",
+            "true, but outside 99.9 % of the covariance claimed: that, or the truth between two visits, is wrong",
         ),
-        ("by_place", "without a pose, or a truth with orientations, are judged by place"),
+        ("by_place", "judged by place: without a pose, or a truth with orientations"),
         ("directions", f"without metres, {closures.get('directions_true')} of them true by turn and direction"),
     ):
         if closures.get(name):

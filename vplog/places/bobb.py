@@ -235,10 +235,14 @@ class BobbState(RecordState):
         corners[codes == NOWHERE] = np.nan
         return Boxes(place.references[used].astype(np.int64), corners)
 
-    def voting_map(self, features: Features, reference: int) -> Floats:
+    def voting_maps(self, features: Features, references: Sequence[int]) -> list[Floats]:
         """(36, 64) expected vote at the middle of every cell, by the closed form of `expected_votes`."""
+        matches = self.matcher.match(features)
+        return [self._voting_map(matches, reference) for reference in references]
+
+    def _voting_map(self, matches: Matches, reference: int) -> Floats:
         s = self.settings
-        _, there, weight = self.agreed(self.matcher.match(features), reference)
+        _, there, weight = self.agreed(matches, reference)
         x, y = (np.arange(_MAP_COLUMNS) + 0.5) / _MAP_COLUMNS, (np.arange(_MAP_ROWS) + 0.5) / _MAP_ROWS
         along_x = (1.0 - np.abs(x[:, None] - there[:, 0])) ** (s.patches_x - 1)
         along_y = (1.0 - np.abs(y[:, None] - there[:, 1])) ** (s.patches_y - 1)

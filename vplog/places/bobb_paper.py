@@ -168,13 +168,15 @@ class PaperBobbState(RecordState):
         corners[np.all(place.boxes[used] == 0, axis=-1)] = np.nan
         return Boxes(place.references[used].astype(np.int64), corners)
 
-    def voting_map(self, features: Features, reference: int) -> Floats:
-        """(N, M) votes of the features of a whole image for a reference, 1 at most."""
+    def voting_maps(self, features: Features, references: Sequence[int]) -> list[Floats]:
+        """(N, M) votes of the features of a whole image for each reference, 1 at most."""
         words = self.library.translate(features.descriptors[: self.settings.features])
-        points, pattern = features.points[: self.settings.features], self.patterns[reference]
-        cells = self.votes(words, points, (features.width, features.height), reference, _WHOLE_IMAGE)
-        votes = rvp.voting_map(cells, pattern.grid_x, pattern.grid_y)
-        return votes / max(float(votes.max()), 1e-12)
+        points, size, maps = features.points[: self.settings.features], (features.width, features.height), []
+        for reference in references:
+            cells, pattern = self.votes(words, points, size, reference, _WHOLE_IMAGE), self.patterns[reference]
+            votes = rvp.voting_map(cells, pattern.grid_x, pattern.grid_y)
+            maps.append(votes / max(float(votes.max()), 1e-12))
+        return maps
 
     def index(self, descriptors: Sequence[BoxPlace]) -> BoxIndex:
         references, boxes = self.arrays(descriptors)

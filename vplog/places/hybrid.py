@@ -207,7 +207,8 @@ class HybridState(ReferencesState):
         """`share`, 0..1, is the part of the words in a score."""
         super().__init__(settings, references)
         self.bobb, self.vlad, self.share = bobb, vlad, share
-        self.windows, self.boxes, self.voting_map, self.shared = bobb.windows, bobb.boxes, bobb.voting_map, bobb.shared
+        self.windows, self.boxes, self.shared = bobb.windows, bobb.boxes, bobb.shared
+        self.voting_maps = bobb.voting_maps
         self._signs = settings.words * settings.bits // 8
 
     @property

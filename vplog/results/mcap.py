@@ -42,6 +42,8 @@ _CHUNK_BYTES = 1 << 20
 """A reader inflates one chunk at a time; 1 MiB is what the format's own tools write."""
 
 PICTURES, REFERENCE, FIXES, EARTH = "/closures/picture", "/reference/image", "/gps", "/gps/optimised"
+VIEWS = "closures.json"
+"""Attachment of the matches, boxes and votes of closures."""
 _CAMERA = "/cam/NAME"
 TOPICS = {
     "/path/optimised": ("foxglove.PosesInFrame", "The keyframes as solved, at the start and the end of the drive."),
@@ -110,6 +112,8 @@ class McapExtras:
     """By row of the keyframe."""
     references: Mapping[int, bytes] = field(default_factory=dict)
     """JPEG of a reference of the library by its number."""
+    views: Mapping[int, dict[str, Any]] = field(default_factory=dict)
+    """Matches, boxes and votes of a candidate closure by its row, see `closure_views.view`."""
     pictures: Mapping[int, bytes] = field(default_factory=dict)
     """JPEG of a candidate closure by its row in the ledger."""
     gps: Gps | None = None
@@ -149,6 +153,9 @@ def write_mcap(
             start_ns = int(keyframes.stamp_ns[0])
             for number, data in sorted(extras.references.items()):
                 writer.add_attachment(start_ns, start_ns, f"reference-{number}.jpg", "image/jpeg", data)
+            if extras.views:
+                views = canonical_json({str(row): view for row, view in extras.views.items()}).encode()
+                writer.add_attachment(start_ns, start_ns, VIEWS, "application/json", views)
         channels = _Channels(writer)
         solved = _solved(keyframes, world_from_body, graph, closures, extras)
         pictured = _camera_messages(keyframes, closures, extras.camera, extras) if extras.camera else iter(())

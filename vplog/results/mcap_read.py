@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -25,8 +25,9 @@ from mcap.writer import MCAP0_MAGIC
 
 from vplog.data import Floats, Gps
 from vplog.geometry import se3
+from vplog.results.closure_views import checked
 from vplog.results.foxglove import CAMERA
-from vplog.results.mcap import FIXES, PICTURES
+from vplog.results.mcap import FIXES, PICTURES, VIEWS
 from vplog.results.tables import reading
 from vplog.storage.parquet_limits import crc_of
 
@@ -43,6 +44,8 @@ class McapContent:
 
     pictures: dict[int, bytes] = field(default_factory=dict)
     """JPEG of a candidate closure by its row in the ledger."""
+    views: dict[int, dict[str, Any]] = field(default_factory=dict)
+    """Matches, boxes and votes of a candidate closure by its row, see `closure_views.view`."""
     references: dict[int, bytes] = field(default_factory=dict)
     """JPEG of a reference of the library by its number."""
     gps: Gps | None = None
@@ -63,11 +66,13 @@ class CameraPicture:
 
 def read_pictures(path: Path) -> McapContent:
     """The pictures, references and fixes of a result.mcap. Raises ResultError where it is missing or damaged."""
-    rows, pictures, references, fixes = [], [], {}, []
+    rows, pictures, references, fixes, views = [], [], {}, [], {}
     with _reading(path) as reader:
         for attachment in reader.iter_attachments():
             if named := re.fullmatch(r"reference-(\d{1,6})\.jpg", attachment.name):
                 references[int(named[1])] = attachment.data
+            if attachment.name == VIEWS:
+                views = {int(row): checked(one) for row, one in json.loads(attachment.data).items()}
         for _, channel, message in reader.iter_messages(topics=[PICTURES, FIXES]):
             if channel.topic == FIXES:
                 fixes.append(LocationFix.FromString(message.data))
@@ -78,7 +83,7 @@ def read_pictures(path: Path) -> McapContent:
                 rows.append(int(named[1]))
         named = list(zip(rows or _picture_rows(reader), pictures, strict=True))
     kept = {row: data for row, data in named if row is not None}
-    return McapContent(kept, references, _gps(fixes) if fixes else None)
+    return McapContent(kept, views, references, _gps(fixes) if fixes else None)
 
 
 def read_fixes(path: Path) -> Gps | None:
@@ -133,7 +138,8 @@ def _topics(reader: McapReader) -> list[str]:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[McapReader]:
-    with reading(path, more=(McapError, DecodeError, EOFError, struct.error)), path.open("rb") as stream:
+    more = (McapError, TypeError, AttributeError, DecodeError, EOFError, struct.error)
+    with reading(path, more=more), path.open("rb") as stream:
         _check_crcs(stream)
         yield make_reader(stream, validate_crcs=True)
 

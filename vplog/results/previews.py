@@ -9,6 +9,8 @@ from pydantic import Field
 from vplog.data import Bytes
 from vplog.settings import Settings
 
+_THUMBNAIL_MEGAPIXELS, _THUMBNAIL_QUALITY = 0.04, 60
+
 
 class PictureSettings(Settings):
     """Images of the camera in result.mcap and report.html."""
@@ -19,9 +21,9 @@ class PictureSettings(Settings):
     quality: int = Field(default=75, ge=1, le=100)
     """JPEG quality of all pictures."""
     closures: int = Field(default=30, ge=0, le=20_000)
-    """Candidates drawn with their matches, boxes and voting maps: half of them accepted ones, the others rejected. One
-    takes 0.07 to 0.2 s of one core and 100 kB, so the default is some 5 % of a run of a few hundred frames; a run
-    again with another value draws them without reading the log."""
+    """Candidates whose matches, boxes and votes are a picture in result.mcap, for Foxglove and rerun: half of them
+    accepted ones, the others rejected. One takes some 0.07 s of one core and 100 kB; a run again with another value
+    draws them without reading the log. report.html draws those of all closures by itself."""
 
 
 def scaled_size(width: int, height: int, megapixels: float) -> tuple[int, int]:
@@ -41,6 +43,11 @@ def shrink(image: Bytes, megapixels: float) -> Bytes:
 def jpeg(image: Bytes, quality: int) -> bytes:
     """The image as a JPEG file: the same bytes for the same pixels."""
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
+def thumbnail(image: Bytes) -> bytes:
+    """A JPEG of 230 x 170 px and some 5 kB."""
+    return jpeg(shrink(image, _THUMBNAIL_MEGAPIXELS), _THUMBNAIL_QUALITY)
 
 
 def preview(image: Bytes, settings: PictureSettings) -> bytes:

@@ -16,9 +16,15 @@ from vplog.graph.refine import about_odometry
 from vplog.results import g2o, mcap, run_record, tables
 from vplog.run import provenance
 from vplog.run.back_end import Solved, about_gps, keyframe_covariances
-from vplog.run.figures.run_figures import ClosureInputs, choose_examples, earth_of, mcap_extras, reference_use
+from vplog.run.figures.run_figures import (
+    ClosureInputs,
+    choose_examples,
+    choose_views,
+    earth_of,
+    mcap_extras,
+    reference_use,
+)
 from vplog.run.report import write_report
-from vplog.storage.image_file import decode_image
 
 if TYPE_CHECKING:
     from vplog.cache.feature_shards import Extracted
@@ -80,9 +86,7 @@ def write(
     """Write the tables, the trajectory, the graph and result.mcap of a run into its folder."""
     log, keyframes, trajectory, poses = run.log, run.keyframes, run.solved.trajectory, run.solution.world_from_body
     picture, gps = run.features.picture, log.gps()
-    inputs = ClosureInputs(
-        lambda row: decode_image(picture(row)), run.features.__getitem__, run.camera, run.state, run.places
-    )
+    inputs = ClosureInputs(run.features.__getitem__, run.camera, run.state, run.places)
     previews = picture if run.features.has_pictures else None
     extras = replace(
         mcap_extras(inputs, previews, run.closures, run.references, verify, pictures, execution),
@@ -123,12 +127,12 @@ def finish(folder: Path, run: Run, record: dict[str, Any], steps: Steps) -> Run:
 
 
 def _pictures_record(run: Run, most: int) -> dict[str, int]:
-    """Number of closures drawn, and of accepted ones that are left out."""
-    rows = choose_examples(run.closures, most) if run.features.has_pictures else []
-    return {
-        "drawn": len(rows),
-        "accepted_left_out": int(run.closures.accepted.sum() - run.closures.accepted[rows].sum()),
-    }
+    """Number of closures drawn in result.mcap, of those with a view in the report, and of accepted ones without."""
+    if not run.features.has_pictures:
+        return {"drawn": 0, "views": 0, "accepted_left_out": int(run.closures.accepted.sum())}
+    drawn, views = choose_examples(run.closures, most), choose_views(run.closures)
+    left_out = int(run.closures.accepted.sum() - run.closures.accepted[views].sum())
+    return {"drawn": len(drawn), "views": len(views), "accepted_left_out": left_out}
 
 
 def _results_record(run: Run) -> dict[str, Any]:

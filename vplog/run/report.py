@@ -15,8 +15,8 @@ from vplog.geometry import se3
 from vplog.graph.joint import spaced_apart
 from vplog.results import mcap_read, tables
 from vplog.results.html import mapping
-from vplog.results.previews import jpeg, shrink
-from vplog.results.report.page import Content, Tracks, false_closures, page
+from vplog.results.previews import thumbnail
+from vplog.results.report.page import Content, Pictures, Tracks, false_closures, page
 from vplog.run.figures.run_figures import earth_of
 from vplog.run.questions import ask_ledger
 from vplog.storage.image_file import decode_image
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _QUESTIONS = 10
-_MOST_THUMBNAILS, _THUMBNAIL_MEGAPIXELS, _THUMBNAIL_QUALITY = 5000, 0.04, 60
-"""Keyframes with a thumbnail in the page, of 230 x 170 px and some 5 kB: 35 MB in base64."""
+_MOST_THUMBNAILS = 5000
+"""Keyframes with a thumbnail in the page, of some 5 kB: 35 MB in base64."""
 
 
 def write_report(
@@ -40,12 +40,12 @@ def write_report(
     record: dict[str, Any],
     path: Path | None = None,
     judged: TruthComparison | None = None,
-    pictures: dict[int, bytes] | None = None,
+    pictures: Pictures | None = None,
     changes: Changes | None = None,
 ) -> Path:
     """Write the page of the run in `folder`, whose run.json holds `record`, as `path` (report.html in it where None).
 
-    `pictures` are JPEGs of closures by row, where result.mcap has none. Raises ResultError.
+    `pictures` are those that result.mcap lacks. Raises ResultError.
     """
     path = path or folder / "report.html"
     text = page(replace(gather(folder, record, judged, pictures), changes=changes))
@@ -91,15 +91,17 @@ def gather(
     folder: Path,
     record: dict[str, Any],
     judged: TruthComparison | None = None,
-    pictures: dict[int, bytes] | None = None,
+    pictures: Pictures | None = None,
 ) -> Content:
     """The content of the page. Raises ResultError where a file of the run is missing or damaged."""
     tracks = gather_tracks(folder, record)
     covariance = tables.read_keyframe_covariance(folder / "keyframes.parquet")
     closures = tables.read_closures(folder / "closures.parquet")
-    content = Content(record, tracks, covariance, closures, tracks.found.pictures or pictures or {}, judged=judged)
+    pictures = pictures or Pictures(tracks.found.views, tracks.found.references)
+    content = Content(record, tracks, covariance, closures, pictures, judged=judged)
     content = replace(content, questions=_questions(folder, content), references=_references(folder, content))
-    return replace(content, thumbnails=_thumbnails(folder, content))
+    thumbnails = pictures.thumbnails or _thumbnails(folder, content)
+    return replace(content, pictures=replace(pictures, thumbnails=thumbnails))
 
 
 def _questions(folder: Path, content: Content) -> list[Question]:
@@ -136,7 +138,7 @@ def _thumbnails(folder: Path, content: Content) -> dict[int, bytes]:
     wanted = set(list(dict.fromkeys(ends))[:_MOST_THUMBNAILS])
     row_at = {stamp: row for row, stamp in enumerate(content.tracks.keyframes.stamp_ns.tolist()) if row in wanted}
     found = {
-        row_at[one.stamp_ns]: jpeg(shrink(decode_image(one.image), _THUMBNAIL_MEGAPIXELS), _THUMBNAIL_QUALITY)
+        row_at[one.stamp_ns]: thumbnail(decode_image(one.image))
         for one in mcap_read.read_images(folder / "result.mcap")
         if one.stamp_ns in row_at
     }

@@ -47,3 +47,14 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None  # JSON has no NaN
     return value
+
+
+def differences(one: Any, other: Any, name: str = "") -> dict[str, list[Any]]:
+    """Leaves of two trees that differ, by their dotted names; None where one tree lacks it."""
+    if not (isinstance(one, dict) or isinstance(other, dict)):
+        return {} if one == other else {name.removeprefix("settings."): [one, other]}
+    left, right = (tree if isinstance(tree, dict) else {} for tree in (one, other))
+    found: dict[str, list[Any]] = {}
+    for key in dict.fromkeys([*left, *right]):
+        found |= differences(left.get(key), right.get(key), f"{name}.{key}" if name else key)
+    return found

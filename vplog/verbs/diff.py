@@ -15,6 +15,7 @@ from vplog.results import run_record, tables
 from vplog.results.html import mapping
 from vplog.results.report.page import Changes
 from vplog.run.report import write_report
+from vplog.storage.json_records import differences
 from vplog.verbs.evaluate_run import TruthOptions, evaluate
 from vplog.verbs.report import judge
 
@@ -40,7 +41,8 @@ _OF_RECORD = {
     "memory_mb": ("totals", "peak_memory_mb"),
 }
 FIGURES = (*_SCORES, "accepted", "gained", "lost", "moved_m", "moved_deg", *_OF_RECORD)
-"""Names of the figures that limits are of."""
+_LIMITED = (*FIGURES, "drives", "joins", "joint_frames")
+"""Names of the figures that limits are of, those of maps among them."""
 
 
 def diff(
@@ -79,7 +81,7 @@ def diff(
     return {
         "baseline": str(baseline),
         "run": str(run),
-        "settings": _differences(trees[0], trees[1]),
+        "settings": differences(trees[0], trees[1]),
         "closures": {"common": len(ledgers[1]) - len(gained), "gained": gained, "lost": lost},
         "trajectory": moved,
         "figures": {name: [*figures[name], _change(*figures[name])] for name in FIGURES if name in figures},
@@ -118,11 +120,11 @@ def check_limits(limits: Sequence[str]) -> None:
     """Raises SettingsError for the first limit that is none: a figure, < <= > or >=, and a number or percentage."""
     for limit in limits:
         found = _LIMIT.fullmatch(limit.replace(" ", ""))
-        if found is None or found[1] not in FIGURES:
-            near = "" if found is None else nearest(found[1], FIGURES)
+        if found is None or found[1] not in _LIMITED:
+            near = "" if found is None else nearest(found[1], _LIMITED)
             raise SettingsError(
                 f"--fail-on {limit!r} is no limit of a change.{near} Write a figure, < <= > or >=, and a number, or a "
-                f"percentage of the baseline: 'recall<-0.01', 'seconds>20%'. Figures: {', '.join(FIGURES)}."
+                f"percentage of the baseline: 'recall<-0.01', 'seconds>20%'. Figures: {', '.join(_LIMITED)}."
             )
 
 
@@ -176,14 +178,3 @@ def _same_stamps(folders: Sequence[Path]) -> tuple[Floats, Floats, Floats]:
 def _change(before: Any, after: Any) -> float | None:
     both = all(isinstance(one, int | float) and np.isfinite(one) for one in (before, after))
     return after - before if both else None
-
-
-def _differences(one: Any, other: Any, name: str = "") -> dict[str, list[Any]]:
-    """Leaves of two trees that differ, by their dotted names; None where one tree lacks it."""
-    if not (isinstance(one, dict) or isinstance(other, dict)):
-        return {} if one == other else {name.removeprefix("settings."): [one, other]}
-    left, right = mapping(one), mapping(other)
-    found: dict[str, list[Any]] = {}
-    for key in dict.fromkeys([*left, *right]):
-        found |= _differences(left.get(key), right.get(key), f"{name}.{key}" if name else key)
-    return found

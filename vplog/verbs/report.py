@@ -17,11 +17,12 @@ from vplog.features.extraction import extract_frames
 from vplog.geometry import se3
 from vplog.pipeline import Pipeline, recorded_pipeline
 from vplog.results import mcap_read, run_record, tables
-from vplog.results.previews import shrink
-from vplog.results.report.page import TruthComparison
-from vplog.run.figures.run_figures import ClosureInputs, choose_examples, draw_closures
+from vplog.results.previews import thumbnail
+from vplog.results.report.page import Pictures, TruthComparison
+from vplog.run.figures.run_figures import ClosureInputs, choose_views, reference_pictures, view_closures
 from vplog.run.provenance import library_at
 from vplog.run.report import write_report
+from vplog.stages import BoxState
 from vplog.storage.remote_path import original
 from vplog.storage.urls import shown
 from vplog.verbs.evaluate_run import TruthOptions, evaluate, evaluate_poses, log_truth
@@ -53,7 +54,7 @@ def report(
         raise TruthError("--distance-m, --heading-deg, --align and --truth-offset-s need a truth: give --truth.")
     judged = judge(folder, record, truth, topics, options) if truth is not None else None
     pictures = None
-    if log is not None and not mcap_read.read_pictures(folder / "result.mcap").pictures:
+    if log is not None and not mcap_read.read_pictures(folder / "result.mcap").views:
         pictures = pictures_from(log, folder, record, execution)
     written = write_report(folder, record, path, judged, pictures)
     return {"report": str(written), "bytes": written.stat().st_size, "truth": truth and shown(truth)}
@@ -93,25 +94,25 @@ def judge(
     )
 
 
-def pictures_from(log: Path, folder: Path, record: dict[str, Any], execution: Execution) -> dict[int, bytes]:
-    """Pictures of closures drawn from the log itself. Raises LogError or ResultError."""
+def pictures_from(log: Path, folder: Path, record: dict[str, Any], execution: Execution) -> Pictures:
+    """Thumbnails and views of closures from the log itself. Raises LogError or ResultError."""
     pipeline = recorded_pipeline(folder, record)
     keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
     closures = tables.read_closures(folder / "closures.parquet")
     state, column = recorded_places(folder, record, pipeline, execution)
     opened = logs.open(log, logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json"))
-    settings = pipeline.pictures.model_copy(update={"megapixels": pipeline.pictures.megapixels or 0.15})
-    rows = choose_examples(closures, settings.closures)
+    rows = choose_views(closures)
     nodes = np.unique(np.concatenate([closures.query[rows], closures.match[rows]])) if rows else np.zeros(0, np.int32)
     stamps = keyframes.stamp_ns[nodes]
-    images: dict[int, Bytes] = {}
+    thumbnails: dict[int, bytes] = {}
     features: dict[int, Features] = {}
     found = frames_at(opened, stamps, pipeline, f"is it the log of {folder}?", execution)
     for node, (image, features[node]) in zip(nodes.tolist(), found, strict=True):
-        images[node] = shrink(image, settings.megapixels)
-    places = state.from_arrow(column)
-    inputs = ClosureInputs(images.__getitem__, features.__getitem__, opened.camera(), state, places)
-    return draw_closures(rows, inputs, closures, pipeline.verify, settings.quality, execution)
+        thumbnails[node] = thumbnail(image)
+    inputs = ClosureInputs(features.__getitem__, opened.camera(), state, state.from_arrow(column))
+    views = view_closures(rows, inputs, closures, pipeline.verify, execution)
+    references = reference_pictures(state.references, pipeline.pictures.quality) if isinstance(state, BoxState) else {}
+    return Pictures(views, references, thumbnails)
 
 
 def frames_at(

@@ -216,7 +216,7 @@ def _draw_example(
             for column, j in enumerate(chosen, start=1):
                 reference = int(mine.references[j])
                 _show(grid[line, column], state.references[reference].image)
-                _overlay(grid[line, column], state.voting_map(features, reference))
+                _overlay(grid[line, column], *state.voting_maps(features, [reference]))
                 rank = np.flatnonzero(boxes.references == reference)
                 if len(rank):
                     _coloured(grid[line, column], boxes.corners[rank[0]])

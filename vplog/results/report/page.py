@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import shlex
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,8 +26,8 @@ _AFTER_GEOMETRY = (Verdict.REJECTED_BY_SOLVER, Verdict.NOT_SIGNIFICANT, Verdict.
 """Verdicts of closures that geometry found and the solution leaves out."""
 _MOST_LOSSES = 100
 """Rows of the table of losses; run.json has them all."""
-_MOST_PICTURE_BYTES = 12_000_000
-"""Bytes of all pictures together: with thumbnails, table and base64 the page then stays below 60 MB."""
+_MOST_VIEW_BYTES = 16_000_000
+"""Bytes of matches, boxes, votes and references together: with thumbnails and table the page stays below 60 MB."""
 _DOUBTFUL_SIGMA = 6.5
 """Residuals of that much are red."""
 _MOST_SIGMA = 10.0
@@ -89,6 +89,18 @@ class Tracks:
 
 
 @dataclass(frozen=True, eq=False)
+class Pictures:
+    """What the page shows of closures."""
+
+    views: dict[int, dict[str, Any]]
+    """Matches, boxes and votes of a candidate closure by its row, see `closure_views.view`."""
+    references: dict[int, bytes] = field(default_factory=dict)
+    """JPEG of a reference by its number."""
+    thumbnails: dict[int, bytes] = field(default_factory=dict)
+    """Small JPEG of a keyframe by its row."""
+
+
+@dataclass(frozen=True, eq=False)
 class Question:
     """Neighbouring closures that agree with each other, as one question to a person."""
 
@@ -122,10 +134,7 @@ class Content:
     covariance: Floats
     """(N, 6, 6) of the solved keyframes, NaN where unknown."""
     closures: Closures
-    pictures: dict[int, bytes]
-    """JPEG of a candidate closure by its row."""
-    thumbnails: dict[int, bytes] = field(default_factory=dict)
-    """Small JPEG of a keyframe by its row."""
+    pictures: Pictures
     judged: TruthComparison | None = None
     changes: Changes | None = None
     questions: list[Question] = field(default_factory=list)
@@ -137,8 +146,10 @@ def page(content: Content) -> str:
     """The whole report: the same text for the same run, but for its timings."""
     record, closures, judged = content.record, content.closures, content.judged
     counts = [(verdict, closures.verdict.count(verdict)) for verdict in Verdict]
-    examples = _examples(content)
     legend, drawn = _map(content)
+    curves = charts.curves(judged.curves) if judged and judged.curves else None
+    over_time, distributions, references = _over_time(content), _distributions(content), _references(content)
+    shown = [*over_time, curves, *(chart for _, chart in distributions), references["chart"] if references else None]
     return render(
         "report.html",
         record=record,
@@ -152,15 +163,14 @@ def page(content: Content) -> str:
         changes=content.changes and _changes(content.changes),
         questions=_questions(content),
         truth=_truth(judged) if judged else [],
-        curves=charts.curves(judged.curves) if judged and judged.curves else None,
+        curves=curves,
         verdicts=[(verdict.value, figure(count), verdict.sentence) for verdict, count in counts if count],
         candidates=len(closures),
-        examples=examples,
-        pictured=_pictured(content, [one["row"] for one in examples]),
-        audit=_audit(content, drawn, [one["row"] for one in examples]),
-        over_time=_over_time(content),
-        distributions=_distributions(content),
-        references=_references(content),
+        audit=_audit(content, drawn),
+        charts={one.label: asdict(one) for one in shown if one},
+        over_time=over_time,
+        distributions=distributions,
+        references=references,
         stages=_stages(mapping(record.get("stages"))),
     )
 
@@ -233,34 +243,38 @@ def _sigma_m(covariance: Floats) -> Floats:
     return sigma_m
 
 
-def _over_time(content: Content) -> list[tuple[str, charts.Chart]]:
+def _over_time(content: Content) -> list[charts.Chart]:
     """Charts of the drive by its time: height, heading and speed, uncertainty, residuals of closures and error."""
     tracks, closures, judged = content.tracks, content.closures, content.judged
     if len(tracks.after.stamp_ns) < 2:
         return []
     sample_s, keyframe_s = ((one.stamp_ns - tracks.after.stamp_ns[0]) / 1e9 for one in (tracks.after, tracks.keyframes))
-    both = [("before", tracks.before.world_from_body), ("after", tracks.after.world_from_body)]
-    yaw = [(kind, np.degrees(np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0])))) for kind, poses in both]
+    both = [("before", "odometry", tracks.before), ("after", "optimised", tracks.after)]
+    poses = [(kind, name, track.world_from_body) for kind, name, track in both]
+    yaw = [(kind, name, np.degrees(np.unwrap(np.arctan2(one[:, 1, 0], one[:, 0, 0])))) for kind, name, one in poses]
+    speed_s, speed = _speed(sample_s, tracks.after.world_from_body[:, :3, 3])
     used, residual = closures.of(*USED), np.minimum(closures.residual_after, _MOST_SIGMA)
-    solved = np.isfinite(residual)
-    dots = [("dot yes", solved & used), ("dot no", solved & ~used)]
-    at_s, error_m = keyframe_s[closures.query], None if judged is None else judged.error_m
-    series = {
-        "height, z in m": [(kind, sample_s, poses[:, 2, 3]) for kind, poses in both],
-        "heading, yaw in degrees": [(kind, sample_s, degrees) for kind, degrees in yaw],
-        "speed in m/s": [("after", *_speed(sample_s, tracks.after.world_from_body[:, :3, 3]))],
-        "position, one sigma in m": [("after", keyframe_s, _sigma_m(content.covariance))],
-        f"residual of closures in sigma, cut at {_MOST_SIGMA:.0f}": [
-            (d, at_s[rows], residual[rows]) for d, rows in dots
-        ],
-        "error of keyframes in m": [] if error_m is None else [("truth", keyframe_s, error_m)],
-    }
+    dots = [("dot yes", "in the solution", used), ("dot no", "other closures", ~used)]
+    solved, error_m = np.isfinite(residual), None if judged is None else judged.error_m
+    residuals = [(kind, name, np.where(rows, residual, np.nan)[solved]) for kind, name, rows in dots]
+    drawn: list[tuple[str, Floats, list[tuple[str, str, Floats]]]] = [
+        ("height, z in m", sample_s, [(kind, name, one[:, 2, 3]) for kind, name, one in poses]),
+        ("heading, yaw in degrees", sample_s, yaw),
+        ("speed in m/s", speed_s, [("after", "optimised", speed)]),
+        ("position, one sigma in m", keyframe_s, [("after", "one sigma", _sigma_m(content.covariance))]),
+        (
+            f"residual of closures in sigma, cut at {_MOST_SIGMA:.0f}",
+            keyframe_s[closures.query[solved]],
+            residuals,
+        ),
+        ("error of keyframes in m", keyframe_s, [] if error_m is None else [("truth", "error", error_m)]),
+    ]
     end_s = float(sample_s[-1])
-    drawn = [(name, charts.over_time(lines, name, end_s)) for name, lines in series.items() if lines]
+    found = [charts.over_time(lines, times, name, end_s) for name, times, lines in drawn]
     if content.references is not None:
         name = "references that explain a keyframe, by first use"
-        drawn.append((name, charts.coverage(content.references, keyframe_s, name, end_s)))
-    return [(name, chart) for name, chart in drawn if chart is not None]
+        found.append(charts.coverage(content.references, keyframe_s, name, end_s))
+    return [chart for chart in found if chart is not None]
 
 
 def _speed(sample_s: Floats, positions: Floats) -> tuple[Floats, Floats]:
@@ -295,7 +309,7 @@ def _map(content: Content) -> tuple[list[tuple[str, str]], dict[str, Any]]:
     groups = [
         ("yes", "closures in the solution", closures.of(*USED) & ~false),
         ("no", "closures the solver or a decision rejected", closures.of(*_AFTER_GEOMETRY)),
-        ("no", "closures in the solution that are false", false),
+        ("false", "closures in the solution that are false", false),
         ("before", "candidates that geometry rejected", ~closures.of(*USED, *_AFTER_GEOMETRY)),
     ]
     paths = [
@@ -336,55 +350,45 @@ def _truth(judged: TruthComparison) -> list[list[str]]:
     return [[f"{heading} ({alignment})" if "ATE" in heading else heading, *values] for heading, *values in rows]
 
 
-def _pictured(content: Content, rows: list[int]) -> tuple[str, str]:
-    """How many closures of the solution have a picture, and the command that draws the others."""
-    used = np.flatnonzero(content.closures.of(*USED))
-    shown = int(np.isin(used, rows).sum())
-    if not rows or shown == len(used):
-        return "", ""
-    log, drawn = shlex.quote(str(content.record.get("log"))), len(content.pictures) < 2 * len(used)
-    said = f"{shown} of the {len(used)} closures in the solution and {len(rows) - shown} others have a picture."
-    again = f"vplog run {log} -o RUN --set pictures.closures={2 * len(used)}"
-    return (f"{said} All, without reading the log again: ", again) if drawn else (f"{said} The page is full.", "")
-
-
-def _examples(content: Content) -> list[dict[str, Any]]:
-    """Closures with a picture, by row, until the page holds enough bytes of them: false ones first, then those of the
-    solution, then those of most inliers."""
-    closures, left, examples = content.closures, _MOST_PICTURE_BYTES, []
+def _views(content: Content) -> tuple[dict[str, Any], dict[str, str]]:
+    """Views by ledger row, and the references that they show in base64, until the page holds enough bytes of them:
+    false closures first, then those of the solution, then those of most inliers."""
+    closures, left = content.closures, _MOST_VIEW_BYTES
+    views, references = {}, {}
     order = np.lexsort((-closures.inliers, ~closures.of(*USED), ~false_closures(content))).tolist()
     for row in order:
-        jpeg = content.pictures.get(row)
-        if jpeg is None or len(jpeg) > left:
+        if (view := content.pictures.views.get(row)) is None:
             continue
-        left -= len(jpeg)
-        verdict = closures.verdict[row]
-        one = {"row": row, "jpeg": jpeg, "verdict": verdict.value}
-        one |= {"kind": "accepted" if verdict in USED else "rejected"}
-        one |= {name: getattr(closures, name)[row] for name in ("query", "match", "matches", "inliers", "score")}
-        examples.append(one)
-    return sorted(examples, key=lambda one: one["row"])
+        wanted = {str(one): jpeg for one in view["references"] if (jpeg := content.pictures.references.get(one))}
+        new = {one: base64.b64encode(jpeg).decode() for one, jpeg in wanted.items() if one not in references}
+        left -= len(str(view)) + sum(map(len, new.values()))
+        if left < 0:
+            break
+        views[str(row)] = view
+        references |= new
+    return views, references
 
 
-def _audit(content: Content, drawn: dict[str, Any], pictures: list[int]) -> dict[str, Any]:
-    """Data of the page's script; `pictures` are the ledger rows with a picture in the page."""
+def _audit(content: Content, drawn: dict[str, Any]) -> dict[str, Any]:
+    """Data of the page's script."""
+    views, references = _views(content)
     closures, log = content.closures, content.record.get("log")
     order = np.lexsort((-closures.score.astype(np.float64), ~closures.of(*USED)))
     columns = _columns(content, sorted(order[:_MOST_ROWS].tolist()))
-    after, (left, across, top, foot) = content.tracks.after.stamp_ns, charts.PLOT
+    start_ns = int(content.tracks.after.stamp_ns[0])
     command = f"vplog run {shlex.quote(str(log))} -o RUN --decisions decisions.csv"
     return {
         "columns": columns,
         "scales": _scales(columns, drawn["error_m"]),
-        "time": {"start": str(after[0]), "end_s": (int(after[-1]) - int(after[0])) / 1e9 or 1.0}
-        | {"left": left, "across": across, "top": top, "foot": foot},
         "used": [verdict.value for verdict in USED],
         "sentences": {verdict.value: verdict.sentence for verdict in Verdict},
         "stamps": list(map(str, content.tracks.keyframes.stamp_ns.tolist())),  # beyond 2^53, where JavaScript rounds
+        "seconds": np.round((content.tracks.keyframes.stamp_ns - start_ns) / 1e9, 4).tolist(),
         "map": drawn,
-        "pictures": pictures,
+        "views": views,
+        "references": references,
         "questions": {str(one.rows[0]): one.rows for one in content.questions},
-        "thumbnails": {str(row): base64.b64encode(jpeg).decode() for row, jpeg in content.thumbnails.items()},
+        "thumbnails": {str(row): base64.b64encode(jpeg).decode() for row, jpeg in content.pictures.thumbnails.items()},
         "explain": "vplog explain RUN --closure ",
         "again": command,
     }
@@ -455,7 +459,7 @@ def _references(content: Content) -> dict[str, Any] | None:
     order = sorted(range(len(used)), key=lambda number: (-used[number], number))
     split = min(_MOST_USED, (len(order) + 1) // 2)
     ends = (("Most used", order[:split]), ("Least used", order[max(split, len(order) - _MOST_USED) :]))
-    jpegs, coverage = content.tracks.found.references, mapping(library.get("coverage"))
+    jpegs, coverage = content.pictures.references, mapping(library.get("coverage"))
     return {
         "count": len(used),
         "explained": coverage.get("explained") if coverage.get("frames") else None,

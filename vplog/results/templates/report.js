@@ -130,8 +130,8 @@
     const [good, bad] = data.scales[name], share = Math.min(Math.max((value - good) / (bad - good), 0), 1);
     return value === null || value === undefined ? colour("before") : "hsl(" + 130 * (1 - share) + " 75% 45%)";
   };
-  const clear = (onto) => {
-    const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
+  const clear = (onto, box = canvas) => {
+    const ratio = window.devicePixelRatio || 1, width = box.clientWidth, height = box.clientHeight;
     onto.width = Math.max(width * ratio, 1); onto.height = Math.max(height * ratio, 1);
     pen = onto.getContext("2d"); pen.setTransform(ratio, 0, 0, ratio, 0, 0); pen.font = "13px system-ui";
     return [width, height];
@@ -145,8 +145,7 @@
       trace(is("matrix") ? [ends[0], [columns.query[row], columns.match[row], 0], ends[1]] : ends, ink, [], 2);
       for (const at of is("matrix") ? [dotOf(row)] : ends.map(place)) disc(at, 6, ink);
     }
-    const at = [moment, ...["query", "match"].map((end) => columns[end][selected] ?? -1)].filter((keyframe) => keyframe >= 0);
-    for (const one of marks) one.setAttribute("d", at.map((keyframe) => "M" + (left + across * seconds[keyframe] / end_s) + " " + top + "V" + foot).join(""));
+    place_marks();
   };
   const round = (most) => {  // the largest 1, 2 or 5 times a power of ten up to it
     const power = 10 ** Math.floor(Math.log10(most));
@@ -182,13 +181,13 @@
     const size = clear(layer), by = $("colour").value, error = by === "path_error_m" ? data.map.error_m : null;
     for (const { kind, points } of paths) {
       if (kind === "gps") points.forEach((point) => disc(place(point), 2, colour("gps")));
-      else if (kind !== "after" || !error) trace(points, colour(kind), { before: [6, 4], truth: [2, 3], other: [6, 3] }[kind] ?? [], 2);
+      else if (kind !== "after" || !error) trace(points, colour(kind), dashes[kind] ?? [], 2);
       else for (let at = 0; at < last; at++) trace(spots.slice(at, at + 2), scaled(by, error[at]), [], 4);
     }
     drawAxes(...size);
     for (const kind of ["before", "yes", "no", "false"]) for (const row of rows) {
       if (kindOf(row) !== kind) continue;
-      const paint = colour({ false: "no" }[kind] ?? kind);
+      const paint = colour(kind);
       pen.globalAlpha = kind === "yes" || kind === "before" ? .35 : 1;
       if (!is("matrix")) trace([spots[columns.match[row]], spots[columns.query[row]]], paint, kind === "no" ? [3, 2] : [], kind === "false" ? 3 : 1);
       pen.globalAlpha = 1;
@@ -251,23 +250,57 @@
     event.preventDefault(); zoom(Math.exp(-event.deltaY / 400), event.offsetX, event.offsetY);
   }, { passive: false });
 
-  // Charts over time: the pointer's moment is shown on all of them and on the map, a click selects the closure nearest
-  const { start, end_s, left, across, top, foot } = data.time, seconds = stamps.map((stamp) => Number(BigInt(stamp) - BigInt(start)) / 1e9);
-  const marks = [...document.querySelectorAll("svg.time")].map((svg) => {
-    const mark = document.createElementNS(svg.namespaceURI, "path"), apart = (row) => Math.abs(columns.query[row] - moment);
-    mark.setAttribute("class", "mark"); svg.append(mark);
-    svg.addEventListener("pointermove", (event) => {
-      const box = svg.getBoundingClientRect(), share = ((event.clientX - box.left) / box.width * svg.viewBox.baseVal.width - left) / across;
-      const after = seconds.findIndex((one) => one >= share * end_s);
+  // Charts: over time they share the pointer, whose moment the map shows; a click selects the closure nearest
+  const seconds = data.seconds, dashes = { before: [6, 4], truth: [2, 3], other: [6, 3] };
+  const axis = { stroke: () => colour("quiet"), grid: { stroke: () => colour("line"), width: 1 }, ticks: { show: false }, font: "12px system-ui" };
+  const draw = (figure) => {
+    const { kind, lines, thresholds, x, x_label } = JSON.parse($("charts").textContent)[figure.dataset.chart], time = kind === "time";
+    const bars = kind === "bar" || kind === "mirrored", mirrored = kind === "mirrored", most = (u, at) => Math.max(...u.data[at].map(Math.abs), 1);
+    const series = lines.map(([paint, label], at) => {
+      const name = paint.replace("dot ", ""), dots = paint !== name, stroke = () => colour(name);
+      return { label, stroke, dash: dots || bars ? [] : dashes[name], width: bars ? 0 : 2, spanGaps: kind === "curve", fill: bars ? stroke : null,
+        scale: mirrored && at ? "down" : "y", paths: dots ? () => null : bars ? uPlot.paths.bars({ size: [.9], align: 1 }) : null,
+        value: (u, value) => value === null ? "-" : +Math.abs(value).toPrecision(5) * (mirrored ? 1 : Math.sign(value)),
+        points: { show: dots, size: 6, fill: stroke, width: 0 } };
+    });
+    const upright = { ...axis, size: 54, space: 34 }, down = { ...upright, scale: "down", side: 1, grid: { show: false } };
+    const half = (sign) => (u, values) => values.map((value) => value * sign < 0 ? "" : Math.abs(value));
+    const plot = new uPlot({
+      width: figure.clientWidth, height: 230, series: [{ label: x_label, value: (u, value) => value === null ? "-" : +value.toPrecision(6) }, ...series],
+      scales: { x: { time: false }, ...(mirrored ? { y: { range: (u) => [-1.3 * most(u, 1), 1.3 * most(u, 1)] }, down: { range: (u) => [-1.3 * most(u, 2), 1.3 * most(u, 2)] } } : bars ? { y: { range: (u, low, high) => [0, high] } } : {}) },
+      axes: [{ ...axis, size: 30, ...(kind === "bar" ? { incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 5000] } : {}) }, ...(mirrored ? [{ ...upright, values: half(1) }, { ...down, values: half(-1) }] : [upright])],
+      legend: { markers: { stroke: (u, at) => `var(--${lines[at - 1]?.[0].replace("dot ", "")})`, fill: "none", width: 2 } },
+      cursor: { y: false, drag: { x: true, y: false }, ...(time ? { sync: { key: "time", scales: ["x", null] } } : {}) },
+      hooks: { setScale: [() => place_marks()], draw: [(u) => thresholds.forEach(([text, at]) => {
+        const place = Math.round(u.valToPos(at, "x", true)), { left, top, width, height } = u.bbox, ratio = devicePixelRatio;
+        u.ctx.fillStyle = colour("ink"); u.ctx.fillRect(place, top, ratio, height); u.ctx.font = 12 * ratio + "px system-ui";
+        u.ctx.textAlign = place > left + width / 2 ? "right" : "left"; u.ctx.fillText(text, place + (u.ctx.textAlign === "left" ? 5 : -5) * ratio, top + 12 * ratio);
+      })] },
+    }, [x, ...lines.map(([, , values]) => values)], figure);
+    if (!time) return { figure, plot, marks: [] };
+    const apart = (row) => Math.abs(columns.query[row] - moment);
+    plot.over.addEventListener("pointermove", (event) => {
+      const after = seconds.findIndex((one) => one >= plot.posToVal(event.offsetX, "x"));
       moment = after < 0 ? last : after; highlight();
     });
-    svg.addEventListener("pointerleave", () => { moment = -1; highlight(); });
-    svg.addEventListener("click", () => {
+    plot.over.addEventListener("pointerleave", () => { moment = -1; highlight(); });
+    plot.over.addEventListener("click", () => {
       const least = rows.reduce((most, row) => Math.min(most, apart(row)), Infinity), near = rows.filter((row) => apart(row) === least);
       if (near.length) select(near[(near.indexOf(selected) + 1) % near.length]);
     });
-    return mark;
-  });
+    const marks = ["query", "match"].map((end) => Object.assign(document.createElement("i"), { className: "mark " + end }));
+    plot.over.append(...marks);
+    return { figure, plot, marks };
+  };
+  const plots = [];
+  const place_marks = () => {  // both keyframes of the closure that is hovered, else selected
+    const row = hovered >= 0 ? hovered : selected;
+    for (const { plot, marks } of plots) marks.forEach((mark, at) => {
+      const x = row < 0 ? -1 : plot.valToPos(seconds[columns[["query", "match"][at]][row]], "x");
+      mark.hidden = x < 0 || x > plot.over.clientWidth + 2; mark.style.left = x + "px";
+    });
+  };
+  plots.push(...[...document.querySelectorAll("figure[data-chart]")].map(draw));
 
   // The selected closure
   const show = () => {
@@ -286,13 +319,45 @@
       $(end).hidden = !jpeg;
       if (jpeg) $(end).src = "data:image/jpeg;base64," + jpeg;
     }
-    // the full picture in place of both thumbnails; the link leads to it at its full size
-    const full = document.querySelector("#closure-" + columns.row[row] + " img");
-    $("query").parentElement.hidden = Boolean(full); $("drawn").hidden = !full;
-    if (full) $("drawn").src = full.src;
-    $("no-picture").hidden = full || [columns.query[row], columns.match[row]].every((at) => thumbnails[at]);
-    $("full").hidden = !full; $("full").href = "#closure-" + columns.row[row];
+    const view = data.views[columns.row[row]], small = ["query", "match"].every((end) => thumbnails[columns[end][row]]);
+    $("no-picture").textContent = small ? view ? "" : "The page has no matches of this pair; the command below draws them." : "No thumbnails of this pair are in the page.";
+    $("references").replaceChildren(...panelsOf(view));
+    overlay();
   };
+  const bytes = (text) => Uint8Array.from(atob(text), (one) => one.charCodeAt(0));
+  const panelsOf = (view) => (view?.references ?? []).filter((one) => data.references[one]).flatMap((reference, at) => {
+    const titles = ["boxes of both", ...(at ? [] : view.votes.map((_, side) => "votes of the " + ["query", "match"][side]))];
+    return titles.map((title, panel) => {
+      const figure = document.createElement("figure"), image = new Image(), caption = document.createElement("figcaption");
+      figure.className = "drawn"; image.alt = caption.textContent = "reference " + reference + ": " + title;
+      image.addEventListener("load", overlay); image.src = "data:image/jpeg;base64," + data.references[reference];
+      figure.append(image, document.createElement("canvas"), caption);
+      figure.paint = (width, height) => panel ? heat(bytes(view.votes[panel - 1]), width, height)
+        : view.boxes[at].forEach((text, side) => rectangles(bytes(text), width, height, ["#ff9d2e", "#4cc3ff"][side]));
+      return figure;
+    });
+  });
+  const rectangles = (all, width, height, paint) => {
+    pen.strokeStyle = paint; pen.lineWidth = 1.5;
+    for (let at = 0; at < all.length; at += 4) pen.strokeRect(all[at] / 255 * width, all[at + 1] / 255 * height, (all[at + 2] - all[at]) / 255 * width, (all[at + 3] - all[at + 1]) / 255 * height);
+  };
+  const heat = (votes, width, height) => {  // 18 rows of 32
+    const grid = new OffscreenCanvas(32, 18), pixels = new ImageData(32, 18);
+    votes.forEach((vote, at) => pixels.data.set([255, 210 - vote * .7, 40, vote * .75], 4 * at));
+    grid.getContext("2d").putImageData(pixels, 0, 0); pen.drawImage(grid, 0, 0, width, height);
+  };
+  const overlay = () => {  // what is drawn over the pictures of the selected closure, at the size that they have now
+    const view = data.views[columns.row[selected]], ends = [$("query"), $("match")];
+    clear($("frames").lastElementChild, $("frames"));
+    const all = bytes(view?.lines ?? ""), placed = (at, end) => [ends[end].offsetLeft + all[at + 2 * end] / 255 * ends[end].clientWidth, ends[end].offsetTop + all[at + 2 * end + 1] / 255 * ends[end].clientHeight];
+    for (let at = all.length - 4; at >= 0; at -= 4) {
+      pen.strokeStyle = at < 4 * view.agree ? "#35e06f" : "#ff4d3d"; pen.globalAlpha = at < 4 * view.agree ? .8 : .6;
+      pen.beginPath(); pen.moveTo(...placed(at, 0)); pen.lineTo(...placed(at, 1)); pen.stroke();
+    }
+    for (const figure of $("references").children) figure.paint(...clear(figure.children[1], figure.children[0]));
+  };
+  for (const id of ["frames", "references"]) $(id).addEventListener("click", () => { $("closure").parentElement.classList.toggle("large"); overlay(); });
+  for (const end of ["query", "match"]) $(end).addEventListener("load", () => overlay());
   $("query").addEventListener("load", (event) => {  // wide pictures one above the other
     event.target.parentElement.classList.toggle("stacked", event.target.naturalWidth > 2 * event.target.naturalHeight);
   });
@@ -337,6 +402,8 @@
   });
   window.addEventListener("beforeunload", (event) => { if (unsaved) event.preventDefault(); });
   $("copy").addEventListener("click", () => { $("command").select(); navigator.clipboard?.writeText($("command").value); });
+  for (const [kind, row] of [["pointerover", (tr) => +tr.dataset.row], ["pointerleave", () => -1]])
+    body.addEventListener(kind, (event) => { const tr = event.target.closest("tr[data-row]"); hovered = tr || kind === "pointerleave" ? row(tr) : -1; highlight(); });
   body.addEventListener("click", (event) => { const tr = event.target.closest("tr[data-row]"); if (tr) select(+tr.dataset.row); });
   box.addEventListener("scroll", drawLedger);
   document.querySelectorAll("#closures th button").forEach((button) => button.addEventListener("click", () => {
@@ -350,7 +417,12 @@
   $("view").addEventListener("change", () => { look(); drawMap(); });
   for (const [id, factor] of [["zoom-in", 1.5], ["zoom-out", 1 / 1.5]]) $(id).addEventListener("click", () => zoom(factor, canvas.clientWidth / 2, canvas.clientHeight / 2));
   $("fit").addEventListener("click", () => { fit(); drawMap(); });
-  window.addEventListener("resize", () => { if (fitted) fit(); drawMap(); drawLedger(); });
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawMap);
+  window.addEventListener("resize", () => {
+    if (fitted) fit();
+    drawMap(); drawLedger();
+    if (selected >= 0) overlay();
+    for (const { figure, plot } of plots) plot.setSize({ width: figure.clientWidth, height: plot.height });
+  });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { drawMap(); plots.forEach(({ plot }) => plot.redraw()); });
   order();
 })();

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain, groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import ACCEPTED, Verdict
+from vplog.data import ACCEPTED, USED, Verdict
 from vplog.errors import ResultError
 from vplog.geometry import geodesy, se3
+from vplog.results import closure_views
 from vplog.results.collage import FramePanel, ReferencePanel, collage
 from vplog.results.geo import Earth
 from vplog.results.mcap import McapExtras, ReferenceBoxes
 from vplog.results.previews import jpeg, scaled_size, shrink
 from vplog.run.figures.closure_view import find_agreement, find_boxes
 from vplog.stages import BoxState
+from vplog.storage.image_file import decode_image
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from vplog.data import Bytes, Camera, Closures, Features, Gps, Reference, Trajectory
+    from vplog.data import Bytes, Camera, Closures, Features, Floats, Gps, Reference, Trajectory
     from vplog.execution.execution import Execution
     from vplog.loops.verify import VerifySettings
     from vplog.results.previews import PictureSettings
@@ -31,7 +34,13 @@ _REFERENCE_MEGAPIXELS = 0.05
 _MOST_REFERENCES = 1000
 """References whose pictures are written: 8 MB. Libraries of a drive have some hundred."""
 _VOTED = 1
-"""Shared references of a closure that are drawn with voting maps: each costs a search of the library."""
+"""Shared references of a closure that are drawn with voting maps."""
+_PANELS = 2
+"""Shared references of a closure that are drawn."""
+_VOTING = 150
+"""Strongest features whose votes are drawn: the search of the library takes its time for each."""
+_LEAST_VIEWS, _MOST_VIEWS = 100, 5000
+"""Closures with a view, half of them nearest misses where there are so many: some 10 ms and 2 kB each."""
 _LEAST_FIXES = 3
 """Fixes that determine position and heading of a trajectory."""
 
@@ -40,8 +49,6 @@ _LEAST_FIXES = 3
 class ClosureInputs:
     """Images, features and places of a drive, for pictures of its closures."""
 
-    image: Callable[[int], Bytes]
-    """A keyframe's picture (h, w) by its row."""
     features: Callable[[int], Features]
     """Features of a keyframe's whole image by its row."""
     camera: Camera
@@ -61,14 +68,14 @@ def mcap_extras(
 ) -> McapExtras:
     """Images, references and drawn closures for result.mcap; `previews` gives a keyframe's JPEG by its row."""
     state, camera = inputs.state, inputs.camera
-    small = {
-        number: jpeg(shrink(reference.image, _REFERENCE_MEGAPIXELS), pictures.quality)
-        for number, reference in enumerate(references[:_MOST_REFERENCES] if pictures.megapixels else [])
-    }
-    drawn = {}
+    small = reference_pictures(references, pictures.quality) if pictures.megapixels else {}
+    drawn, views = {}, {}
     if previews is not None:
         rows = choose_examples(closures, pictures.closures)
-        drawn = draw_closures(rows, inputs, closures, verify, pictures.quality, execution)
+        drawn = draw_closures(
+            rows, lambda row: decode_image(previews(row)), inputs, closures, verify, pictures.quality, execution
+        )
+        views = view_closures(choose_views(closures), inputs, closures, verify, execution)
     return McapExtras(
         camera=camera,
         image=previews,
@@ -76,7 +83,16 @@ def mcap_extras(
         explained=(lambda row: explain(state, inputs.places[row])) if isinstance(state, BoxState) else None,
         references=small,
         pictures=drawn,
+        views=views,
     )
+
+
+def reference_pictures(references: Sequence[Reference], quality: int) -> dict[int, bytes]:
+    """Small JPEGs of the first references by their number."""
+    return {
+        number: jpeg(shrink(reference.image, _REFERENCE_MEGAPIXELS), quality)
+        for number, reference in enumerate(references[:_MOST_REFERENCES])
+    }
 
 
 def explain(state: BoxState, place: Any) -> ReferenceBoxes | None:
@@ -118,14 +134,15 @@ def choose_examples(closures: Closures, count: int) -> list[int]:
 
 def draw_closures(
     rows: Sequence[int],
+    image: Callable[[int], Bytes],
     inputs: ClosureInputs,
     closures: Closures,
     verify: VerifySettings,
     quality: int,
     execution: Execution,
 ) -> dict[int, bytes]:
-    """JPEGs of ledger rows."""
-    images = {node: inputs.image(node) for row in rows for node in (int(closures.query[row]), int(closures.match[row]))}
+    """JPEGs of ledger rows; `image` gives a keyframe's picture (h, w) by its row."""
+    images = {node: image(node) for row in rows for node in (int(closures.query[row]), int(closures.match[row]))}
     drawn = execution.map(lambda row: jpeg(_draw(row, inputs, images, closures, verify), quality), rows)
     return dict(zip(rows, drawn, strict=True))
 
@@ -155,14 +172,63 @@ def _panels(
     if not isinstance(state, BoxState):
         return []
     panels, none = [], np.zeros((0, 4))
-    for found in find_boxes(state, inputs.places[nodes[0]], inputs.places[nodes[1]], shared)[:2]:
+    for found in find_boxes(state, inputs.places[nodes[0]], inputs.places[nodes[1]], shared)[:_PANELS]:
         name = f"reference {found.reference}"
         panels.append(ReferencePanel(found.image, f"{name}: boxes of both", found.query_boxes, found.match_boxes, None))
         if len(panels) <= _VOTED:
             for side, one in zip(("query", "match"), features, strict=True):
-                votes = state.voting_map(one, found.reference)
+                [votes] = state.voting_maps(_strongest(one), [found.reference])
                 panels.append(ReferencePanel(found.image, f"votes of the {side}", none, none, votes))
     return panels
+
+
+def _strongest(features: Features) -> Features:
+    return replace(features.rows(slice(_VOTING)), thumbnail=None)
+
+
+def choose_views(closures: Closures) -> list[int]:
+    """Rows of the closures in the solution and of as many nearest misses: those that geometry accepted, then those of
+    most inliers and matches."""
+    used = closures.of(*USED)
+    order = np.lexsort((-closures.matches, -closures.inliers, np.isnan(closures.residual_after), ~used))
+    return sorted(order[: min(max(2 * int(used.sum()), _LEAST_VIEWS), _MOST_VIEWS)].tolist())
+
+
+def view_closures(
+    rows: Sequence[int], inputs: ClosureInputs, closures: Closures, verify: VerifySettings, execution: Execution
+) -> dict[int, dict[str, Any]]:
+    """Matches of the strongest features, boxes and votes of ledger rows, see `closure_views.view`.
+
+    A keyframe's features search the library once.
+    """
+    state, matching = inputs.state, verify.matching
+    strongest = matching.model_copy(update={"features": min(matching.first_look, matching.features)})
+    verify = verify.model_copy(update={"matching": strongest})
+    ends = {row: (int(closures.query[row]), int(closures.match[row])) for row in rows}
+    shared: dict[int, list[tuple[int, Floats, Floats]]] = {row: [] for row in rows}
+    votes: dict[tuple[int, int], Floats] = {}
+    if isinstance(state, BoxState):
+        for row, pair in ends.items():
+            mine, theirs = (inputs.places[node] for node in pair)
+            found = find_boxes(state, mine, theirs, closures.shared_references[row].tolist())[:_PANELS]
+            shared[row] = [(one.reference, one.query_boxes, one.match_boxes) for one in found]
+        wanted = sorted({(node, boxes[0][0]) for row, boxes in shared.items() if boxes for node in ends[row]})
+        groups = [(node, [reference for _, reference in some]) for node, some in groupby(wanted, lambda one: one[0])]
+        maps = execution.map(lambda one: state.voting_maps(_strongest(inputs.features(one[0])), one[1]), groups)
+        votes = dict(zip(wanted, chain.from_iterable(maps), strict=True))
+
+    def one(row: int) -> dict[str, Any]:
+        query, match = map(inputs.features, ends[row])
+        pose, inliers, boxes = closures.match_from_query[row], int(closures.inliers[row]), shared[row]
+        found = find_agreement(query, match, pose, inliers, inputs.camera, verify)
+        here, there = (
+            (points + 0.5) / (features.width, features.height)
+            for points, features in ((found.query, query), (found.match, match))
+        )
+        voted = [votes[node, boxes[0][0]] for node in ends[row]] if boxes else []
+        return closure_views.view(here, there, found.agrees, boxes, voted)
+
+    return dict(zip(rows, execution.map(one, rows), strict=True))
 
 
 def earth_of(trajectory: Trajectory, gps: Gps | None, solved: dict[str, Any] | None) -> Earth | None:
