@@ -174,7 +174,7 @@ def run(
         staged_run(out, head, files_of(path), library, topics, cache=cache) as folder,
         Steps(path, cache.folder or (out if cache.use else folder) / CACHE, execution, use_cache=cache.use) as do,
     ):
-        odometry, camera, selected = do(read, log, topics, pipeline.keyframes)
+        odometry, camera, selected = do(read, log, topics, pipeline.keyframes, pipeline.gps.use)
         features = do(extract, log, topics, selected, pipeline)
         keyframes = decoded(selected, features, pipeline.features)
         decisions = read_decisions(Path(pipeline.decisions.file), keyframes) if pipeline.decisions.file else None
