@@ -37,10 +37,11 @@ _UNCALIBRATED = (
 _FOCAL_LENGTH = 1.2
 """Focal length of a camera that is not calibrated as a share of the longer side of its images: COLMAP's, a field of view
 of 45 degrees; phones have some 0.8 to 1.2."""
-_UNIT = (
-    "A single camera has no metres: lengths of this run are in a unit of its own, about a tenth of the distance of what "
-    "is seen, and its scale wanders. %s"
+UNIT = (
+    "A single camera has no metres: lengths are in a unit of its own, about a tenth of the distance of what is seen, and "
+    "its scale wanders."
 )
+"""Said where the scale is unknown."""
 _SPEED = 0.05
 """Units a second of a motion that is not known: a keyframe a second, the least spacing."""
 _SAMPLES = 8
@@ -75,13 +76,13 @@ def _with_scale(odometry: Odometry, log: Log, camera: Camera, use_gps: bool) -> 
     if _is_unknown(odometry):
         return odometry
     if gps is None:
-        _log.warning(_UNIT, "`vplog evaluate` aligns it with a scale.")
+        _log.warning("%s `vplog evaluate` aligns with a scale.", UNIT)
     elif not use_gps:
-        _log.warning(_UNIT, "--gps takes metres from the fixes.")
+        _log.warning("%s --gps takes metres from the fixes.", UNIT)
     elif (found := in_metres(odometry, gps, camera)) is not None:
         return found
     else:
-        _log.warning(_UNIT, "The fixes do not go far enough for one in metres.")
+        _log.warning("%s The fixes do not go far enough for metres.", UNIT)
     return odometry
 
 
@@ -100,16 +101,40 @@ def _assumed(camera: Camera) -> Camera:
     return replace(camera, matrix=np.array([[focal_px, 0.0, x], [0.0, focal_px, y], [0.0, 0.0, 1.0]]))
 
 
-def gives_visual(log: Log) -> Literal["metric", "unknown", ""]:
-    """The scale of a log's visual odometry: metric by a calibrated camera with depth or a stereo pair, unknown by another
-    camera; empty without images that may follow each other, as pictures in a folder whose names are no times."""
+def is_metric(log: Log) -> bool:
+    """Whether there is a calibrated camera with depth or a stereo pair."""
     with suppress(LogError):  # no images
-        if log.camera().matrix is not None and log.has_depth():
-            return "metric"
+        return log.camera().matrix is not None and log.has_depth()
+    return False
+
+
+def gives_visual(log: Log) -> bool:
+    """Whether there are images by which a run computes its odometry unasked: of any camera, but no pictures of a folder
+    whose names hold no times, which need not follow each other."""
+    with suppress(LogError):  # no images
         stamp_ns = log.stamps()
-        timed = log.file_names() is None or not np.array_equal(stamp_ns, np.arange(len(stamp_ns)) * PERIOD_NS)
-        return "unknown" if timed and len(stamp_ns) > 1 else ""
-    return ""
+        pictures = log.file_names() is not None and np.array_equal(stamp_ns, np.arange(len(stamp_ns)) * PERIOD_NS)
+        return is_metric(log) or (len(stamp_ns) > 1 and not pictures)
+    return False
+
+
+def check_metric(log: Log, topics: TopicChoice) -> None:
+    """Raise LogError where a drive has no metres, or no odometry at all, so that no other drive is joined with it."""
+    if source_of(log, topics) == "visual" and not is_metric(log):
+        raise LogError(
+            f"{log.name}: the visual odometry of a single camera has no metres, so no other drive is joined with it. Run "
+            "it by itself, or give its poses by --odometry-file."
+        )
+
+
+def about_assumed(camera: Camera) -> str:
+    """What is assumed of a camera that is not calibrated."""
+    focal_px = undistort.focal_px(_assumed(camera))
+    return (
+        f"Camera {camera.name} is not calibrated: a focal length of {focal_px:.0f} px ({_FOCAL_LENGTH} times the longer "
+        "side of its images), its centre in their middle, and no distortion are assumed. --calibration takes one from a "
+        "file."
+    )
 
 
 def source_of(log: Log, topics: TopicChoice) -> Literal["log", "visual", "lidar"]:
@@ -125,7 +150,7 @@ def source_of(log: Log, topics: TopicChoice) -> Literal["log", "visual", "lidar"
     if topics.odometry == "visual":
         log.camera()  # raises where there are no images
         return "visual"
-    if topics.odometry is None and gives_visual(log) == "metric":
+    if topics.odometry is None and is_metric(log):
         return "visual"
     if log.lidar() is not None:
         return "lidar"
@@ -149,15 +174,10 @@ def by_images(log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], *
     of which nothing is known, else raises LogError."""
     if unasked:
         _log.warning("The log has no odometry, so visual odometry of its images is used (--odometry visual).")
-    stamp_ns, camera = log.stamps(), log.camera()
-    metric = camera.matrix is not None and log.has_depth()
+    stamp_ns, camera, metric = log.stamps(), log.camera(), is_metric(log)
     if camera.matrix is None:
+        _log.warning(about_assumed(camera))
         camera = _assumed(camera)
-        _log.warning(
-            "Camera %s is not calibrated: a focal length of %.0f px (%.1f times the longer side of its images), its "
-            "centre in their middle, and no distortion are assumed. --calibration takes one from a file.",
-            camera.name, undistort.focal_px(camera), _FOCAL_LENGTH,
-        )  # fmt: skip
     odometry = visual_odometry(_decoded(log, stamp_ns, execution), camera, metric)
     if odometry is None and metric:
         raise LogError(
