@@ -232,7 +232,7 @@ class RecordedLog:
             masks.check(content.stamp_ns.tolist(), size, notes)
         body = self._body
         named = body and frame and content.tree.between(body, frame) is not None
-        visual = camera.matrix is not None and self._selection.has_depth
+        visual = camera.matrix is not None or self._contents.names is None
         if known is not None and known.body_from_camera is not None and not named:
             camera = replace(camera, body_from_camera=known.body_from_camera)
         elif self.odometry() is not None or content.chosen.lidar is not None or visual:

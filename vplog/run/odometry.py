@@ -44,6 +44,8 @@ UNIT = (
 """Said where the scale is unknown."""
 _SPEED = 0.05
 """Units a second of a motion that is not known: a keyframe a second, the least spacing."""
+_SHORTEST = 1.0
+"""Units of its way, at least: 20 keyframes of a short drive."""
 _SAMPLES = 8
 """Scans over the drive by which the range of the lidar is chosen."""
 _NAMED = 4
@@ -220,7 +222,8 @@ def by_lidar(log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], *,
 def _unknown(stamp_ns: np.ndarray) -> Odometry:
     """A motion of which nothing is known, with a break at every frame, by which keyframes are evenly spread in time."""
     poses = np.tile(np.eye(4), (len(stamp_ns), 1, 1))
-    poses[:, 0, 3] = (stamp_ns - stamp_ns[0]) / 1e9 * _SPEED
+    seconds = (stamp_ns - stamp_ns[0]) / 1e9
+    poses[:, 0, 3] = seconds * max(_SPEED, _SHORTEST / seconds[-1])
     covariance = np.tile(np.eye(6), (len(stamp_ns), 1, 1))
     return Odometry(stamp_ns, poses, covariance, breaks=np.arange(1, len(stamp_ns)), metric=False)
 
