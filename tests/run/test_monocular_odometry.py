@@ -174,7 +174,13 @@ def test_places_are_recognised_where_nothing_can_be_tracked(tmp_path: Path) -> N
     folder.mkdir()
     for row in range(12):
         assert cv2.imwrite(str(folder / f"{1000 + row}.0.png"), pictures.texture(20 * (row % 10)))
-    settings = ("library.size=8", "keyframes.sparseness=1", "propose.gap_steps=0", "pictures.closures=0", "pictures.megapixels=0")
+    settings = (
+        "library.size=8",
+        "keyframes.sparseness=1",
+        "propose.gap_steps=0",
+        "pictures.closures=0",
+        "pictures.megapixels=0",
+    )
     done = run(folder, tmp_path / "run", load_pipeline("quick", settings))
     assert done.record["scale"] == "unknown"
     assert (tmp_path / "run" / "report.html").exists()

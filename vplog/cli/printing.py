@@ -167,7 +167,9 @@ def _outcome_text(outcome: Outcome, record: dict[str, Any]) -> str:
     causes = [f"{plural(outcome.closures, 'closure')} at {plural(outcome.places, 'place')}"] if outcome.closures else []
     causes += ["the satellite fixes"] if record["gps"] else []
     unit = "m" if record.get("scale") != "unknown" else "units (its scale is unknown)"
-    return f"the trajectory moved by up to {outcome.moved_m:.2f} {unit}{', by ' if causes else ''}{' and '.join(causes)}"
+    return (
+        f"the trajectory moved by up to {outcome.moved_m:.2f} {unit}{', by ' if causes else ''}{' and '.join(causes)}"
+    )
 
 
 def print_joint(out: Path, record: dict[str, Any]) -> None:

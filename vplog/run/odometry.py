@@ -35,11 +35,11 @@ _UNCALIBRATED = (
     "Record its camera_info, or name it with --camera-info-topic."
 )
 _FOCAL_LENGTH = 1.2
-"""Focal length of a camera that is not calibrated as a share of the longer side of its images: COLMAP's, a field of view
-of 45 degrees; phones have some 0.8 to 1.2."""
+"""Focal length of a camera that is not calibrated as a share of the longer side of its images: COLMAP's, a field of
+view of 45 degrees; phones have some 0.8 to 1.2."""
 UNIT = (
-    "A single camera has no metres: lengths are in a unit of its own, about a tenth of the distance of what is seen, and "
-    "its scale wanders."
+    "A single camera has no metres: lengths are in a unit of its own, about a tenth of the distance of what is seen, "
+    "and its scale wanders."
 )
 """Said where the scale is unknown."""
 _SPEED = 0.05
@@ -124,8 +124,8 @@ def check_metric(log: Log, topics: TopicChoice) -> None:
     """Raise LogError where a drive has no metres, or no odometry at all, so that no other drive is joined with it."""
     if source_of(log, topics) == "visual" and not is_metric(log):
         raise LogError(
-            f"{log.name}: the visual odometry of a single camera has no metres, so no other drive is joined with it. Run "
-            "it by itself, or give its poses by --odometry-file."
+            f"{log.name}: the visual odometry of a single camera has no metres, so no other drive is joined with it. "
+            "Run it by itself, or give its poses by --odometry-file."
         )
 
 
@@ -133,9 +133,9 @@ def about_assumed(camera: Camera) -> str:
     """What is assumed of a camera that is not calibrated."""
     focal_px = undistort.focal_px(_assumed(camera))
     return (
-        f"Camera {camera.name} is not calibrated: a focal length of {focal_px:.0f} px ({_FOCAL_LENGTH} times the longer "
-        "side of its images), its centre in their middle, and no distortion are assumed. --calibration takes one from a "
-        "file."
+        f"Camera {camera.name} is not calibrated: a focal length of {focal_px:.0f} px ({_FOCAL_LENGTH} times the "
+        "longer side of its images), its centre in their middle, and no distortion are assumed. --calibration takes "
+        "one from a file."
     )
 
 
@@ -188,9 +188,9 @@ def by_images(log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], *
         )
     if odometry is None:
         _log.warning(
-            "No two of %d frames could be tracked: too few corners, too little in common from one frame to the next, or "
-            "a camera that only turns. Nothing is known of the motion: only the places recognised mean something, and "
-            "the trajectory does not. --odometry-file takes poses from a file.",
+            "No two of %d frames could be tracked: too few corners, too little in common from one frame to the next, "
+            "or a camera that only turns. Nothing is known of the motion: only the places recognised mean something, "
+            "and the trajectory does not. --odometry-file takes poses from a file.",
             len(stamp_ns),
         )
         return _unknown(stamp_ns)

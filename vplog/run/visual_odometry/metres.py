@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -49,7 +50,7 @@ def in_metres(odometry: Odometry, gps: Gps, camera: Camera) -> Odometry | None:
     breaks = odometry.breaks if odometry.breaks is not None else np.zeros(0, np.int64)
     bounds = np.concatenate([[0], breaks, [len(poses)]]).tolist()
     sigma_m = _sigma_m(gps)
-    ways = [_way(odometry.stamp_ns[a:b], poses[a:b], gps, sigma_m) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    ways = [_way(odometry.stamp_ns[a:b], poses[a:b], gps, sigma_m) for a, b in pairwise(bounds)]
     found = [_log_scale(way, sigma_m) if len(way.stamp_ns) >= _LEAST else None for way in ways]
     known = [one for one in found if one is not None]
     if not known:
@@ -60,18 +61,24 @@ def in_metres(odometry: Odometry, gps: Gps, camera: Camera) -> Odometry | None:
         if one is not None:
             middle = (way.stamp_ns[1:] - odometry.stamp_ns[0] + way.stamp_ns[:-1] - odometry.stamp_ns[0]) / 2.0
             log_scale[a:b] = np.interp(odometry.stamp_ns[a:b] - odometry.stamp_ns[0], middle, one)
-    scale = np.exp(log_scale)
+    return replace(scaled(odometry, np.exp(log_scale), camera), metric=True)
+
+
+def scaled(odometry: Odometry, scale: Floats, camera: Camera) -> Odometry:
+    """Odometry whose steps to each sample are multiplied (T,), those of the camera, as its place on the body is in
+    metres."""
+    lever = camera.body_from_camera
+    poses = se3.inverse(lever) @ odometry.odom_from_body @ lever
     steps = np.diff(poses[:, :3, 3], axis=0) * scale[1:, None]
-    steps[breaks - 1] = 0.0
-    scaled = poses.copy()
-    scaled[1:, :3, 3] = poses[0, :3, 3] + np.cumsum(steps, axis=0)
+    if odometry.breaks is not None:
+        steps[odometry.breaks - 1] = 0.0
+    poses[1:, :3, 3] = poses[0, :3, 3] + np.cumsum(steps, axis=0)
     covariance = odometry.covariance
     if covariance is not None:
         covariance = covariance.copy()
         covariance[:, 3:] *= scale[:, None, None]
         covariance[:, :, 3:] *= scale[:, None, None]
-    body = lever @ scaled @ se3.inverse(lever)
-    return replace(odometry, odom_from_body=body, covariance=covariance, metric=True)
+    return replace(odometry, odom_from_body=lever @ poses @ se3.inverse(lever), covariance=covariance)
 
 
 def _sigma_m(gps: Gps) -> float:

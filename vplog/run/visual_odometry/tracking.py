@@ -109,9 +109,7 @@ def track(reference: Reference, frame: Frame, guess: Floats, sensor: Sensor) -> 
     return None if motion is None else (extended, motion)
 
 
-def _with_unplaced(
-    motion: Motion, reference: Reference, rows: np.ndarray, observed: Points, sensor: Sensor
-) -> Motion:
+def _with_unplaced(motion: Motion, reference: Reference, rows: np.ndarray, observed: Points, sensor: Sensor) -> Motion:
     """The motion with further points: those of the reference without a depth that were followed along the epipolar
     line of the motion."""
     R, t = motion.reference_from_camera[:3, :3], motion.reference_from_camera[:3, 3]
