@@ -52,7 +52,7 @@ def test_two_views_give_motion_and_depths_but_for_a_unit() -> None:
     at, moved = cloud(), se3.exp(np.array([0.02, -0.05, 0.01, 0.6, 0.1, 0.8]))
     found = two_views(seen(at, np.eye(4), 1), seen(at, moved, 2), SENSOR.focal_px, 30)
     assert found is not None
-    unit = np.linalg.norm(found.first_from_second[:3, 3]) / np.linalg.norm(moved[:3, 3])
+    unit = float(np.linalg.norm(found.first_from_second[:3, 3]) / np.linalg.norm(moved[:3, 3]))
     off = se3.between(moved, se3.stretched(found.first_from_second, 1.0 / unit))
     assert np.degrees(se3.angle(off)) < 0.2
     assert np.linalg.norm(off[:3, 3]) < 0.05
@@ -78,7 +78,8 @@ def test_a_depth_is_as_sure_as_its_parallax() -> None:
     assert good.mean() > 0.95
     sigmas = (rho - 1.0 / at[:, 2])[good] / np.sqrt(variance[good])
     assert 0.3 < sigmas.std() < 1.2
-    by_parallax = rho_variance(at, views[:, :3, 3], np.isfinite(observed).all(axis=2), (2 * px) ** 2)
+    shown = np.asarray(np.isfinite(observed).all(axis=2))
+    by_parallax = rho_variance(at, views[:, :3, 3], shown, (2 * px) ** 2)
     np.testing.assert_allclose(variance[good], by_parallax[good], rtol=0.2)
 
 
@@ -123,7 +124,7 @@ def test_a_camera_that_turns_has_no_motion_and_one_that_goes_on_has() -> None:
     turned = []
     for step in range(8, 0, -1):
         H = matrix @ se3.so3_exp(np.array([0.0, 0.01 * step, 0.0])) @ np.linalg.inv(matrix)
-        image = cv2.warpPerspective(frames[0].image, H, size, borderMode=cv2.BORDER_REFLECT)
+        image = np.asarray(cv2.warpPerspective(frames[0].image, H, size, borderMode=cv2.BORDER_REFLECT), np.uint8)
         turned.append(replace(frames[0], stamp_ns=frames[0].stamp_ns - step * period_ns, image=image))
     assert visual_odometry(turned, frames[0].camera, metric=False) is None
     odometry = followed([*turned, *frames[:10]])
@@ -142,8 +143,8 @@ def test_it_goes_on_as_another_piece() -> None:
 
 
 def fixes_at(stamp_ns: np.ndarray, enu_m: Floats) -> Gps:
-    place = geodesy.geodetic(enu_m, (48.0, 8.0, 100.0))
-    return Gps(stamp_ns, *place.T, np.tile(np.eye(3), (len(stamp_ns), 1, 1)))
+    latitude, longitude, altitude = geodesy.geodetic(enu_m, (48.0, 8.0, 100.0)).T
+    return Gps(stamp_ns, latitude, longitude, altitude, np.tile(np.eye(3), (len(stamp_ns), 1, 1)))
 
 
 def test_fixes_give_metres_to_a_scale_that_wanders() -> None:

@@ -132,8 +132,8 @@ def evaluate_poses(
 
 
 def _stretched(
-    keyframes: Keyframes, world_from_body: Floats, covariance: Floats | None, ledger: Closures, scale: float
-) -> tuple[Keyframes, Floats, Floats | None, Closures]:
+    keyframes: Keyframes, world_from_body: Floats, covariance: Floats, ledger: Closures, scale: float
+) -> tuple[Keyframes, Floats, Floats, Closures]:
     """A run in units of its own as one whose lengths are multiplied."""
     units = np.array([1.0, 1.0, 1.0, scale, scale, scale])
     ledger = replace(
@@ -142,7 +142,7 @@ def _stretched(
         information=ledger.information / np.outer(units, units),
     )
     keyframes = replace(keyframes, odom_from_body=se3.stretched(keyframes.odom_from_body, scale))
-    covariance = None if covariance is None else covariance * np.outer(units, units)
+    covariance = covariance * np.outer(units, units)
     return keyframes, se3.stretched(world_from_body, scale), covariance, ledger
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from vplog.features.extraction import describe
 from vplog.features.matching import MatchSettings, match_features
@@ -180,7 +180,7 @@ def _placed(points: Points) -> Points:
     known = np.isfinite(points.rho)
     if known.all() or not known.any():
         return points
-    _, nearest = cKDTree(points.px[known]).query(points.px[~known])
+    _, nearest = KDTree(points.px[known]).query(points.px[~known])
     rho = points.rho.copy()
     rho[~known] = points.rho[known][nearest]
     return replace(points, rho=rho)

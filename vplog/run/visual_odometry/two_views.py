@@ -119,7 +119,7 @@ def rho_of(rays: Floats, observed: Floats, views: Floats, px: float) -> tuple[Fl
     `observed` (V, K, 2) are the rays in the views, NaN where they do not show it; `views` (V, 4, 4) view_from_camera.
     u (a_z + rho t_z) = a_xy + rho t_xy is linear in rho.
     """
-    shown = np.isfinite(observed).all(axis=2)
+    shown: Bools = np.asarray(np.isfinite(observed).all(axis=2))
     seen = np.where(shown[..., None], observed, 0.0)
     turned = np.column_stack([rays, np.ones(len(rays))]) @ np.swapaxes(views[:, :3, :3], 1, 2)
     moved = views[:, None, :3, 3]

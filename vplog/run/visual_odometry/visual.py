@@ -230,7 +230,7 @@ class _Tracker:
         """The points that have a ray, and a depth where there are any."""
         points = self.sensor.measure(frame, px)
         known = np.isfinite(points.noise).all(axis=(1, 2)) & np.isfinite(points.rays).all(axis=1)
-        return points.rows(known & np.isfinite(points.rho) if self.sensor.metric else known)
+        return points.rows(np.flatnonzero(known & np.isfinite(points.rho) if self.sensor.metric else known))
 
     def _place(self, view: _View, ids: np.ndarray, points: Points) -> None:
         """Landmarks where the view that first shows them measures them; without depth, where the window's views make
@@ -322,7 +322,7 @@ class _Tracker:
         known = np.isfinite(at[:, 2])
         rays, rho, variance = points.rays.copy(), np.full(len(ids), np.nan), np.full(len(ids), np.nan)
         rays[known], rho[known] = at[known, :2] / at[known, 2:], 1.0 / at[known, 2]
-        shown = np.isfinite(self._observed(ids[known])).all(axis=2)
+        shown = np.asarray(np.isfinite(self._observed(ids[known])).all(axis=2))
         ray_variance = (self.sensor.pixel_sigma / self.sensor.focal_px) ** 2
         variance[known] = rho_variance(at[known], centres, shown, ray_variance)
         return replace(points, rays=rays, rho=rho, variance=variance)
