@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import pytest
 
-from vplog.data import Camera, Frame, Gps, Odometry
+from vplog.data import Camera, Frame, Gps, Keyframes, Odometry
 from vplog.demo.scene import make_scene, take_picture
 from vplog.demo.settings import DemoSettings
 from vplog.geometry import geodesy, se3
 from vplog.pipeline import load_pipeline, run
+from vplog.results import run_record
+from vplog.run.scale_drift import in_one_scale
 from vplog.run.visual_odometry.metres import in_metres
 from vplog.run.visual_odometry.sensor import Sensor
 from vplog.run.visual_odometry.two_views import UNIT_DEPTH, rho_of, rho_variance, two_views
 from vplog.run.visual_odometry.visual import visual_odometry
 from vplog.testing import pictures
+from vplog.verbs.evaluate_run import TruthOptions, evaluate
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vplog.data import Floats
+    from vplog.demo.record import Drive
     from vplog.run.visual_odometry.sensor import Points
 
 SENSOR = Sensor(Camera("camera", np.array([[500, 0, 320], [0, 500, 240], [0, 0, 1.0]]), "none", np.zeros(0), 640, 480,
@@ -190,3 +194,36 @@ def test_places_are_recognised_where_nothing_can_be_tracked(tmp_path: Path) -> N
     pairs = zip(done.closures.query.tolist(), done.closures.match.tolist(), strict=True)
     assert {(10, 0), (11, 1)} <= set(pairs)
     assert not done.closures.accepted.any()
+
+
+def test_the_ratios_of_closures_give_one_scale() -> None:
+    """A unit that shrinks to a half along a lap, seen by closures between its ends of which a fifth is false."""
+    rng, count = np.random.default_rng(3), 200
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[1:, 0, 3] = np.cumsum(np.linspace(1.0, 2.0, count - 1))
+    stamp_ns = np.arange(count, dtype=np.int64) * 10**9
+    odometry = Odometry(stamp_ns, poses, None, breaks=np.zeros(0, np.int64), metric=False)
+    query, match = np.arange(180, 200), np.arange(20)
+    logs = np.log(np.interp(match, [0, count], [1.0, 2.0]) / np.interp(query, [0, count], [1.0, 2.0]))
+    logs = logs + rng.normal(0.0, 0.02, 20)
+    logs[::5] = 0.3
+    ratios = np.column_stack([query, match, logs, np.full(20, 0.02)]).astype(np.float64)
+    found, keyframes = in_one_scale(odometry, Keyframes("drive", stamp_ns, poses), SENSOR.camera, ratios)
+    steps = np.linalg.norm(np.diff(found.odom_from_body[:, :3, 3], axis=0), axis=1)
+    assert steps[-10:].mean() / steps[:10].mean() == pytest.approx(1.0, abs=0.1)
+    np.testing.assert_allclose(keyframes.odom_from_body, found.odom_from_body, atol=1e-9)
+
+
+def test_a_run_without_metres_is_evaluated_with_a_scale(finished: Path, drive: Drive, tmp_path: Path) -> None:
+    """The finished run, said to have a unit of its own."""
+    folder = Path(shutil.copytree(finished, tmp_path / "run"))
+    record = run_record.read_finished_run(folder)
+    assert record["scale"] == "metric"
+    run_record.write_run_json(folder / "run.json", record | {"scale": "unknown"})
+    found, known = (evaluate(one, str(drive.truth)) for one in (folder, finished))
+    assert (found["ate_after"]["alignment"], known["ate_after"]["alignment"]) == ("Sim(3)", "SE(3)")
+    assert found["scale"] == pytest.approx(1.0, abs=0.05)
+    assert found["ate_after"]["scale"] == pytest.approx(1.0)
+    assert known["scale"] is None
+    assert found["closures"]["accepted_true"] == known["closures"]["accepted_true"]
+    assert evaluate(folder, str(drive.truth), options=TruthOptions(align="se3"))["ate_after"]["alignment"] == "SE(3)"
