@@ -265,7 +265,7 @@ def evaluate(
 
     truth: a TUM file of poses, `gps`, the log's own fixes, or `auto`, the ground truth that comes with the log.
     distance_m, heading_deg: bounds of one place; 6 m and 45 degrees unless given.
-    align: alignment of the ATE, `se3`, `sim3` or `origin`.
+    align: alignment of the ATE, `se3`, `sim3` or `origin`; unless given `se3`, or `sim3` of a run without metres.
     truth_offset_s: added to the truth's stamps.
     """
     from vplog.storage.remote_path import local_copy, located

@@ -85,6 +85,8 @@ class Odometry:
     breaks: Ints | None = None
     """Rows whose motion since the row before is not known, as where visual odometry lost its track: the pose is held.
     None without any."""
+    metric: bool = True
+    """Not where lengths are in a unit of its own, as those of one camera without depth."""
 
 
 RECEIVER_SIGMA_M = 3.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ from vplog.run.outputs import Run, finish, report, write
 from vplog.run.place_recognition import describe, find_candidates
 from vplog.run.reference_library import check_library, cover, given_references, learn, own_images, own_references
 from vplog.run.run_folder import CacheOptions, staged_run
+from vplog.run.scale_drift import in_one_scale, scale_ratios
 from vplog.run.verification import DriveFeatures, verify
 from vplog.settings import Settings, load_yaml, override
 
@@ -147,10 +149,11 @@ def pipeline_folder() -> Path:
 
 
 STAGES = (
-    "read", "extract", "choose", "learn", "cover", "describe", "propose", "verify", "p_false", "decide", "solve",
-    "write", "report",
+    "read", "extract", "choose", "learn", "cover", "describe", "propose", "scale", "verify", "p_false", "decide",
+    "solve", "write", "report",
 )  # fmt: skip
-"""Names of the steps of `run` in order, as run.json and progress have them; `decide` is for decisions alone."""
+"""Names of the steps of `run` in order, as run.json and progress have them; `scale` is for drives without metres and
+`decide` for decisions alone."""
 
 
 def run(
@@ -175,7 +178,7 @@ def run(
         staged_run(out, head, files_of(path), library, topics, cache=cache) as folder,
         Steps(path, cache.folder or (out if cache.use else folder) / CACHE, execution, use_cache=cache.use) as do,
     ):
-        odometry, camera, selected = do(read, log, topics, pipeline.keyframes)
+        odometry, camera, selected = do(read, log, topics, pipeline.keyframes, pipeline.gps.use)
         features = do(extract, log, topics, selected, pipeline)
         keyframes = decoded(selected, features, pipeline.features)
         decisions = read_decisions(Path(pipeline.decisions.file), keyframes) if pipeline.decisions.file else None
@@ -191,6 +194,9 @@ def run(
         descriptors = do(describe, state, log, features)
         proposals = do(find_candidates, state, descriptors, keyframes, pipeline.propose, pipeline.sequence)
         drive = DriveFeatures(keyframes, camera, features, pipeline.verify)
+        if not odometry.metric:
+            odometry, keyframes = in_one_scale(odometry, keyframes, camera, do(scale_ratios, proposals, drive))
+            drive = replace(drive, keyframes=keyframes)
         closures = do(verify, proposals, drive)
         views = [View.of(log, drive, descriptors), *do(describe_cameras, views, state)]
         closures = do(verify_cameras, closures, views, state, pipeline)

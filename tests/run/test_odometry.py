@@ -15,7 +15,7 @@ from vplog.errors import LogError
 from vplog.execution.execution import Execution
 from vplog.graph.noise import NoiseSettings, broken_edges, edge_covariance
 from vplog.pipeline import load_pipeline, run
-from vplog.run.odometry import source_of
+from vplog.run.odometry import check_metric, source_of
 from vplog.testing import pictures
 from vplog.verbs.evaluate_run import evaluate
 from vplog.verbs.info import preflight, preflight_lines
@@ -81,8 +81,11 @@ def test_it_is_taken_where_the_log_has_no_other() -> None:
     assert source_of(log, logs.TopicChoice()) == source_of(log, VISUAL) == "visual"
     with pytest.raises(LogError, match="no odometry"):
         source_of(log, logs.TopicChoice(odometry="gps"))
-    with pytest.raises(LogError, match="needs a calibrated camera with depth images or a stereo pair"):
-        source_of(replace(log, depth=False), VISUAL)
+    single = Calibrated([np.zeros((9, 9), np.uint8)] * 2, depth=False)
+    assert source_of(single, logs.TopicChoice()) == source_of(single, VISUAL) == "visual"
+    with pytest.raises(LogError, match="no metres"):
+        check_metric(single, logs.TopicChoice())
+    check_metric(log, logs.TopicChoice())
 
 
 def test_nothing_is_known_of_the_motion_across_a_break() -> None:

@@ -145,7 +145,7 @@ def test_the_command_of_a_log_that_cannot_be_run_works_all_the_same(verb: Any, d
     assert preflight(two, parser.topics_of(main._parser().parse_args(words_of(broken["command"])))).record["ready"]
     assert "--image-topic /cam/image/compressed" in broken["command"]
     images = write_ros2(tmp_path / "images", [m for m in messages if m.topic == "/cam/image/compressed"])
-    record = preflight(images).record
+    record = preflight(images, TopicChoice(odometry="")).record
     assert words_of(record["command"])[0] == "library"
     done = verb(*[str(tmp_path / "lib") if word == "OUT" else word for word in words_of(record["command"])])
     assert done.code == 0, done.err
@@ -190,7 +190,7 @@ def test_a_folder_of_images_with_files_beside_it(tmp_path: Path) -> None:
     assert why(record) == {"images": "used as camera"}
     assert (record["odometry"]["source"], record["odometry"]["path_m"]) == (str(poses), 6.0)
     assert f"--odometry-file {poses}" in record["command"]
-    assert "--odometry-file" in preflight(folder).record["problems"][0]
+    assert "--odometry-file" in preflight(folder, TopicChoice(odometry="")).record["problems"][0]
     poses.write_text("1001 0 0 0 0 0 0 1\n1002 2 0 0 0 0 0 1\n")
     short = preflight(folder, TopicChoice(odometry_file=poses)).record
     assert short["frames"]["keyframes"] == 2

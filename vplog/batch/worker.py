@@ -26,7 +26,7 @@ from vplog.pipeline import Pipeline
 from vplog.pipeline import run as run_alone
 from vplog.results import run_record, tables
 from vplog.run import provenance
-from vplog.run.odometry import gives_visual
+from vplog.run.odometry import check_metric, is_metric
 from vplog.run.run_folder import CacheOptions
 from vplog.storage.remote_path import located
 
@@ -136,6 +136,7 @@ def _compute(task: Task, path: Path) -> tuple[dict[str, Any], str, dict[str, Any
     execution, log = Execution(task.threads), logs.open(path, task.topics)
     if _is_pictures(log):
         return _write_pictures(task, path, log, execution), task.drive, {**task.record, layout.PICTURES: True}
+    check_metric(log, task.topics)
     options = CacheOptions(task.cache, use=task.cache is not None)
     done = run_alone(path, task.folder, task.pipeline, task.library, task.topics, execution, options)
     return done.record, done.keyframes.drive, task.record
@@ -144,7 +145,7 @@ def _compute(task: Task, path: Path) -> tuple[dict[str, Any], str, dict[str, Any
 def _is_pictures(log: Log) -> bool:
     """Whether a log is a folder of images without odometry, or depth or scans that give one: these can be found again
     in a map, and no more than that."""
-    computed = gives_visual(log) or log.lidar() is not None
+    computed = is_metric(log) or log.lidar() is not None
     return log.file_names() is not None and log.odometry() is None and not computed
 
 

@@ -170,7 +170,10 @@ def _outcome_text(outcome: Outcome, record: dict[str, Any]) -> str:
         return f"the trajectory is the odometry's. {record['solution']['reason'].strip()}"
     causes = [f"{plural(outcome.closures, 'closure')} at {plural(outcome.places, 'place')}"] if outcome.closures else []
     causes += ["the satellite fixes"] if record["gps"] else []
-    return f"the trajectory moved by up to {outcome.moved_m:.2f} m{', by ' if causes else ''}{' and '.join(causes)}"
+    unit = "m" if record.get("scale") != "unknown" else "units (its scale is unknown)"
+    return (
+        f"the trajectory moved by up to {outcome.moved_m:.2f} {unit}{', by ' if causes else ''}{' and '.join(causes)}"
+    )
 
 
 def print_joint(out: Path, record: dict[str, Any]) -> None:
@@ -237,6 +240,11 @@ def print_evaluation(found: dict[str, Any]) -> None:
 def _truth_notes(found: dict[str, Any]) -> list[str]:
     """Warnings about the truth that bear on the figures."""
     truth, notes = found.get("truth_is"), []
+    if found.get("scale") is not None:
+        notes.append(
+            "The run has no metres of its own: Sim(3) alignment finds them, and all lengths and figures are multiplied "
+            f"by {found['scale']:.4g}."
+        )
     if truth is not None and truth["frame"] != "body":
         what = "the camera" if truth["frame"] == "camera" else "another point of the body, found by the odometry"
         notes.append(f"The truth is that of {what}: closures and drift are the body's, ATE and RPE are not.")

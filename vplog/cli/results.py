@@ -152,7 +152,9 @@ def _add_truth_options(verb: argparse.ArgumentParser) -> None:
     sub = verb.add_argument_group("places and alignment of the truth")
     option(sub, "--distance-m", parser.positive, "M", "largest distance within one place (default: 6)")
     option(sub, "--heading-deg", parser.positive, "DEG", "largest angle between optical axes (default: 45)")
-    sub.add_argument("--align", choices=_ALIGNMENTS, help="alignment of the ATE (default: se3)")
+    sub.add_argument(
+        "--align", choices=_ALIGNMENTS, help="alignment of the ATE (default: se3; sim3 of a run without metres)"
+    )
     option(sub, "--truth-offset-s", _seconds, "S", "add to the truth's stamps (default: 0)")
 
 

@@ -166,6 +166,13 @@ def _matrices(rows: list[list[Floats]]) -> Floats:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def stretched(poses: Floats, scale: float) -> Floats:
+    """Poses (..., 4, 4) with their translations multiplied."""
+    result = poses.copy()
+    result[..., :3, 3] *= scale
+    return result
+
+
 def umeyama(source: Floats, target: Floats, with_scale: bool = False) -> tuple[Floats, float]:
     """target_from_source (4, 4) and the scale that align points (T, 3) with least squares: Umeyama 1991, eq. 40-43."""
     mean_source, mean_target = source.mean(0), target.mean(0)

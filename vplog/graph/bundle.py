@@ -1,4 +1,4 @@
-"""Bundle adjustment of a window of views with landmarks of measured depth, by GTSAM."""
+"""Bundle adjustment of a window of views with landmarks, by GTSAM."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ class Bundle:
     """(6, 6) covariance of the last view's pose in the one before it, in the frame of the last."""
 
 
-def adjust(world_from_camera: Floats, points: Floats, observed: Observations) -> Bundle | None:
+def adjust(world_from_camera: Floats, points: Floats, observed: Observations, metric: bool = True) -> Bundle | None:
     """The views (W, 4, 4), the oldest fixed, and points (P, 3) that explain the observations best; None where these do
-    not determine them."""
+    not determine them. Without depths (not `metric`) the distance of the two oldest views, too, stays as it is."""
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for row, pose in enumerate(world_from_camera):
         start.insert(X(row), gtsam.Pose3(pose))
@@ -63,6 +63,10 @@ def adjust(world_from_camera: Floats, points: Floats, observed: Observations) ->
         start.insert(L(row), point)
     fixed = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED)
     graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(world_from_camera[0]), fixed))
+    if not metric:
+        apart = float(np.linalg.norm(world_from_camera[1][:3, 3] - world_from_camera[0][:3, 3]))
+        held = gtsam.noiseModel.Isotropic.Sigma(1, _FIXED * apart)
+        graph.add(gtsam.RangeFactorPose3(X(0), X(1), apart, held))
     _add_observations(graph, observed)
     settings = gtsam.LevenbergMarquardtParams()
     settings.setMaxIterations(_STEPS)

@@ -50,8 +50,11 @@ def edge_covariance(
     odometry: Odometry, keyframe_stamp_ns: Ints, settings: NoiseSettings
 ) -> tuple[Floats, list[str], str]:
     """`covariance_without_breaks`, but where the odometry breaks an edge may be any turn, and as long as the path."""
-    covariance, warnings, source = covariance_without_breaks(odometry, keyframe_stamp_ns, settings)
     edges = broken_edges(odometry, keyframe_stamp_ns)
+    if 0 < len(edges) == len(keyframe_stamp_ns) - 1:  # nothing is known of any
+        covariance, warnings, source = np.zeros((len(edges), 6, 6)), [], "unknown"
+    else:
+        covariance, warnings, source = covariance_without_breaks(odometry, keyframe_stamp_ns, settings)
     if len(edges):
         path_m = np.linalg.norm(np.diff(odometry.odom_from_body[:, :3, 3], axis=0), axis=1).sum()
         covariance[edges] = np.diag([*[np.pi**2 / 3] * 3, *[max(float(path_m), 1.0) ** 2] * 3])

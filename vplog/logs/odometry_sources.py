@@ -49,6 +49,7 @@ PROPERTIES = {
     "twist": "drifts by about 1 to 5 % of the way; knows neither slip nor, without a gyroscope, small turns",
     "gps": "does not drift, and is off by metres at any time; knows neither roll and pitch nor a heading at rest",
     "visual": "drifts by about 0.5 to 2 % of the way; breaks where images lack features, and goes on as another piece",
+    "monocular": "has no metres, and its scale wanders; breaks where the camera only turns, and goes on as a new piece",
     "lidar": "drifts by about 0.5 to 2 % of the way; lost along a tunnel, and goes on as another piece after a gap",
     "truth": "does not drift; an evaluation with it tells nothing about real odometry",
 }

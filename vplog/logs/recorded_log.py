@@ -166,7 +166,7 @@ class RecordedLog:
         given = [f"--odometry {source.topic}: {PROPERTIES[source.kind]}" for source in content.sources]
         wheels = [c.channel for c in self._candidates if c.count]
         given += [f"{needs} make odometry of {one.topic}" for one in wheels if (needs := wheel_options(one))]
-        given += ["--odometry visual needs a calibrated camera with depth or a stereo pair"]
+        given += ["--odometry visual takes the images to be a drive"] if self._selection.image else []
         clouds = [c.channel.topic for c in self._candidates if c.role == "lidar" and c.count]
         given += [f"--odometry lidar takes it from {clouds[0]}"] if clouds else []
         return "; ".join([*given, "--odometry-file takes poses from a file; `vplog library` needs none"]) + "."
@@ -243,7 +243,7 @@ class RecordedLog:
             masks.check(content.stamp_ns.tolist(), size, notes)
         body = self._body
         named = body and frame and content.tree.between(body, frame) is not None
-        visual = camera.matrix is not None and self._selection.has_depth
+        visual = camera.matrix is not None or self._contents.names is None
         if known is not None and known.body_from_camera is not None and not named:
             camera = replace(camera, body_from_camera=known.body_from_camera)
         elif self.odometry() is not None or content.chosen.lidar is not None or visual:

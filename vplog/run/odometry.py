@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -14,9 +15,12 @@ from vplog.cache.steps import Steps, step
 from vplog.data import Camera, Frame, Keyframes, Odometry
 from vplog.errors import LogError
 from vplog.geometry.masking import masked
+from vplog.logs.image_folder import PERIOD_NS
+from vplog.loops import undistort
 from vplog.run.feature_extraction import image_topics
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.run.lidar_odometry import lidar_odometry, range_of
+from vplog.run.visual_odometry.metres import in_metres
 from vplog.run.visual_odometry.visual import visual_odometry
 
 if TYPE_CHECKING:
@@ -30,6 +34,18 @@ _UNCALIBRATED = (
     "Camera %s is not calibrated, so no closure gets a metric pose: the trajectory is the odometry's. "
     "Record its camera_info, or name it with --camera-info-topic."
 )
+_FOCAL_LENGTH = 1.2
+"""Focal length of a camera that is not calibrated as a share of the longer side of its images: COLMAP's, a field of
+view of 45 degrees; phones have some 0.8 to 1.2."""
+UNIT = (
+    "A single camera has no metres: lengths are in a unit of its own, about a tenth of the distance of what is seen, "
+    "and its scale wanders."
+)
+"""Said where the scale is unknown."""
+_SPEED = 0.05
+"""Units a second of a motion that is not known: a keyframe a second, the least spacing."""
+_SHORTEST = 1.0
+"""Units of its way, at least: 20 keyframes of a short drive."""
 _SAMPLES = 8
 """Scans over the drive by which the range of the lidar is chosen."""
 _NAMED = 4
@@ -38,42 +54,111 @@ _NAMED = 4
 
 @step("read")
 def read(
-    log: Log, topics: TopicChoice, settings: KeyframeSettings, *, steps: Steps
+    log: Log, topics: TopicChoice, settings: KeyframeSettings, use_gps: bool = False, *, steps: Steps
 ) -> tuple[Odometry, Camera, Keyframes]:
-    """Odometry, camera and selected keyframes of a drive. Raises LogError where there is no odometry."""
+    """Odometry, camera and selected keyframes of a drive; fixes give metres where `use_gps`, and nothing else does.
+    Raises LogError where there is no odometry."""
     odometry = odometry_of(log, topics, steps)
+    camera = camera_of(log, topics)
+    if not odometry.metric:
+        odometry = _with_scale(odometry, log, camera, use_gps)
     selected, warnings = select_keyframes(log.name, log.stamps(), odometry, settings)
     for warning in warnings:
         _log.warning(warning)
-    if (camera := log.camera()).matrix is None:
+    if _is_unknown(odometry):
+        camera = replace(camera, matrix=None, distortion_model="none", distortion=np.zeros(0))
+    elif camera.matrix is None:
         _log.warning(_UNCALIBRATED, camera.name)
     return odometry, camera, selected
 
 
-def gives_visual(log: Log) -> bool:
+def _with_scale(odometry: Odometry, log: Log, camera: Camera, use_gps: bool) -> Odometry:
+    """Odometry in units of its own, in metres by fixes where that can be."""
+    gps = log.gps()
+    if _is_unknown(odometry):
+        return odometry
+    if gps is None:
+        _log.warning("%s `vplog evaluate` aligns with a scale.", UNIT)
+    elif not use_gps:
+        _log.warning("%s --gps takes metres from the fixes.", UNIT)
+    elif (found := in_metres(odometry, gps, camera)) is not None:
+        return found
+    else:
+        _log.warning("%s The fixes do not go far enough for metres.", UNIT)
+    return odometry
+
+
+def camera_of(log: Log, topics: TopicChoice) -> Camera:
+    """The camera of a run: that of the log, or where its motion is to be computed from images that nothing calibrates,
+    with the matrix that COLMAP assumes."""
+    camera = log.camera()
+    if camera.matrix is not None or source_of(log, topics) != "visual":
+        return camera
+    return _assumed(camera)
+
+
+def _assumed(camera: Camera) -> Camera:
+    focal_px = _FOCAL_LENGTH * max(camera.width, camera.height)
+    x, y = (camera.width - 1) / 2.0, (camera.height - 1) / 2.0
+    return replace(camera, matrix=np.array([[focal_px, 0.0, x], [0.0, focal_px, y], [0.0, 0.0, 1.0]]))
+
+
+def is_metric(log: Log) -> bool:
     """Whether there is a calibrated camera with depth or a stereo pair."""
     with suppress(LogError):  # no images
         return log.camera().matrix is not None and log.has_depth()
     return False
 
 
+def gives_visual(log: Log) -> bool:
+    """Whether there are images by which a run computes its odometry unasked: of any camera, but no pictures of a folder
+    whose names hold no times, which need not follow each other."""
+    with suppress(LogError):  # no images
+        stamp_ns = log.stamps()
+        pictures = log.file_names() is not None and np.array_equal(stamp_ns, np.arange(len(stamp_ns)) * PERIOD_NS)
+        return is_metric(log) or (len(stamp_ns) > 1 and not pictures)
+    return False
+
+
+def check_metric(log: Log, topics: TopicChoice) -> None:
+    """Raise LogError where a drive has no metres, or no odometry at all, so that no other drive is joined with it."""
+    if source_of(log, topics) == "visual" and not is_metric(log):
+        raise LogError(
+            f"{log.name}: the visual odometry of a single camera has no metres, so no other drive is joined with it. "
+            "Run it by itself, or give its poses by --odometry-file."
+        )
+
+
+def about_assumed(camera: Camera) -> str:
+    """What is assumed of a camera that is not calibrated."""
+    focal_px = undistort.focal_px(_assumed(camera))
+    return (
+        f"Camera {camera.name} is not calibrated: a focal length of {focal_px:.0f} px ({_FOCAL_LENGTH} times the "
+        "longer side of its images), its centre in their middle, and no distortion are assumed. --calibration takes "
+        "one from a file."
+    )
+
+
 def source_of(log: Log, topics: TopicChoice) -> Literal["log", "visual", "lidar"]:
     """The source of the odometry. Raises LogError where there is none at all.
 
-    Unasked, images come before a lidar: they need no transforms to a second sensor and no extra to be installed, so
-    that a log gives one result everywhere; and a cloud may be a depth camera's, which registers worse.
+    Unasked, images with depth come before a lidar: they need no transforms to a second sensor and no extra to be
+    installed, so that a log gives one result everywhere; and a cloud may be a depth camera's, which registers worse.
+    A single camera comes last, as it has no metres.
     """
     odometry = log.odometry()
     if odometry is not None and len(odometry.stamp_ns) > 1:
         return "log"
-    if topics.odometry in (None, "visual") and gives_visual(log):
-        return "visual"
-    if topics.odometry != "visual" and log.lidar() is not None:
-        return "lidar"
-    what = "has no odometry, and a trajectory is built on it"
     if topics.odometry == "visual":
-        what = "gives no visual odometry, which needs a calibrated camera with depth images or a stereo pair"
-    raise LogError(f"{log.name} {what}. {log.without_odometry()}")
+        log.camera()  # raises where there are no images
+        return "visual"
+    if topics.odometry is None and is_metric(log):
+        return "visual"
+    if log.lidar() is not None:
+        return "lidar"
+    if topics.odometry is None and gives_visual(log):
+        return "visual"
+    raise LogError(f"{log.name} has no odometry, and a trajectory is built on it. {log.without_odometry()}")
 
 
 def odometry_of(log: Log, topics: TopicChoice, steps: Steps) -> Odometry:
@@ -87,16 +172,28 @@ def odometry_of(log: Log, topics: TopicChoice, steps: Steps) -> Odometry:
 
 @step("odometry", lambda *_: json_codec(_from_plain, _plain), lambda log, *_: len(log.stamps()), ("log",))
 def by_images(log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], *, execution: Execution) -> Odometry:
-    """Visual odometry, its breaks noted. Raises LogError where tracking fails from the first frame to the last."""
+    """Visual odometry, its breaks noted. Where tracking fails from the first frame to the last: without depth a motion
+    of which nothing is known, else raises LogError."""
     if unasked:
         _log.warning("The log has no odometry, so visual odometry of its images is used (--odometry visual).")
-    stamp_ns = log.stamps()
-    odometry = visual_odometry(_decoded(log, stamp_ns, execution), log.camera())
-    if odometry is None:
+    stamp_ns, camera, metric = log.stamps(), log.camera(), is_metric(log)
+    if camera.matrix is None:
+        _log.warning(about_assumed(camera))
+        camera = _assumed(camera)
+    odometry = visual_odometry(_decoded(log, stamp_ns, execution), camera, metric)
+    if odometry is None and metric:
         raise LogError(
             f"{log.name}: no two of {len(stamp_ns)} frames could be tracked: too few corners with depth, or too little "
             "in common from one frame to the next. --odometry-file takes poses from a file."
         )
+    if odometry is None:
+        _log.warning(
+            "No two of %d frames could be tracked: too few corners, too little in common from one frame to the next, "
+            "or a camera that only turns. Nothing is known of the motion: only the places recognised mean something, "
+            "and the trajectory does not. --odometry-file takes poses from a file.",
+            len(stamp_ns),
+        )
+        return _unknown(stamp_ns)
     _log_breaks("Visual odometry", odometry, stamp_ns, "frames")
     return odometry
 
@@ -120,6 +217,20 @@ def by_lidar(log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], *,
         )
     _log_breaks(f"Odometry of {lidar.name}", odometry, stamp_ns, "scans")
     return odometry
+
+
+def _unknown(stamp_ns: np.ndarray) -> Odometry:
+    """A motion of which nothing is known, with a break at every frame, by which keyframes are evenly spread in time."""
+    poses = np.tile(np.eye(4), (len(stamp_ns), 1, 1))
+    seconds = (stamp_ns - stamp_ns[0]) / 1e9
+    poses[:, 0, 3] = seconds * max(_SPEED, _SHORTEST / seconds[-1])
+    covariance = np.tile(np.eye(6), (len(stamp_ns), 1, 1))
+    return Odometry(stamp_ns, poses, covariance, breaks=np.arange(1, len(stamp_ns)), metric=False)
+
+
+def _is_unknown(odometry: Odometry) -> bool:
+    """Whether it is `_unknown`."""
+    return not odometry.metric and odometry.breaks is not None and len(odometry.breaks) == len(odometry.stamp_ns) - 1
 
 
 def _decoded(log: Log, stamp_ns: np.ndarray, execution: Execution) -> Iterator[Frame]:
@@ -157,7 +268,7 @@ _ARRAYS = {"stamp_ns": np.int64, "odom_from_body": np.float64, "covariance": np.
 
 
 def _plain(odometry: Odometry) -> dict[str, Any]:
-    return {name: getattr(odometry, name).tolist() for name in _ARRAYS}
+    return {name: getattr(odometry, name).tolist() for name in _ARRAYS} | {"metric": odometry.metric}
 
 
 def _from_plain(tree: dict[str, Any]) -> Odometry:
@@ -165,4 +276,4 @@ def _from_plain(tree: dict[str, Any]) -> Odometry:
     count = len(arrays["stamp_ns"])
     if arrays["odom_from_body"].shape != (count, 4, 4) or arrays["covariance"].shape != (count, 6, 6):
         raise ValueError("poses and covariances do not fit the stamps")
-    return Odometry(**arrays)
+    return Odometry(**arrays, metric=bool(tree["metric"]))

@@ -160,6 +160,7 @@ def _results_record(run: Run) -> dict[str, Any]:
         },
         "losses": [asdict(loss) for loss in getattr(run.log, "losses", [])],
         "noise": run.solved.noise_source,
+        "scale": "metric" if run.odometry.metric else "unknown",
         "solution": {
             "error_before": solution.error_before,
             "error_after": solution.error_after,

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Floats, Gps, Keyframes, Trajectory
+from vplog.data import Closures, Floats, Gps, Keyframes, Trajectory
 from vplog.errors import ResultError, TruthError
 from vplog.evaluate import closures, trajectory
 from vplog.evaluate.body_truth import BodyTruth, body_truth
 from vplog.evaluate.closure_pose import pose_bounds
 from vplog.evaluate.truth import ate_to_gps, read_truth
+from vplog.geometry import se3
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.results import mcap_read, run_record, tables
 from vplog.run.provenance import reopened
@@ -31,10 +32,19 @@ _PUT_BACK = "Put it back there, or give a truth file: --truth FILE.tum."
 class TruthOptions(closures.PlaceCriterion):
     """Options of the comparison of a run with the truth."""
 
-    align: str = "se3"
-    """Alignment of the ATE, a name of `trajectory.ALIGNMENTS`."""
+    align: str = ""
+    """Alignment of the ATE, a name of `trajectory.ALIGNMENTS`; empty takes `se3`, or `sim3` of a run without metres."""
     truth_offset_s: float = 0.0
     """s added to the stamps of the truth, as evo's --t_offset."""
+
+    def of(self, record: dict[str, Any]) -> TruthOptions:
+        """With the alignment for the run of this record."""
+        return self if self.align else replace(self, align="se3" if has_metres(record) else "sim3")
+
+
+def has_metres(record: dict[str, Any]) -> bool:
+    """Whether the lengths of a run are metres, by its run.json."""
+    return record.get("scale") != "unknown"
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +68,8 @@ def evaluate(
 
     Raises TruthError or ResultError with one line.
     """
-    options = options or TruthOptions()
     record = run_record.read_finished_run(folder)
+    options = (options or TruthOptions()).of(record)
     if "maps" in record:
         return _joint(folder, record, truth, options)
     known = log_truth(record, topics, options) if truth == "auto" else None
@@ -82,19 +92,30 @@ def evaluate_poses(
     folder: Path, record: dict[str, Any], truth: str, options: TruthOptions, known: Trajectory | None = None
 ) -> Evaluation:
     """A run of one drive against a TUM file, or the poses `known` that were read from it. Raises as `evaluate`."""
+    options = options.of(record)
     known = _shifted(read_truth(truth), options) if known is None else known
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
+    scale = 1.0
+    if not has_metres(record):
+        scale = trajectory.ate(trajectory.at_truth(after, known)[0], known, alignment="sim3").scale
+        after = Trajectory(after.stamp_ns, se3.stretched(after.world_from_body, scale))
+        odometry = replace(odometry, odom_from_body=se3.stretched(odometry.odom_from_body, scale))
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     covariance = tables.read_keyframe_covariance(folder / "keyframes.parquet")
     ledger = tables.read_closures(folder / "closures.parquet")
     settings = run_record.recorded(record, folder / "run.json", dict, "settings", "propose")
     stops = candidate_stops(keyframes, ProposeSettings.read(settings, f"{folder}/run.json"))
+    if not has_metres(record):
+        keyframes, world_from_body, covariance, ledger = _stretched(
+            keyframes, world_from_body, covariance, ledger, scale
+        )
     camera = _camera(folder)
     of_body = body_truth(known, before, camera)
     score, judged = closures.score_closures(keyframes, ledger, of_body, stops, options, camera)
     found = {
         "truth": shown(truth),
+        "scale": None if has_metres(record) else scale,
         "truth_is": {
             "frame": of_body.frame,
             "oriented": of_body.oriented,
@@ -108,6 +129,21 @@ def evaluate_poses(
     if record.get("gps") is None:  # with GPS they are relative to earth, where the truth need not be
         found["poses"] = asdict(closures.score_poses(keyframes, world_from_body, covariance, of_body))
     return Evaluation(found, keyframes, of_body, judged)
+
+
+def _stretched(
+    keyframes: Keyframes, world_from_body: Floats, covariance: Floats, ledger: Closures, scale: float
+) -> tuple[Keyframes, Floats, Floats, Closures]:
+    """A run in units of its own as one whose lengths are multiplied."""
+    units = np.array([1.0, 1.0, 1.0, scale, scale, scale])
+    ledger = replace(
+        ledger,
+        match_from_query=se3.stretched(ledger.match_from_query, scale),
+        information=ledger.information / np.outer(units, units),
+    )
+    keyframes = replace(keyframes, odom_from_body=se3.stretched(keyframes.odom_from_body, scale))
+    covariance = covariance * np.outer(units, units)
+    return keyframes, se3.stretched(world_from_body, scale), covariance, ledger
 
 
 def _shifted(known: Trajectory, options: TruthOptions) -> Trajectory:
@@ -140,6 +176,7 @@ def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptio
     """
     if truth in ("gps", "auto"):
         raise TruthError(f"{folder} holds several drives; each has its own truth: vplog evaluate {folder}/DRIVE")
+    options = options.of(record)
     known = _shifted(read_truth(truth), options)
     drives: dict[str, Evaluation] = {}
     uncovered: dict[str, str] = {}

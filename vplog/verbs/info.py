@@ -24,7 +24,7 @@ from vplog.results.html import render
 from vplog.results.previews import jpeg
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.run.lidar_odometry import new_registration
-from vplog.run.odometry import gives_visual, source_of
+from vplog.run.odometry import UNIT, about_assumed, gives_visual, is_metric, source_of
 from vplog.run.visual_odometry.visual import visual_odometry
 from vplog.storage.json_records import plain
 from vplog.storage.remote_path import address
@@ -117,8 +117,12 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
     sampled, decoded = _sampled(log, stamp_ns, problems)
     computed = _computed(log, topics) if camera is not None and odometry is None else ""
     keyframes, missing = None, []
+    metric = camera is not None and is_metric(log)
     if computed == "visual" and camera is not None:
-        _check_moves(log.name, sampled, camera, problems)
+        if metric:
+            _check_moves(log.name, sampled, camera, problems)
+        elif camera.matrix is None:
+            missing = [about_assumed(camera)]
     elif computed == "lidar":
         with _noted(problems):
             new_registration(1.0)
@@ -146,7 +150,8 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
         "visual_odometry": _use(computed == "visual", camera is not None and gives_visual(log)),
         "lidar_odometry": _use(computed == "lidar", any(one.role == "lidar" and one.count for one in found.topics)),
         "gps": _about_gps(gps, found),
-        "scale": _scale(camera, found),
+        "scale": _scale(camera, found, computed, gps),
+        "visual_scale": "metric" if metric else "unknown",
         "gaps": _gaps(found, stamp_ns, odometry, gps),
         "losses": [asdict(loss) for loss in getattr(log, "losses", [])],
         "problems": problems,
@@ -343,11 +348,11 @@ def _about_gps(gps: Gps | None, found: LogInfo) -> dict[str, Any] | None:
     }
 
 
-def _scale(camera: Camera | None, found: LogInfo) -> dict[str, str]:
+def _scale(camera: Camera | None, found: LogInfo, computed: str, gps: Gps | None) -> dict[str, str]:
     """Source of the metres of a closure."""
     if camera is None:
         return {"source": "none", "why": "The log has no camera images."}
-    if camera.matrix is None:
+    if camera.matrix is None and computed != "visual":
         return {
             "source": "none",
             "why": "No calibration, so no closure gets a metric pose; give one with --calibration.",
@@ -357,6 +362,9 @@ def _scale(camera: Camera | None, found: LogInfo) -> dict[str, str]:
     unused = any(line.startswith("Depth is not used") for line in found.warnings)
     if not unused and any(topic.part == "depth" for topic in found.topics):
         return {"source": "depth", "why": "Depth images come with the camera's."}
+    if computed == "visual":
+        given = "nothing gives them; `vplog evaluate` aligns with a scale" if gps is None else "--gps takes them"
+        return {"source": "unknown", "why": f"{UNIT} {given[0].upper()}{given[1:]}."}
     return {"source": "odometry", "why": "A single camera has no scale: its metres are the odometry's."}
 
 
@@ -380,6 +388,7 @@ def _gaps(found: LogInfo, stamp_ns: Ints, odometry: Odometry | None, gps: Gps | 
 def preflight_lines(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """Name and text of each line: the parts of the log that a run would use."""
     camera, frames, odometry, gps = (found[name] for name in ("camera", "frames", "odometry", "gps"))
+    visual = "visual" if found["visual_scale"] == "metric" else "monocular"
     if camera is not None:
         matrix = camera["matrix"]
         model = "no distortion" if camera["distortion_model"] == "none" else camera["distortion_model"]
@@ -401,9 +410,9 @@ def preflight_lines(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "drift", odometry["properties"]
     if found["visual_odometry"] == "used":
         yield "odometry", "visual: the run computes it from the images"
-        yield "drift", PROPERTIES["visual"]
+        yield "drift", PROPERTIES[visual]
     elif found["visual_odometry"]:
-        yield "", f"--odometry visual: {PROPERTIES['visual']}"
+        yield "", f"--odometry visual: {PROPERTIES[visual]}"
     if found["lidar_odometry"] == "used":
         yield "odometry", "lidar: the run computes it from the scans"
         yield "drift", PROPERTIES["lidar"]

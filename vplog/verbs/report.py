@@ -25,7 +25,7 @@ from vplog.run.report import write_report
 from vplog.stages import BoxState
 from vplog.storage.remote_path import original
 from vplog.storage.urls import shown
-from vplog.verbs.evaluate_run import TruthOptions, evaluate, evaluate_poses, log_truth
+from vplog.verbs.evaluate_run import TruthOptions, evaluate, evaluate_poses, has_metres, log_truth
 
 if TYPE_CHECKING:
     from pyarrow import Array
@@ -71,15 +71,15 @@ def judge(
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     at, known, judged = found.truth.at(keyframes.stamp_ns), found.truth.trajectory, found.judged
     true, solved = at.world_from_body[at.known][:, :3, 3], world_from_body[at.known][:, :3, 3]
-    world_from_truth, _ = se3.umeyama(true, solved)
+    world_from_truth, units = se3.umeyama(true, solved, with_scale=not has_metres(record))
     # of the truth only what the drive covers, so that the map is that of the drive
     during = (known.stamp_ns >= keyframes.stamp_ns[0]) & (known.stamp_ns <= keyframes.stamp_ns[-1])
-    path = se3.transform(world_from_truth, known.world_from_body[during][:, :3, 3])
+    path = se3.transform(world_from_truth, units * known.world_from_body[during][:, :3, 3])
     error_m = np.full(len(keyframes.stamp_ns), np.nan)
-    error_m[at.known] = np.linalg.norm(se3.transform(world_from_truth, true) - solved, axis=1)
+    error_m[at.known] = np.linalg.norm(se3.transform(world_from_truth, units * true) - solved, axis=1) / units
     closures = tables.read_closures(folder / "closures.parquet")
     seen = se3.between(at.world_from_body[closures.match], at.world_from_body[closures.query])
-    apart_m = np.linalg.norm((seen - closures.match_from_query)[:, :3, 3], axis=1)
+    apart_m = np.linalg.norm((seen - se3.stretched(closures.match_from_query, 1.0 / units))[:, :3, 3], axis=1)
     return TruthComparison(
         Path(shown(truth)).name,
         found.record,

@@ -24,7 +24,7 @@ from vplog.pipeline import run as run_alone
 from vplog.results import g2o, run_record, tables
 from vplog.results.run_record import CACHE
 from vplog.run import provenance
-from vplog.run.odometry import source_of
+from vplog.run.odometry import check_metric
 from vplog.run.reference_library import build_library, check_library
 from vplog.run.run_folder import CacheOptions, staged_run
 from vplog.storage.folders import numbered
@@ -68,7 +68,7 @@ def run_joint(
         drives_at[numbered(log.name, log.name, {"library", *drives_at})] = path
     check_library(library, pipeline)
     for log in opened:  # before the first drive is computed
-        source_of(log, topics or logs.TopicChoice())
+        check_metric(log, topics or logs.TopicChoice())
     head = {**provenance.head(pipeline, paths[0], execution.threads), **provenance.logs_of(paths)}
     watch = StageTimer()
     with ExitStack() as stack:

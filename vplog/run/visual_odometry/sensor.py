@@ -1,4 +1,4 @@
-"""Measurements of one frame of an RGB-D or stereo camera: rays and inverse depths of its points."""
+"""Measurements of one frame: rays of its points, and their inverse depths where it has depth or a right image."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ class Points:
 
 
 class Sensor:
-    """A calibrated camera whose frames have depth or a right image."""
+    """A calibrated camera; `metric` where its frames have depth or a right image."""
 
-    def __init__(self, camera: Camera) -> None:
-        self.camera, self.focal_px = camera, undistort.focal_px(camera)
+    def __init__(self, camera: Camera, metric: bool = True) -> None:
+        self.camera, self.focal_px, self.metric = camera, undistort.focal_px(camera), metric
         noise, self._baseline_m = LandmarkSettings(), camera.baseline_m
         self._noise = noise if camera.baseline_m is None else for_stereo(noise, self.focal_px, camera.baseline_m)
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 
 from vplog.features.extraction import describe
 from vplog.features.matching import MatchSettings, match_features
@@ -30,6 +31,8 @@ _SPREAD = 0.6
 _SETTINGS = MetricSettings()
 _CHANCE = 3, 4
 """Points that fix a pose, and poses that they allow (P3P)."""
+_EPIPOLAR_PX = 3.0
+"""px by which a point without a depth may miss its epipolar line: four sigmas of a corner."""
 _SINGULAR = 1e12
 """Condition of the Hessian beyond which its inverse has no digit left that a sensor could have measured."""
 
@@ -94,13 +97,34 @@ def track(reference: Reference, frame: Frame, guess: Floats, sensor: Sensor) -> 
     for px in (_predicted(reference, guess, sensor), reference.points.px):
         found = follow(reference.frame.image, frame.image, reference.points.px, px)
         rows = np.flatnonzero(np.isfinite(found).all(axis=1))
-        if (motion := solve(reference, rows, sensor.measure(frame, found[rows]), sensor)) is not None:
-            return reference, motion
+        observed = sensor.measure(frame, found[rows])
+        if (motion := solve(reference, rows, observed, sensor)) is not None:
+            return reference, motion if sensor.metric else _with_unplaced(motion, reference, rows, observed, sensor)
+    if not sensor.metric:
+        return None
     first, second = rematch(reference.frame, frame, sensor)
     rows = len(reference.ids) + np.arange(len(first.px))
     extended = reference.extended(first)
     motion = solve(extended, rows, second, sensor)
     return None if motion is None else (extended, motion)
+
+
+def _with_unplaced(motion: Motion, reference: Reference, rows: np.ndarray, observed: Points, sensor: Sensor) -> Motion:
+    """The motion with further points: those of the reference without a depth that were followed along the epipolar
+    line of the motion."""
+    R, t = motion.reference_from_camera[:3, :3], motion.reference_from_camera[:3, 3]
+    sound = np.isfinite(observed.rays).all(axis=1) & np.isfinite(observed.noise).all(axis=(1, 2))
+    unplaced = np.flatnonzero(np.isnan(reference.points.rho[rows]) & sound)
+    first = np.column_stack([reference.points.rays[rows[unplaced]], np.ones(len(unplaced))])
+    second = np.column_stack([observed.rays[unplaced], np.ones(len(unplaced))])
+    E = se3.skew(t[None])[0] @ R
+    line = first @ E  # of the second view
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = np.abs((line * second).sum(axis=1)) / np.linalg.norm(line[:, :2], axis=1)
+    near = unplaced[~(off > _EPIPOLAR_PX / sensor.focal_px)]
+    return replace(
+        motion, rows=np.concatenate([motion.rows, rows[near]]), points=motion.points.joined(observed.rows(near))
+    )
 
 
 def rematch(reference: Frame, frame: Frame, sensor: Sensor) -> tuple[Points, Points]:
@@ -117,12 +141,12 @@ def rematch(reference: Frame, frame: Frame, sensor: Sensor) -> tuple[Points, Poi
 
 def solve(reference: Reference, rows: np.ndarray, observed: Points, sensor: Sensor) -> Motion | None:
     """The motion by points `rows` (K,) of the reference, observed in a frame; None where they agree on none."""
-    known = np.isfinite(np.column_stack([observed.rays, observed.noise.reshape(-1, 4)]))
+    known = np.isfinite(np.column_stack([observed.rays, observed.noise.reshape(-1, 4), reference.points.rho[rows]]))
     valid = np.flatnonzero(known.all(axis=1))
     rows, observed = rows[valid], observed.rows(valid)
     points = reference.points.rows(rows)
     near = _SETTINGS.ransac_px / sensor.focal_px
-    found = find_pose(_cloud(points), observed.rays, near, _SETTINGS.ransac_rounds)
+    found = find_pose(cloud(points), observed.rays, near, _SETTINGS.ransac_rounds)
     if found is None:
         return None
     xyrho = np.column_stack([points.rays, points.rho])
@@ -144,13 +168,24 @@ def solve(reference: Reference, rows: np.ndarray, observed: Points, sensor: Sens
 
 def _predicted(reference: Reference, guess: Floats, sensor: Sensor) -> Float32s:
     """(K, 2) px at which the frame shows the landmarks by a guess of its pose; where it does not, as the reference."""
-    at = se3.transform(se3.inverse(guess), _cloud(reference.points))
+    at = se3.transform(se3.inverse(guess), cloud(_placed(reference.points)))
     px = undistort.project(sensor.camera, at).astype(np.float32)
     size = np.array([sensor.camera.width, sensor.camera.height], np.float32)
     inside = np.logical_and.reduce(np.isfinite(px) & (px > 0) & (px < size), axis=1)
     return np.where(inside[:, None], px, reference.points.px)
 
 
-def _cloud(points: Points) -> Floats:
+def _placed(points: Points) -> Points:
+    """The points, those without a depth at that of the nearest in the image that has one."""
+    known = np.isfinite(points.rho)
+    if known.all() or not known.any():
+        return points
+    _, nearest = KDTree(points.px[known]).query(points.px[~known])
+    rho = points.rho.copy()
+    rho[~known] = points.rho[known][nearest]
+    return replace(points, rho=rho)
+
+
+def cloud(points: Points) -> Floats:
     """(K, 3) m in the camera's frame."""
     return np.column_stack([points.rays, np.ones(len(points.rays))]) / points.rho[:, None]

@@ -1,14 +1,16 @@
-"""Visual odometry of a camera with depth or of a stereo pair.
+"""Visual odometry of a camera with depth, of a stereo pair, or of a single camera, whose unit of length is its own.
 
 Corners of a reference frame are followed into the next frames by optical flow (Lucas & Kanade 1981); a frame's pose is
 that of P3P in RANSAC, refined, as a closure's. A frame that shows too little of the
 reference becomes the next one, and a bundle adjustment of the last references refines their poses and landmarks.
+Without depth a piece begins with two views that have enough parallax, and a point becomes a landmark when the views
+of the window make its depth sure.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,13 +18,14 @@ import numpy as np
 from vplog.data import Odometry
 from vplog.geometry import se3
 from vplog.graph.bundle import Observations, adjust
-from vplog.run.visual_odometry.sensor import Sensor
-from vplog.run.visual_odometry.tracking import Reference, corners, track
+from vplog.run.visual_odometry.sensor import Sensor, follow
+from vplog.run.visual_odometry.tracking import Reference, cloud, corners, solve, track
+from vplog.run.visual_odometry.two_views import CERTAINTY, rho_of, rho_variance, two_views
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from vplog.data import Camera, Floats, Frame
+    from vplog.data import Camera, Float32s, Floats, Frame
     from vplog.run.visual_odometry.sensor import Points
     from vplog.run.visual_odometry.tracking import Motion
 
@@ -34,6 +37,10 @@ _FLOW = 0.05
 """So does one whose points moved by this share of the image's width: farther, and patches no longer look alike."""
 _LEAST = 30
 """Points with depth that a first frame needs: half as many again as a pose does."""
+_LEFT = 0.4
+"""Share of the points of a first view that must still be followed; else the next frame is taken for it."""
+_MOST_BETWEEN = 256
+"""Frames without parallax that are kept to be placed: 10 s of a standing camera at 25 Hz."""
 _PATIENCE_NS = 10**9
 """ns for which a frame that is lost is passed over, as a blurred one; then the next piece begins."""
 
@@ -53,6 +60,35 @@ class _View:
 
 
 @dataclass(eq=False)
+class _Start:
+    """The first view of a piece of a camera without depth, until a later one has parallax to it."""
+
+    frame: Frame
+    points: Points
+    last: Frame
+    """The last frame, to which points were followed from frame to frame."""
+    rows: np.ndarray
+    """Points that were found in it."""
+    px: Float32s
+    between: list[tuple[int, np.ndarray, Points]] = field(default_factory=list)
+    """Stamp of each frame without enough parallax, the points found there, and where."""
+
+    def follow(self, frame: Frame, sensor: Sensor) -> Points:
+        """The points found in the next frame, `rows`."""
+        found = follow(self.last.image, frame.image, self.px, self.px)
+        observed = sensor.measure(frame, found)
+        good = np.flatnonzero(np.isfinite(np.column_stack([found, observed.rays])).all(axis=1))
+        self.last, self.rows, self.px = frame, self.rows[good], found[good]
+        return observed.rows(good)
+
+    def passed(self, stamp_ns: int, observed: Points) -> None:
+        """Keep a frame without enough parallax, thinned out where the camera stands for long."""
+        self.between.append((stamp_ns, self.rows, observed))
+        if len(self.between) > _MOST_BETWEEN:
+            del self.between[::2]
+
+
+@dataclass(eq=False)
 class _Tracker:
     """State while the frames pass."""
 
@@ -67,6 +103,7 @@ class _Tracker:
     breaks: list[int] = field(default_factory=list)
     """Rows of frames at which a piece begins, but for the first."""
     reference: Reference | None = None
+    start: _Start | None = None
     window: deque[tuple[int, np.ndarray, Points]] = field(default_factory=lambda: deque(maxlen=_WINDOW))
     """View, landmarks and measurements of the last references of this piece."""
     world: dict[int, Floats] = field(default_factory=dict)
@@ -74,6 +111,9 @@ class _Tracker:
 
     def add(self, frame: Frame) -> None:
         """Take the next frame."""
+        if self.start is not None:
+            self._follow_start(self.start, frame)
+            return
         if self.reference is None:
             self._start(frame)
             return
@@ -83,35 +123,83 @@ class _Tracker:
                 self._start(frame)
             return
         extended, motion = tracked
-        self.stamp_ns.append(frame.stamp_ns)
         if extended is self.reference and not self._is_far(extended, motion):
-            self.view.append(self.view[-1])
-            self.view_from_camera.append(motion.reference_from_camera)
-            self.by_points.append(motion.covariance + motion.systematic)
+            self._add_frame(frame.stamp_ns, motion)
         else:
+            self.stamp_ns.append(frame.stamp_ns)
             self._extend(extended)
             self._add_view(frame, extended, motion)
+
+    def _add_frame(self, stamp_ns: int, motion: Motion) -> None:
+        """Add a frame that is no reference."""
+        self.stamp_ns.append(stamp_ns)
+        self.view.append(self.view[-1])
+        self.view_from_camera.append(motion.reference_from_camera)
+        self.by_points.append(motion.covariance + motion.systematic)
 
     def _start(self, frame: Frame) -> None:
         """Begin a piece where the last one ended; nothing where the frame has too few points with depth."""
         points = self._usable(frame, corners(frame, np.zeros((0, 2), np.float32)))
+        self.start = None
         if len(points.px) < _LEAST:
             return
+        if not self.sensor.metric:
+            self.start = _Start(frame, points, frame, np.arange(len(points.px)), points.px)
+            return
+        ids = self._free() + np.arange(len(points.px))
+        self._add_reference(frame, self._first_view(frame.stamp_ns), ids, points)
+
+    def _first_view(self, stamp_ns: int) -> _View:
+        """The first of a piece, where the last one ended."""
         if self.stamp_ns:
             self.breaks.append(len(self.stamp_ns))
         pose = self._pose(-1) if self.stamp_ns else np.eye(4)
-        first = int(max(self.world, default=-1)) + 1
-        ids = first + np.arange(len(points.px))
         self.window.clear()
         self.world.clear()
-        self.stamp_ns.append(frame.stamp_ns)
-        self._add_reference(frame, _View(pose, len(self.stamp_ns) - 1, _UNKNOWN), ids, points)
+        self.stamp_ns.append(stamp_ns)
+        return _View(pose, len(self.stamp_ns) - 1, _UNKNOWN)
+
+    def _follow_start(self, start: _Start, frame: Frame) -> None:
+        """Begin the piece where the frame has enough parallax to its first view."""
+        observed = start.follow(frame, self.sensor)
+        if len(start.rows) < max(_LEAST, len(start.points.px) * _LEFT):
+            self._start(frame)
+            return
+        first = start.points.rows(start.rows)
+        found = two_views(first, observed, self.sensor.focal_px, _LEAST)
+        if found is not None:
+            rows, first = start.rows[found.rows], first.rows(found.rows)
+            centre, ray_variance = found.first_from_second[:3, 3], (self.sensor.pixel_sigma / self.sensor.focal_px) ** 2
+            shown = np.ones((1, len(rows)), bool)
+            variance = rho_variance(found.first, centre[None], shown, ray_variance)
+            points = replace(first, rays=found.first[:, :2] / found.first[:, 2:], rho=1.0 / found.first[:, 2])
+            ids = self._free() + np.arange(len(rows))
+            reference = Reference(start.frame, ids, replace(points, variance=variance), int(ids[-1]) + 1)
+            motion = solve(reference, np.arange(len(rows)), observed.rows(found.rows), self.sensor)
+            if motion is not None:
+                self._begin(start, rows, reference, first)
+                self.stamp_ns.append(frame.stamp_ns)
+                self._add_view(frame, reference, motion)
+                return
+        start.passed(frame.stamp_ns, observed)
+
+    def _begin(self, start: _Start, rows: np.ndarray, reference: Reference, measured: Points) -> None:
+        """Add the first view, and the frames between it and the second one, by the points `rows` of the start."""
+        view = self._first_view(start.frame.stamp_ns)
+        at = se3.transform(view.world_from_camera, cloud(reference.points))
+        self.world.update(zip(reference.ids.tolist(), at, strict=True))
+        self._add_pose(view, reference.ids, measured)
+        self.start = None
+        for stamp_ns, there, observed in start.between:
+            both, mine, theirs = np.intersect1d(rows, there, assume_unique=True, return_indices=True)
+            if len(both) and (motion := solve(reference, mine, observed.rows(theirs), self.sensor)) is not None:
+                self._add_frame(stamp_ns, motion)
 
     def _add_view(self, frame: Frame, reference: Reference, motion: Motion) -> None:
         """Make a tracked frame the next reference, and adjust the window."""
         ids, points = reference.ids[motion.rows], motion.points
         new = self._usable(frame, corners(frame, points.px))
-        first = max(self.world) + 1
+        first = self._free()
         pose = self.views[-1].world_from_camera @ motion.reference_from_camera
         view = _View(pose, len(self.stamp_ns) - 1, motion.covariance + motion.systematic)
         ids = np.concatenate([ids, first + np.arange(len(new.px))])
@@ -120,27 +208,61 @@ class _Tracker:
     def _add_reference(
         self, frame: Frame, view: _View, ids: np.ndarray, points: Points, systematic: Floats | None = None
     ) -> None:
-        self.views.append(view)
-        self.view.append(len(self.views) - 1)
-        self.view_from_camera.append(np.eye(4))
-        self.by_points.append(view.motion)
-        self.window.append((len(self.views) - 1, ids, points))
+        self._add_pose(view, ids, points)
         self._place(view, ids, points)
         if systematic is not None:
             self._adjust(systematic)
         self.reference = self._reference(frame)
 
+    def _add_pose(self, view: _View, ids: np.ndarray, points: Points) -> None:
+        """Add a view to the window."""
+        self.views.append(view)
+        self.view.append(len(self.views) - 1)
+        self.view_from_camera.append(np.eye(4))
+        self.by_points.append(view.motion)
+        self.window.append((len(self.views) - 1, ids, points))
+
+    def _free(self) -> int:
+        """The least number that no landmark has."""
+        return 1 + max((int(ids.max(initial=-1)) for _, ids, _ in self.window), default=-1)
+
     def _usable(self, frame: Frame, px: np.ndarray) -> Points:
-        """The points that have a ray and a depth."""
+        """The points that have a ray, and a depth where there are any."""
         points = self.sensor.measure(frame, px)
-        return points.rows(np.isfinite(points.rho) & np.isfinite(points.noise).all(axis=(1, 2)))
+        known = np.isfinite(points.noise).all(axis=(1, 2)) & np.isfinite(points.rays).all(axis=1)
+        return points.rows(np.flatnonzero(known & np.isfinite(points.rho) if self.sensor.metric else known))
 
     def _place(self, view: _View, ids: np.ndarray, points: Points) -> None:
-        """Landmarks where the view that first shows them measures them."""
+        """Landmarks where the view that first shows them measures them; without depth, where the window's views make
+        their depth sure."""
+        if not self.sensor.metric:
+            self._triangulate(view, ids, points)
+            return
         new = np.array([number not in self.world for number in ids.tolist()], bool)
         ray = np.column_stack([points.rays, np.ones(len(ids))])[new]
         placed = se3.transform(view.world_from_camera, ray / points.rho[new, None])
         self.world.update(zip(ids[new].tolist(), placed, strict=True))
+
+    def _triangulate(self, view: _View, ids: np.ndarray, points: Points) -> None:
+        new = np.flatnonzero([number not in self.world for number in ids.tolist()])
+        if len(self.window) < 2 or not len(new):
+            return
+        poses = np.stack([self.views[other].world_from_camera for other, _, _ in self.window])[:-1]
+        observed = self._observed(ids[new])[:-1]
+        views = se3.between(poses, view.world_from_camera)
+        rho, variance = rho_of(points.rays[new], observed, views, self.sensor.pixel_sigma / self.sensor.focal_px)
+        sure = np.flatnonzero(rho > CERTAINTY * np.sqrt(variance))
+        ray = np.column_stack([points.rays[new[sure]], np.ones(len(sure))])
+        placed = se3.transform(view.world_from_camera, ray / rho[sure, None])
+        self.world.update(zip(ids[new[sure]].tolist(), placed, strict=True))
+
+    def _observed(self, ids: np.ndarray) -> Floats:
+        """(V, K, 2) rays of landmarks in the views of the window, NaN where they are not shown."""
+        result = np.full((len(self.window), len(ids), 2), np.nan)
+        for row, (_, shown, points) in enumerate(self.window):
+            _, mine, theirs = np.intersect1d(ids, shown, assume_unique=True, return_indices=True)
+            result[row, mine] = points.rays[theirs]
+        return result
 
     def _extend(self, reference: Reference) -> None:
         """Give the newest view the points that were matched since."""
@@ -155,7 +277,8 @@ class _Tracker:
         """Bundle adjustment of the window; `systematic` (6, 6) adds to the covariance of the newest motion."""
         shown = np.concatenate([ids for _, ids, _ in self.window])
         often, count = np.unique(shown, return_counts=True)
-        landmarks = often[count > 1]
+        placed = np.array([number in self.world for number in often.tolist()], bool)
+        landmarks = often[(count > 1) & placed]
         columns = []
         for row, (_, ids, points) in enumerate(self.window):
             used = np.isin(ids, landmarks)
@@ -166,27 +289,43 @@ class _Tracker:
         observed = Observations(*(np.concatenate(column) for column in zip(*columns, strict=True)))
         views = [self.views[view] for view, _, _ in self.window]
         start = np.stack([view.world_from_camera for view in views])
-        found = adjust(start, np.stack([self.world[number] for number in landmarks.tolist()]), observed)
+        points = np.stack([self.world[number] for number in landmarks.tolist()])
+        found = adjust(start, points, observed, self.sensor.metric)
         if found is not None:
             for view, pose in zip(views, found.world_from_camera, strict=True):
                 view.world_from_camera = pose
             views[-1].motion = found.last_motion + systematic
             self.world.update(zip(landmarks.tolist(), found.points, strict=True))
-        self.world = {number: self.world[number] for number in often.tolist()}
+        self.world = {number: self.world[number] for number in often[placed].tolist()}
 
     def _reference(self, frame: Frame) -> Reference:
         """The newest view, its landmarks by all views that show them."""
         view, ids, points = self.window[-1]
         pose = self.views[view].world_from_camera
-        at = se3.transform(se3.inverse(pose), np.stack([self.world[number] for number in ids.tolist()]))
-        front = at[:, 2] > 0
+        nowhere = np.full(3, np.nan)
+        at = se3.transform(se3.inverse(pose), np.stack([self.world.get(number, nowhere) for number in ids.tolist()]))
+        front = ~(at[:, 2] <= 0)
         at, ids, points = at[front], ids[front], points.rows(front)
+        if not self.sensor.metric:
+            return Reference(frame, ids, self._estimated(ids, points, at), self._free())
         shown = np.concatenate([other for _, other, _ in self.window])
         times = (np.sort(shown).searchsorted(ids, "right") - np.sort(shown).searchsorted(ids, "left")).clip(1)
         own = np.where(np.isfinite(points.variance), points.variance, np.nanmedian(points.variance))
         rho = 1.0 / at[:, 2]
         estimated = type(points)(points.px, at[:, :2] * rho[:, None], points.noise, rho, own / times)
-        return Reference(frame, ids, estimated, max(self.world) + 1)
+        return Reference(frame, ids, estimated, self._free())
+
+    def _estimated(self, ids: np.ndarray, points: Points, at: Floats) -> Points:
+        """The points with the depths of their landmarks at (K, 3) in the newest view, and the variance by parallax."""
+        poses = np.stack([self.views[other].world_from_camera for other, _, _ in self.window])
+        centres = se3.between(poses[-1], poses)[:, :3, 3]
+        known = np.isfinite(at[:, 2])
+        rays, rho, variance = points.rays.copy(), np.full(len(ids), np.nan), np.full(len(ids), np.nan)
+        rays[known], rho[known] = at[known, :2] / at[known, 2:], 1.0 / at[known, 2]
+        shown = np.asarray(np.isfinite(self._observed(ids[known])).all(axis=2))
+        ray_variance = (self.sensor.pixel_sigma / self.sensor.focal_px) ** 2
+        variance[known] = rho_variance(at[known], centres, shown, ray_variance)
+        return replace(points, rays=rays, rho=rho, variance=variance)
 
     def _is_far(self, reference: Reference, motion: Motion) -> bool:
         flow = np.linalg.norm(motion.points.px - reference.points.px[motion.rows], axis=1)
@@ -217,7 +356,11 @@ class _Tracker:
         moved = se3.adjoint(camera.body_from_camera)
         covariance = moved @ covariance @ moved.T
         return Odometry(
-            np.array(self.stamp_ns, np.int64), odom_from_body, covariance, breaks=np.array(self.breaks, np.int64)
+            np.array(self.stamp_ns, np.int64),
+            odom_from_body,
+            covariance,
+            breaks=np.array(self.breaks, np.int64),
+            metric=self.sensor.metric,
         )
 
     def _increments(self) -> Floats:
@@ -236,11 +379,11 @@ class _Tracker:
         return result
 
 
-def visual_odometry(frames: Iterable[Frame], camera: Camera) -> Odometry | None:
-    """The motion of the body by the images of a calibrated camera with depth or of a stereo pair; None where fewer than
-    two frames have a pose. Frames that are lost have none. The covariance is that of each frame's motion since the one
-    before it, by the bundle adjustment's marginals."""
-    tracker = _Tracker(Sensor(camera))
+def visual_odometry(frames: Iterable[Frame], camera: Camera, metric: bool = True) -> Odometry | None:
+    """The motion of the body by the images of a calibrated camera, `metric` where it has depth or is that of a stereo
+    pair; None where fewer than two frames have a pose. Frames that are lost have none. The covariance is that of each
+    frame's motion since the one before it, by the bundle adjustment's marginals."""
+    tracker = _Tracker(Sensor(camera, metric))
     for frame in frames:
         tracker.add(frame)
     return tracker.odometry()

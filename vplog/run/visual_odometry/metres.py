@@ -1,0 +1,136 @@
+"""Metres for odometry in units of its own, by satellite fixes: its scale as it wanders along the way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from vplog.data import RECEIVER_SIGMA_M
+from vplog.geometry import se3
+from vplog.geometry.geodesy import local_enu
+
+if TYPE_CHECKING:
+    from vplog.data import Camera, Floats, Gps, Ints, Odometry
+
+_APART = 10.0
+"""Sigmas of a fix between two that are compared: their distance then is known to a seventh."""
+_REACH = (1, 2, 4, 8)
+"""Numbers of such steps over which distances are compared."""
+_WANDER = 0.01
+"""Standard deviation of the log of the scale after a metre, growing as the root of the way: 10 % in 100 m, as a single
+camera's wanders in bends."""
+_TUNING = 2.0
+"""Sigmas beyond which a distance counts less (Huber)."""
+_ROUNDS = 15
+"""Gauss-Newton steps; from the median ratio some five converge."""
+_LEAST = 3
+"""Fixes at such distances from each other that give metres."""
+
+
+class _Way(NamedTuple):
+    """The fixes that are compared, of one piece of the odometry."""
+
+    stamp_ns: Ints
+    """(A,)."""
+    enu_m: Floats
+    """(A, 3)."""
+    at: Floats
+    """(A, 3) the odometry there."""
+
+
+def in_metres(odometry: Odometry, gps: Gps, camera: Camera) -> Odometry | None:
+    """Odometry with its steps multiplied by the scale that the fixes have them have; None where the body does not move
+    far enough for one. Pieces without such fixes take the scale of the others."""
+    lever = camera.body_from_camera
+    poses = se3.inverse(lever) @ odometry.odom_from_body @ lever
+    breaks = odometry.breaks if odometry.breaks is not None else np.zeros(0, np.int64)
+    bounds = np.concatenate([[0], breaks, [len(poses)]]).tolist()
+    sigma_m = _sigma_m(gps)
+    ways = [_way(odometry.stamp_ns[a:b], poses[a:b], gps, sigma_m) for a, b in pairwise(bounds)]
+    found = [_log_scale(way, sigma_m) if len(way.stamp_ns) >= _LEAST else None for way in ways]
+    known = [one for one in found if one is not None]
+    if not known:
+        return None
+    common = float(np.median(np.concatenate(known)))
+    log_scale = np.full(len(poses), common)
+    for way, one, a, b in zip(ways, found, bounds[:-1], bounds[1:], strict=True):
+        if one is not None:
+            middle = (way.stamp_ns[1:] - odometry.stamp_ns[0] + way.stamp_ns[:-1] - odometry.stamp_ns[0]) / 2.0
+            log_scale[a:b] = np.interp(odometry.stamp_ns[a:b] - odometry.stamp_ns[0], middle, one)
+    return replace(scaled(odometry, np.exp(log_scale), camera), metric=True)
+
+
+def scaled(odometry: Odometry, scale: Floats, camera: Camera) -> Odometry:
+    """Odometry whose steps to each sample are multiplied (T,), those of the camera, as its place on the body is in
+    metres."""
+    lever = camera.body_from_camera
+    poses = se3.inverse(lever) @ odometry.odom_from_body @ lever
+    steps = np.diff(poses[:, :3, 3], axis=0) * scale[1:, None]
+    if odometry.breaks is not None:
+        steps[odometry.breaks - 1] = 0.0
+    poses[1:, :3, 3] = poses[0, :3, 3] + np.cumsum(steps, axis=0)
+    covariance = odometry.covariance
+    if covariance is not None:
+        covariance = covariance.copy()
+        covariance[:, 3:] *= scale[:, None, None]
+        covariance[:, :, 3:] *= scale[:, None, None]
+    return replace(odometry, odom_from_body=lever @ poses @ se3.inverse(lever), covariance=covariance)
+
+
+def _sigma_m(gps: Gps) -> float:
+    variance = np.trace(gps.covariance, axis1=1, axis2=2) / 3.0
+    known = variance[np.isfinite(variance) & (variance > 0)]
+    return float(np.sqrt(np.median(known))) if len(known) else RECEIVER_SIGMA_M
+
+
+def _way(stamp_ns: Ints, poses: Floats, gps: Gps, sigma_m: float) -> _Way:
+    """Fixes within these samples, each `_APART` sigmas or more from the one before it."""
+    fixes = local_enu(gps)
+    inside = np.flatnonzero((fixes.stamp_ns >= stamp_ns[0]) & (fixes.stamp_ns <= stamp_ns[-1]))
+    chosen = list[int]()
+    for row in inside.tolist():
+        if not chosen or np.linalg.norm(fixes.enu_m[row] - fixes.enu_m[chosen[-1]]) >= _APART * sigma_m:
+            chosen.append(row)
+    at = np.zeros((0, 3))
+    if chosen and len(stamp_ns) > 1:
+        at = se3.interpolate_at(stamp_ns, poses, fixes.stamp_ns[chosen])[:, :3, 3]
+    return _Way(fixes.stamp_ns[chosen][: len(at)], fixes.enu_m[chosen][: len(at)], at)
+
+
+def _log_scale(way: _Way, sigma_m: float) -> Floats | None:
+    """(A-1,) between each two fixes: least squares of the logs of distances, of a scale that wanders slowly."""
+    steps, count = np.diff(way.at, axis=0), len(way.at) - 1
+    pairs = np.array([(a, a + reach) for reach in _REACH for a in range(count + 1 - reach)])
+    square = ((way.enu_m[pairs[:, 1]] - way.enu_m[pairs[:, 0]]) ** 2).sum(1) - 6.0 * sigma_m**2
+    own = np.linalg.norm(way.at[pairs[:, 1]] - way.at[pairs[:, 0]], axis=1)
+    good = (square > (_APART * sigma_m / 2.0) ** 2) & (own > 0)
+    pairs, length = pairs[good], np.sqrt(square[good])
+    if not len(pairs):
+        return None
+    x = np.full(count, float(np.median(np.log(length / own[good]))))
+    size = np.diff(pairs, axis=1).ravel()
+    row = np.repeat(np.arange(len(pairs)), size)
+    column = np.concatenate([np.arange(a, b) for a, b in pairs.tolist()])
+    metres = np.linalg.norm(np.diff(way.enu_m, axis=0), axis=1)
+    smooth = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(count - 1, count)).tocsr()
+    smooth = sparse.diags_array(1.0 / (_WANDER * np.sqrt((metres[1:] + metres[:-1]) / 2.0))) @ smooth
+    sigma = np.sqrt(2.0) * sigma_m / length
+    for _ in range(_ROUNDS):
+        moved = np.exp(x)[:, None] * steps
+        cumulative = np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)])
+        chord = cumulative[pairs[:, 1]] - cumulative[pairs[:, 0]]
+        reached = np.maximum(np.linalg.norm(chord, axis=1), 1e-9)
+        residual = np.log(length / reached) / sigma
+        weight = np.sqrt(np.minimum(1.0, _TUNING / np.maximum(np.abs(residual), 1e-9))) / sigma
+        slope = (moved[column] * (chord / reached[:, None])[row]).sum(1) / reached[row]
+        A = sparse.vstack([sparse.csr_array((slope * weight[row], (row, column)), (len(pairs), count)), smooth])
+        b = np.concatenate([residual * sigma * weight, -(smooth @ x)])
+        step = sparse.linalg.spsolve((A.T @ A).tocsc(), A.T @ b)
+        x = x + np.clip(step, -0.5, 0.5)
+        if np.abs(step).max() < 1e-4:
+            break
+    return x
