@@ -325,6 +325,11 @@ class Closures:
         return Closures(**columns)
 
     @property
+    def of_first_camera(self) -> Bools:
+        """(C,) whether both pictures of each candidate are of the first camera."""
+        return (self.query_camera == 0) & (self.match_camera == 0)
+
+    @property
     def accepted(self) -> Bools:
         """(C,) whether each candidate is a closure with metres, by the robust solve or by decision."""
         return self.of(*ACCEPTED)

@@ -227,4 +227,6 @@ def ledger(pairs: Pairs, measured: Floats, information: Floats, scale: list[str]
         residual_before=unknown,
         residual_after=unknown,
         weight=unknown,
+        query_camera=np.zeros(count, np.int32),
+        match_camera=np.zeros(count, np.int32),
     )

@@ -57,6 +57,8 @@ def ledger(pairs: Sequence[tuple[int, int, float, bool]]) -> Closures:
         residual_before=nan,
         residual_after=nan,
         weight=nan,
+        query_camera=zeros,
+        match_camera=zeros,
     )
 
 

@@ -80,6 +80,8 @@ def ledger(query: np.ndarray, match: np.ndarray, match_from_query: Floats) -> Cl
         residual_before=np.full(n, np.nan),
         residual_after=np.full(n, np.nan),
         weight=np.full(n, np.nan),
+        query_camera=whole,
+        match_camera=whole,
     )
 
 

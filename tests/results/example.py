@@ -81,6 +81,8 @@ def make_run(seed: int = 0) -> Run:
         residual_before=rng.random(count) * known,
         residual_after=rng.random(count) * known,
         weight=rng.random(count) * known,
+        query_camera=rng.integers(0, 3, count).astype(np.int32),
+        match_camera=rng.integers(0, 3, count).astype(np.int32),
     )
     a = np.arange(COUNT - 1, dtype=np.int32)
     edges = COUNT - 1 + int(solved.sum())

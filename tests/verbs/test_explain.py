@@ -297,11 +297,11 @@ def test_matches_that_the_pose_explains_are_told_from_others(shift_m: float) -> 
     descriptors = rng.integers(0, 256, (len(query), 128)).astype(np.uint8)
     ours, theirs = features(query, descriptors), features(match, descriptors)
     settings = Pipeline().verify
-    known = find_agreement(ours, theirs, match_from_query, 9, CAMERA, settings)
+    known = find_agreement(ours, theirs, match_from_query, 9, (CAMERA, CAMERA), settings)
     assert len(known.agrees) == len(query) > 100
     assert known.agrees[~wrong].mean() > 0.98
     assert known.agrees[wrong].mean() < 0.1
-    unknown = find_agreement(ours, theirs, np.full((4, 4), np.nan), 9, replace(CAMERA, matrix=None), settings)
+    unknown = find_agreement(ours, theirs, np.full((4, 4), np.nan), 9, (CAMERA, replace(CAMERA, matrix=None)), settings)
     if shift_m:  # without a shift there is no epipolar geometry, and any that a turn allows will do
         assert unknown.agrees[~wrong].mean() > 0.8
         assert unknown.agrees[wrong].mean() < 0.2
@@ -312,7 +312,7 @@ def test_matches_by_chance_agree_with_nothing(count: int) -> None:
     rng = np.random.default_rng(count)
     descriptors = rng.integers(0, 256, (count, 128)).astype(np.uint8)
     ours, theirs = (features(rng.uniform([0, 0], [640, 480], (count, 2)), descriptors) for _ in range(2))
-    found = find_agreement(ours, theirs, np.full((4, 4), np.nan), 0, CAMERA, Pipeline().verify)
+    found = find_agreement(ours, theirs, np.full((4, 4), np.nan), 0, (CAMERA, CAMERA), Pipeline().verify)
     assert len(found.agrees) == count
     assert not found.agrees.any()
     assert not found.model

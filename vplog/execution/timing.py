@@ -26,7 +26,8 @@ class StageTimer:
         yield
         seconds = time.perf_counter() - began
         before = self.stages.get(name, {})  # of the first camera, where there are several
-        seconds, items = seconds + before.get("seconds", 0.0), None if items is None else items + before.get("items", 0)
+        seconds += before.get("seconds", 0.0)
+        items = before.get("items") if items is None else items + before.get("items", 0)
         entry: dict[str, Any] = {
             "seconds": round(seconds, 3),
             "cpu_seconds": round(time.process_time() - cpu + before.get("cpu_seconds", 0.0), 3),

@@ -66,7 +66,8 @@ class RecordedLog:
     def info(self) -> LogInfo:
         """Reads the chosen topics once, so that the warnings are complete."""
         content = self._content
-        topics = [self._topic(channel, count) for channel, count in self._contents.counts.items()]
+        others = {choice.image for choice in self.further_cameras()}
+        topics = [self._topic(channel, count, others) for channel, count in self._contents.counts.items()]
         if self._selection.image is not None:
             self._check_images()
         tracks = [track for track in (content, content.odometry, content.gps) if track and len(track.stamp_ns)]
@@ -77,8 +78,9 @@ class RecordedLog:
             [frame for frame in content.frames if frame], content.skew_ms, content.sources, self._truth_name,
         )  # fmt: skip
 
-    def _topic(self, channel: Channel, count: int) -> Topic:
+    def _topic(self, channel: Channel, count: int, others: set[str | None]) -> Topic:
         part, rate_hz = self._content.chosen.parts.get(channel, ""), self._content.rates_hz.get(channel)
+        part = part or ("image" if channel.topic in others else "")
         known = self._candidate(channel) or Candidate(channel, count, "")
         calibrated = known.calibrated if known.role == "camera_info" else None
         return Topic(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import pairwise, product
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -93,7 +93,9 @@ def read_cameras(
     own_library: bool, *, steps: Steps, execution: Execution,
 ) -> list[View]:  # fmt: skip
     """The pictures of every camera but the first, extracted, those with fewer than two left out with a warning."""
-    found = []
+    found = list[View]()
+    if not odometry.metric:  # nor are the mounts then known in its units
+        return found
     for choice in log.further_cameras():
         try:
             other = logs.open_drive(files_of(path), choice)
@@ -137,7 +139,7 @@ def describe_cameras(views: Sequence[View], state: PlaceState, *, steps: Steps) 
     return [replace(view, places=steps.part(describe, state, view.log, view.pictures.features)) for view in views]
 
 
-@step("verify", items=lambda closures, views, *_: len(views) ** 2 - 1)
+@step("verify")
 def verify_cameras(
     closures: Closures, views: Sequence[View], state: PlaceState, settings: RigSettings,
     *, steps: Steps, execution: Execution,
@@ -203,7 +205,7 @@ def _of_keyframes(
 def _numbered(ledgers: Sequence[Closures]) -> list[Ints]:
     """Numbers of the candidates of several ledgers one after the other."""
     ends = np.cumsum([0, *map(len, ledgers)])
-    return [np.arange(begin, end) for begin, end in zip(ends, ends[1:], strict=False)]
+    return [np.arange(begin, end) for begin, end in pairwise(ends)]
 
 
 def _once(closures: Closures) -> Closures:

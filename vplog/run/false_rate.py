@@ -54,7 +54,7 @@ def rate_closures(
         return closures
     keyframes, reach_m, views = drive.keyframes, drive.settings.metric.max_distance_m, for_verification(drive)
     ruled_out = beyond_drift(closures, keyframes, odometry, noise, reach_m, settings.sigmas)
-    left = np.flatnonzero(~ruled_out & (closures.query_camera == 0) & (closures.match_camera == 0))
+    left = np.flatnonzero(~ruled_out & closures.of_first_camera)
     count = min(max(null_pairs(evidence(closures), settings) - int(ruled_out.sum()), 0), len(left))
     rows = left[np.linspace(0, len(left) - 1, count).astype(np.int64)]
     mirror = mirrored_evidence(closures, rows, views, execution)

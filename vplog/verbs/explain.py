@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ from vplog.verbs.explain_figure import View, draw
 from vplog.verbs.report import frames_at, recorded_places
 
 if TYPE_CHECKING:
+    from vplog.data import Bytes, Camera, Features
     from vplog.pipeline import Pipeline
 
 
@@ -57,7 +58,8 @@ def explain(
     shown = None
     if not words_only:
         topics = logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json")
-        view = _view(number, row, explanation, folder, record, pipeline, reopened(record, log, topics))
+        opened = _Opened(folder, record, pipeline, log, reopened(record, log, topics))
+        view = _view(number, row, explanation, opened)
         file = picture or folder / f"closure-{number}.png"
         draw(file, view)
         shown = {
@@ -93,28 +95,54 @@ def _chosen(closure: tuple[int, ...] | None, closures: Closures, keyframes: Keyf
     return int(found[0])
 
 
-def _view(
-    number: int, row: dict[str, Any], explanation: explain_text.Explanation, folder: Path, record: dict[str, Any],
-    pipeline: Pipeline, log: Log,
-) -> View:  # fmt: skip
+@dataclass(frozen=True, eq=False)
+class _Opened:
+    """A run and its log."""
+
+    folder: Path
+    record: dict[str, Any]
+    pipeline: Pipeline
+    path: Path | None
+    """Of the log, where it is not the run's own."""
+    log: Log
+
+
+def _view(number: int, row: dict[str, Any], explanation: explain_text.Explanation, opened: _Opened) -> View:
     """Both frames, read again from the log, with their matches and shared boxes."""
-    stamps = np.array([row["match_stamp_ns"], row["query_stamp_ns"]], np.int64)
-    match, query = frames_at(log, stamps, pipeline, f"is it the log of {folder}? Name it with --log.")
+    query, match = (_picture(end, row, opened) for end in ("query", "match"))
     pose = se3.from_vectors(np.array([row[name] for name in tables.POSE_COLUMNS], np.float64))
-    agreement = find_agreement(query[1], match[1], pose, row["inliers"], log.camera(), pipeline.verify)
-    boxes, missing = _boxes(row, folder, record, pipeline)
+    cameras = query[2], match[2]
+    agreement = find_agreement(query[1], match[1], pose, row["inliers"], cameras, opened.pipeline.verify)
+    boxes, missing = _boxes(row, (query[1], match[1]), opened)
     return View(number, row, explanation, query[0], match[0], agreement, boxes, missing)
 
 
-def _boxes(
-    row: dict[str, Any], folder: Path, record: dict[str, Any], pipeline: Pipeline
-) -> tuple[list[SharedBoxes], str]:
+def _picture(end: str, row: dict[str, Any], opened: _Opened) -> tuple[Bytes, Features, Camera]:
+    """Image, features and camera of the query or the match. Raises ResultError."""
+    log, otherwise = opened.log, f"is it the log of {opened.folder}? Name it with --log."
+    stamp_ns = np.array([row[f"{end}_stamp_ns"]], np.int64)
+    if number := row[f"{end}_camera"] or 0:
+        names = run_record.recorded(opened.record, opened.folder / "run.json", list, "cameras")
+        choices = {one.image: one for one in log.further_cameras()}
+        if not 0 < number < len(names) or names[number] not in choices:
+            raise ResultError(f"{log.name} has no camera {number} of the run: {otherwise}")
+        log = reopened(opened.record, opened.path, choices[names[number]])
+        stamps = log.stamps()
+        stamp_ns = stamps[[np.abs(stamps - stamp_ns).argmin()]]
+    [(image, features)] = frames_at(log, stamp_ns, opened.pipeline, otherwise)
+    return image, features, log.camera()
+
+
+def _boxes(row: dict[str, Any], views: tuple[Features, Features], opened: _Opened) -> tuple[list[SharedBoxes], str]:
     """Boxes that both views share on the library's references, or why they are not known."""
     if not row["shared_references"]:
-        return [], f"{pipeline.places.kind} names no reference that both views share"
+        return [], f"{opened.pipeline.places.kind} names no reference that both views share"
     try:
-        state, column = recorded_places(folder, record, pipeline, Execution())
-        query, match = state.from_arrow(column.take([row["query"], row["match"]]))
+        state, column = recorded_places(opened.folder, opened.record, opened.pipeline, Execution())
+        if row["query_camera"] or row["match_camera"]:  # descriptors.parquet has those of the first camera
+            query, match = map(state.describe, views)
+        else:
+            query, match = state.from_arrow(column.take([row["query"], row["match"]]))
     except (LibraryError, LogError) as error:
         return [], str(error).rstrip(".")
     return (find_boxes(state, query, match, row["shared_references"]) if isinstance(state, BoxState) else []), ""

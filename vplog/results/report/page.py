@@ -389,6 +389,7 @@ def _audit(content: Content, drawn: dict[str, Any]) -> dict[str, Any]:
         "references": references,
         "questions": {str(one.rows[0]): one.rows for one in content.questions},
         "thumbnails": {str(row): base64.b64encode(jpeg).decode() for row, jpeg in content.pictures.thumbnails.items()},
+        "cameras": list(map(str, _list(content.record.get("cameras")))),
         "explain": "vplog explain RUN --closure ",
         "again": command,
     }
@@ -416,6 +417,7 @@ def _columns(content: Content, rows: list[int]) -> dict[str, list[Any]]:
     if content.changes is not None:
         columns["change"] = [content.changes.change[row] for row in rows]
     whole = ("query", "match", "rank", "matches", "inliers", "reverse_inliers", "support")
+    whole += () if closures.of_first_camera.all() else ("query_camera", "match_camera")
     shares = {"residual_before": 2, "residual_after": 2, "p_false": 4, "weight": 3, "score": 4, "spread": 3}
     columns |= {name: getattr(closures, name)[rows].tolist() for name in whole}
     columns |= {name: _rounded(getattr(closures, name)[rows], digits) for name, digits in shares.items()}

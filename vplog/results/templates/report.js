@@ -314,13 +314,14 @@
     $("closure-numbers").textContent = names.filter((name) => !["row", "verdict", "query", "match"].includes(name) && columns[name][row] !== null)
       .map((name) => name + " " + columns[name][row]).join(", ");
     $("command").value = data.explain + columns.query[row] + ":" + columns.match[row];
+    const others = ["query", "match"].map((end) => columns[end + "_camera"]?.[row] ?? 0);
     for (const end of ["query", "match"]) {
-      const jpeg = thumbnails[columns[end][row]];
+      const jpeg = others.some(Boolean) ? "" : thumbnails[columns[end][row]];
       $(end).hidden = !jpeg;
       if (jpeg) $(end).src = "data:image/jpeg;base64," + jpeg;
     }
     const view = data.views[columns.row[row]], small = ["query", "match"].every((end) => thumbnails[columns[end][row]]);
-    $("no-picture").textContent = small ? view ? "" : "The page has no matches of this pair; the command below draws them." : "No thumbnails of this pair are in the page.";
+    $("no-picture").textContent = others.some(Boolean) ? "Pictures of the cameras " + others.map((one) => data.cameras[one]).join(" and ") + ", which the command below draws." : small ? view ? "" : "The page has no matches of this pair; the command below draws them." : "No thumbnails of this pair are in the page.";
     $("references").replaceChildren(...panelsOf(view));
     overlay();
   };

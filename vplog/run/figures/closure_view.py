@@ -53,14 +53,16 @@ class SharedBoxes:
 
 
 def find_agreement(
-    query: Features, match: Features, match_from_query: Floats, inliers: int, camera: Camera, settings: VerifySettings
-) -> Agreement:
+    query: Features, match: Features, match_from_query: Floats, inliers: int, cameras: tuple[Camera, Camera],
+    settings: VerifySettings,
+) -> Agreement:  # fmt: skip
     """The matches as in verification, and those within the epipolar lines of the closure's pose (4, 4), which has so
-    many inliers; where it is NaN, those of the epipolar geometry with most matches."""
+    many inliers; where it is NaN, those of the epipolar geometry with most matches. `cameras` are the query's and the
+    match's."""
     mine, theirs = match_features(query, match, settings.matching)
     here, there = query.points[mine], match.points[theirs]
-    if np.isfinite(match_from_query).all() and camera.matrix is not None:
-        agrees = _on_epipolar_lines(here, there, match_from_query, camera, settings.metric.ransac_px)
+    if np.isfinite(match_from_query).all() and all(one.matrix is not None for one in cameras):
+        agrees = _on_epipolar_lines(here, there, match_from_query, cameras, settings.metric.ransac_px)
         model = f"the ledger's pose (verification also requires a known position, and counted {inliers})"
         return Agreement(here, there, agrees, model)
     agrees, by_chance = epipolar_inliers(here, there, query.width, query.height, settings.epipolar)
@@ -69,13 +71,18 @@ def find_agreement(
     return Agreement(here, there, agrees, "the epipolar geometry that most agree with")
 
 
-def _on_epipolar_lines(here: Float32s, there: Float32s, body: Floats, camera: Camera, most_px: float) -> Any:
+def _on_epipolar_lines(
+    here: Float32s, there: Float32s, body: Floats, cameras: tuple[Camera, Camera], most_px: float
+) -> Any:
     """(K,) bool: by Sampson's distance (Hartley & Zisserman 2004, eq. 11.9), and in front of both cameras."""
-    match_from_query = se3.inverse(camera.body_from_camera) @ body @ camera.body_from_camera
-    rays = [np.column_stack([undistort.rays(camera, points), np.ones(len(points))]) for points in (here, there)]
+    match_from_query = se3.inverse(cameras[1].body_from_camera) @ body @ cameras[0].body_from_camera
+    rays = [
+        np.column_stack([undistort.rays(camera, points), np.ones(len(points))])
+        for camera, points in zip(cameras, (here, there), strict=True)
+    ]
     turned = rays[0] @ match_from_query[:3, :3].T
     shift, observed = match_from_query[:3, 3], rays[1]
-    noise = [undistort.noise_of_rays(camera, one[:, :2], 1.0) for one in rays]
+    noise = [undistort.noise_of_rays(camera, one[:, :2], 1.0) for camera, one in zip(cameras, rays, strict=True)]
     with np.errstate(all="ignore"):
         if np.linalg.norm(shift) < _SAME_SPOT_M:
             error = turned[:, :2] / turned[:, 2:] - observed[:, :2]
@@ -91,7 +98,7 @@ def _on_epipolar_lines(here: Float32s, there: Float32s, body: Floats, camera: Ca
         depth = (np.cross(observed, shift) * across).sum(axis=1), (np.cross(turned, shift) * across).sum(axis=1)
         ahead = (depth[0] > 0) & (depth[1] > 0)
         # parallel within the noise: at infinity, on either side of it
-        far = square < (most_px / undistort.focal_px(camera)) ** 2
+        far = square < (most_px / undistort.focal_px(cameras[0])) ** 2
         return (error_px < most_px) & (ahead | far)
 
 

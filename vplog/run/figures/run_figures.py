@@ -114,13 +114,14 @@ def reference_use(state: PlaceState, places: Sequence[Any]) -> list[int] | None:
 
 
 def choose_examples(closures: Closures, count: int) -> list[int]:
-    """Rows worth a picture: accepted ones evenly along the drive, and of every reason of rejection the best scored."""
+    """Rows of the first camera worth a picture: accepted ones evenly along the drive, and of every reason of rejection
+    the best scored."""
     verdicts = np.array([verdict.value for verdict in closures.verdict])
-    accepted = np.flatnonzero(closures.accepted)
+    accepted, first = np.flatnonzero(closures.accepted & closures.of_first_camera), closures.of_first_camera
     others = [
         rows[np.argsort(-closures.score[rows], kind="stable")].tolist()
         for verdict in reversed(Verdict)  # the reasons that come last in the checks are the most telling
-        if verdict not in ACCEPTED and len(rows := np.flatnonzero(verdicts == verdict.value))
+        if verdict not in ACCEPTED and len(rows := np.flatnonzero((verdicts == verdict.value) & first))
     ]
     room = count - min(count // 2, sum(map(len, others)))
     chosen = accepted[np.linspace(0, len(accepted) - 1, min(room, len(accepted))).astype(np.int64)].tolist()
@@ -153,7 +154,7 @@ def _draw(
     nodes = int(closures.query[row]), int(closures.match[row])
     features = inputs.features(nodes[0]), inputs.features(nodes[1])
     pose, inliers = closures.match_from_query[row], int(closures.inliers[row])
-    agreement = find_agreement(*features, pose, inliers, inputs.camera, verify)
+    agreement = find_agreement(*features, pose, inliers, (inputs.camera, inputs.camera), verify)
     sides = [np.array([one.width, one.height]) for one in features]
     frames = [
         FramePanel(images[node], f"closure {row}, {name}: keyframe {node}", (points + 0.5) / side)
@@ -187,11 +188,11 @@ def _strongest(features: Features) -> Features:
 
 
 def choose_views(closures: Closures) -> list[int]:
-    """Rows of the closures in the solution and of as many nearest misses: those that geometry accepted, then those of
-    most inliers and matches."""
-    used = closures.of(*USED)
+    """Rows, of the first camera alone, of the closures in the solution and of as many nearest misses: those that
+    geometry accepted, then those of most inliers and matches."""
+    used, first = closures.of(*USED), closures.of_first_camera
     order = np.lexsort((-closures.matches, -closures.inliers, np.isnan(closures.residual_after), ~used))
-    return sorted(order[: min(max(2 * int(used.sum()), _LEAST_VIEWS), _MOST_VIEWS)].tolist())
+    return sorted(order[first[order]][: min(max(2 * int(used.sum()), _LEAST_VIEWS), _MOST_VIEWS)].tolist())
 
 
 def view_closures(
@@ -220,7 +221,7 @@ def view_closures(
     def one(row: int) -> dict[str, Any]:
         query, match = map(inputs.features, ends[row])
         pose, inliers, boxes = closures.match_from_query[row], int(closures.inliers[row]), shared[row]
-        found = find_agreement(query, match, pose, inliers, inputs.camera, verify)
+        found = find_agreement(query, match, pose, inliers, (inputs.camera, inputs.camera), verify)
         here, there = (
             (points + 0.5) / (features.width, features.height)
             for points, features in ((found.query, query), (found.match, match))

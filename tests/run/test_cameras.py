@@ -1,0 +1,161 @@
+"""Several cameras on one body: the rear one recognises on the way back what the front one saw."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from tests.graph.drive import ledger
+from vplog.data import Keyframes, Odometry, Verdict
+from vplog.demo import SMALL, make_drive
+from vplog.demo.record import IMAGE, REAR
+from vplog.errors import LogError
+from vplog.geometry import se3
+from vplog.logs.formats.container import Channel
+from vplog.logs.topic_selection import Candidate, Selection, further_cameras
+from vplog.results import tables
+from vplog.results.run_record import read_run_json
+from vplog.run import cameras
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from tests.conftest import Said
+
+RIG = SMALL.model_copy(
+    update={"laps": 1.05, "frame_rate_hz": 2.0, "width": 320, "height": 180, "rear_camera": True, "turn_back_m": 34.0}
+)
+QUICK = (
+    "--set",
+    "propose.per_query=2",
+    "--set",
+    "features.max_features=700",
+    "--set",
+    "pictures.closures=2",
+    "--set",
+    "propose.gap_steps=8",
+)
+
+
+@pytest.fixture(scope="module")
+def rig(made_once: Callable[..., Path]) -> Path:
+    """A drive out and back, with cameras ahead and behind."""
+    return made_once("rig", lambda folder: make_drive(folder, RIG))
+
+
+def test_the_rear_camera_closes_the_way_back(rig: Path, verb: Callable[..., Said], tmp_path: Path) -> None:
+    out, log = tmp_path / "run", rig / "drive.mcap"
+    found = verb("run", log, "-o", out, "--json", *QUICK).json
+    assert found["cameras"] == [IMAGE, REAR]
+    closures = tables.read_closures(out / "closures.parquet")
+    used = closures.of(Verdict.ACCEPTED)
+    assert used.sum() >= 4
+    assert (closures.query_camera + closures.match_camera)[used].tolist() == [1] * used.sum()
+    pairs = list(zip(closures.query.tolist(), closures.match.tolist(), strict=True))
+    assert len(set(pairs)) == len(pairs)
+    judged = verb("evaluate", out, "--truth", rig / "truth.tum", "--json").json
+    assert judged["closures"]["accepted_false"] == 0
+    assert judged["ate_after"]["rmse_m"] < 0.5 * judged["ate_before"]["rmse_m"]
+    shown = verb("explain", out, "--closure", int(np.flatnonzero(used)[0]), "--json").json["picture"]
+    assert shown["agree"] >= 20
+    assert shown["references"]
+    again = verb("run", log, "-o", out, "--json", *QUICK, "--image-topic", IMAGE, "--image-topic", REAR).json
+    assert again["stages"]["extract"]["parts_reused"] == again["stages"]["extract"]["parts"]
+    assert again["graph_sha256"] == found["graph_sha256"]
+
+
+def test_one_camera_that_is_chosen_is_alone(rig: Path, verb: Callable[..., Said], tmp_path: Path) -> None:
+    used = {t["name"] for t in verb("info", rig / "drive.mcap", "--json").json["topics"] if t["part"] == "image"}
+    assert used == {IMAGE, REAR}
+    found = verb("run", rig / "drive.mcap", "-o", tmp_path / "run", "--json", "--image-topic", IMAGE, *QUICK).json
+    assert found["cameras"] == [IMAGE]
+    assert "accepted" not in found["counts"]["verdicts"]
+
+
+def test_a_camera_that_cannot_be_used_is_left_out_with_a_line(
+    rig: Path, verb: Callable[..., Said], tmp_path: Path
+) -> None:
+    mask = tmp_path / "mask.png"
+    mask.write_bytes(b"no image")
+    request = ("run", rig / "drive.mcap", "-o", tmp_path / "run", "--mask", f"{REAR}={mask}", *QUICK)
+    said = verb(*request)
+    assert said.code == 0
+    record = read_run_json(tmp_path / "run" / "run.json")
+    assert record["cameras"] == [IMAGE]
+    assert any(REAR in line and "mask" in line for line in record["warnings"])
+
+
+def candidate(name: str, role: str = "image", **more: Any) -> Candidate:
+    return Candidate(Channel(f"/{name}", "", ""), 10, role, **more)
+
+
+def test_further_cameras_are_calibrated_have_frames_of_their_own_and_are_not_right() -> None:
+    images = ["front/image", "front/image_small", "left/image", "right/image", "rear/image", "dark/image", "top/image"]
+    frames = ["front", "front", "left", "right", "rear", "dark", ""]
+    found = [candidate(name, frame=frame) for name, frame in zip(images, frames, strict=True)]
+    known = ("front", "left", "right", "rear", "top")
+    found += [candidate(f"{name}/camera_info", "camera_info", calibrated=True) for name in known]
+    found += [candidate("dark/camera_info", "camera_info")]
+    front = Selection(image=found[0].channel)
+    assert [one.channel.topic for one in further_cameras(found, front)] == ["/left/image", "/rear/image"]
+    assert "/left/image" not in [c.channel.topic for c in further_cameras(found, replace(front, mask=found[2].channel))]
+
+
+def poses_of(rng: np.random.Generator, count: int) -> np.ndarray:
+    return se3.exp(rng.normal(size=(count, 6)))
+
+
+def test_pictures_are_the_nearest_of_a_keyframe_and_none_is_far() -> None:
+    rng = np.random.default_rng(2)
+    odometry = Odometry(np.arange(0, 1001, 10), poses_of(rng, 101), None)
+    keyframes = Keyframes("drive", np.array([100, 203, 300, 480, 700]), poses_of(rng, 5))
+    stamps = np.array([90, 112, 200, 206, 290, 360, 430, 950, 1020])
+    row, pictures = cameras.pictures_at(keyframes, stamps, odometry)
+    assert pictures.stamp_ns.tolist() == [90, 200, 290, 430]
+    assert row.tolist() == [0, 1, 2, 3]
+    assert np.allclose(pictures.odom_from_body, odometry.odom_from_body[[9, 20, 29, 43]])
+    with pytest.raises(LogError, match="near the stamp"):
+        cameras.pictures_at(keyframes, np.array([0, 10, 20]), odometry)
+
+
+def test_a_closure_of_pictures_is_carried_to_the_keyframes() -> None:
+    """With exact odometry the true closure of two pictures is that of their keyframes, and as many sigmas from any
+    other pose as before."""
+    rng = np.random.default_rng(3)
+    world_from_keyframe, world_from_picture = poses_of(rng, 4), poses_of(rng, 4)
+    keyframes, pictures = (
+        Keyframes("drive", np.arange(4), poses) for poses in (world_from_keyframe, world_from_picture)
+    )
+    query, match, row = np.array([3, 2]), np.array([0, 1]), np.arange(4)
+    found = ledger(query, match, se3.between(world_from_picture[match], world_from_picture[query]))
+    square = rng.normal(size=(2, 6, 6))
+    found = replace(found, information=square @ np.swapaxes(square, 1, 2) + np.eye(6))
+    view: Any = type("View", (), {"row": row, "pictures": type("Pictures", (), {"keyframes": pictures})})
+    carried = cameras._of_keyframes(found, (view, 1), (view, 2), keyframes)
+    true = se3.between(world_from_keyframe[match], world_from_keyframe[query])
+    assert np.allclose(carried.match_from_query, true)
+    assert (carried.query_camera.tolist(), carried.match_camera.tolist()) == ([1, 1], [2, 2])
+    moved = replace(found, match_from_query=found.match_from_query @ se3.exp(rng.normal(size=(2, 6)) * 1e-4))
+    sigmas = []
+    for one, at in (
+        (moved, found.match_from_query),
+        (cameras._of_keyframes(moved, (view, 1), (view, 2), keyframes), true),
+    ):
+        error = se3.log(se3.between(at, one.match_from_query))
+        sigmas.append(
+            np.einsum("ki,kij,kj->k", error, carried.information if one is not moved else found.information, error)
+        )
+    assert np.allclose(*sigmas)
+
+
+def test_a_pair_of_keyframes_is_once_in_the_ledger_as_the_cameras_that_agree_best_have_it() -> None:
+    found = ledger(np.array([5, 5, 4, 5, 5]), np.array([1, 1, 0, 1, 2]), np.tile(np.eye(4), (5, 1, 1)))
+    verdicts = [Verdict.ACCEPTED, Verdict.TOO_FAR, Verdict.TOO_FAR, Verdict.ACCEPTED, Verdict.ACCEPTED]
+    inliers, number = np.array([30, 90, 10, 40, 20], np.int32), np.arange(5, dtype=np.int32)
+    found = replace(found, verdict=verdicts, inliers=inliers, query_camera=number)
+    assert cameras._once(found).query_camera.tolist() == [2, 3, 4]
+    assert len(cameras._once(found.rows(number[:0].astype(np.int64)))) == 0
