@@ -264,7 +264,7 @@
         points: { show: dots, size: 6, fill: stroke, width: 0 } };
     });
     const upright = { ...axis, size: 54, space: 34 }, down = { ...upright, scale: "down", side: 1, grid: { show: false } };
-    const half = (sign) => (u, values) => values.map((value) => value * sign < 0 ? "" : Math.abs(value));
+    const half = (sign) => (u, values) => values.map((value) => value * sign < 0 || value % 1 ? "" : Math.abs(value));
     const plot = new uPlot({
       width: figure.clientWidth, height: 230, series: [{ label: x_label, value: (u, value) => value === null ? "-" : +value.toPrecision(6) }, ...series],
       scales: { x: { time: false }, ...(mirrored ? { y: { range: (u) => [-1.3 * most(u, 1), 1.3 * most(u, 1)] }, down: { range: (u) => [-1.3 * most(u, 2), 1.3 * most(u, 2)] } } : bars ? { y: { range: (u, low, high) => [0, high] } } : {}) },
