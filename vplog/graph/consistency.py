@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
+from scipy.special import chdtri
 
 from vplog.data import EdgeKind
 from vplog.geometry import se3
@@ -144,27 +144,5 @@ def far_from_odometry(graph: PoseGraph, probability: float, chain: OdometryChain
 
 @lru_cache
 def chi2_quantile(probability: float, dof: int) -> float:
-    """Value that chi-square with `dof` degrees of freedom stays below with this probability.
-
-    The upper tail is a finite sum for whole degrees, P(chi2 > x) = [erfc(sqrt(x / 2))] + sum of
-    exp(-x / 2) (x / 2)^s / Gamma(s + 1) over s = 0, 1, .. < dof / 2 for even `dof`, over s = 1/2, 3/2, .. < dof / 2
-    with the bracket for odd (Abramowitz and Stegun, 26.4.4 and 26.4.5). Inverted by bisection.
-    """
-    odd = dof % 2 == 1
-    power = np.arange(dof // 2) + (0.5 if odd else 0.0)
-    log_gamma = power
-    if dof > 1:
-        log_gamma = math.lgamma(power[0] + 1.0) + np.concatenate([[0.0], np.cumsum(np.log(power[1:]))])
-
-    def tail(x: float) -> float:
-        total = float(np.exp(power * math.log(x / 2.0) - log_gamma - x / 2.0).sum())
-        return total + (math.erfc(math.sqrt(x / 2.0)) if odd else 0.0)
-
-    low, high = 1e-9, 2.0 * dof + 100.0  # beyond every probability that a float can tell from 1
-    while high - low > 1e-12 * high:
-        middle = (low + high) / 2.0
-        if tail(middle) > 1.0 - probability:
-            low = middle
-        else:
-            high = middle
-    return high
+    """Value that chi-square with `dof` degrees of freedom stays below with this probability."""
+    return float(chdtri(dof, 1.0 - probability))
