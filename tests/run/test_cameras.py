@@ -16,6 +16,7 @@ from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.formats.container import Channel
 from vplog.logs.topic_selection import Candidate, Selection, further_cameras
+from vplog.loops.propose import Proposals
 from vplog.results import tables
 from vplog.results.run_record import read_run_json
 from vplog.run import cameras
@@ -150,6 +151,21 @@ def test_a_closure_of_pictures_is_carried_to_the_keyframes() -> None:
             np.einsum("ki,kij,kj->k", error, carried.information if one is not moved else found.information, error)
         )
     assert np.allclose(*sigmas)
+
+
+def test_of_each_query_the_best_candidates_of_all_cameras_are_verified() -> None:
+    def found(query: list[int], score: list[float]) -> Proposals:
+        count = len(query)
+        return Proposals(
+            np.array(query, np.int32), np.arange(count, dtype=np.int32), np.zeros(count, np.int32),
+            np.array(score, np.float32), np.zeros(count, np.int32),
+        )  # fmt: skip
+
+    best = cameras._best({1: found([4, 4, 5], [0.9, 0.2, 0.1]), 2: found([4, 5, 5], [0.5, 0.3, 0.2])}, 2)
+    assert {m: list(zip(one.query.tolist(), one.match.tolist(), strict=True)) for m, one in best.items()} == {
+        1: [(4, 0)],
+        2: [(4, 0), (5, 1), (5, 2)],
+    }
 
 
 def test_a_pair_of_keyframes_is_once_in_the_ledger_as_the_cameras_that_agree_best_have_it() -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -150,17 +150,34 @@ def verify_cameras(
         return closures
     ledgers, indexes = [closures], [state.index(view.places) for view in views]
     shares = [calibrated(view.pictures, steps) for view in views]
-    for q, m in product(range(len(views)), repeat=2):
-        if q or m:
-            later, earlier = views[q], views[m]
+    for q, later in enumerate(views):
+        found = dict[int, Proposals]()
+        for m, earlier in enumerate(views):
+            if q == m == 0:  # of the first camera they are verified already
+                continue
             sequence = settings.sequence if q == m else _VIEW_BY_VIEW
             stops = _stops(later, earlier, settings.propose)
             ranked = rank_places(indexes[m], later.places, stops, settings.propose.ranked, sequence, execution)
-            proposals, share = propose(ranked, settings.propose), max(shares[q], shares[m])
+            found[m] = propose(ranked, settings.propose)
+        own = {q: found.pop(q)} if q else {}
+        for m, proposals in (own | _best(found, settings.propose.per_query)).items():
             if len(proposals.query):
-                found = steps.part(verify_pair, proposals, share, later.pictures, earlier.pictures)
-                ledgers.append(_of_keyframes(found, (later, q), (earlier, m), views[0].pictures.keyframes))
+                share = max(shares[q], shares[m])
+                ledger = steps.part(verify_pair, proposals, share, later.pictures, views[m].pictures)
+                ledgers.append(_of_keyframes(ledger, (later, q), (views[m], m), views[0].pictures.keyframes))
     return _once(merged(ledgers, _numbered(ledgers)))
+
+
+def _best(found: dict[int, Proposals], count: int) -> dict[int, Proposals]:
+    """The best of the candidates in all other cameras together, so many of each query: with six cameras there are not
+    six times as many to verify."""
+    query, score = (np.concatenate([getattr(one, name) for one in found.values()]) for name in ("query", "score"))
+    order = np.lexsort([-score, query])
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order)) - np.searchsorted(query[order], query[order])
+    ends = np.cumsum([len(one.query) for one in found.values()])[:-1]
+    kept = np.split(place < count, ends)
+    return {m: one.rows(rows) for (m, one), rows in zip(found.items(), kept, strict=True)}
 
 
 @step("verify", lambda *_: closures_codec())
