@@ -447,11 +447,9 @@ def image_folder(folder: Path, _: Path) -> Path:
         (empty, "empty"),
         (wrong_magic, "RIFF"),
         (no_images, "image"),
-        (no_odometry, "odometry"),
         (no_messages, "odometry"),
         (one_frame, "two"),
         (no_decodable_image, "decodes"),
-        (only_nan_odometry, "odometry"),
         (image_folder, "odometry"),
     ],
     ids=lambda value: value.__name__ if callable(value) else "",
@@ -463,6 +461,18 @@ def test_a_log_that_cannot_be_run_is_one_line(
     error = verb("run", log, "-o", tmp_path / "run", *QUICK).error
     assert why in error
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("make", [no_odometry, only_nan_odometry])
+def test_a_log_without_odometry_is_run_by_its_images_unless_it_may_not(
+    verb: Verb, tiny: Drive, tmp_path: Path, make: Callable[[Path, Path], Path]
+) -> None:
+    log = make(tmp_path, tiny.log)
+    assert "has no odometry" in verb("run", log, "-o", tmp_path / "run", "--odometry", "", *QUICK).error
+    assert not (tmp_path / "run").exists()
+    found = verb("run", log, "-o", tmp_path / "run", "--json", *QUICK).json
+    assert found["scale"] == "unknown"
+    assert any("visual odometry of its images is used" in line for line in found["warnings"])
 
 
 def test_topics_that_are_not_there_are_named_with_the_choices(verb: Verb, drive: Drive, tmp_path: Path) -> None:
