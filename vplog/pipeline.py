@@ -149,11 +149,11 @@ def pipeline_folder() -> Path:
 
 
 STAGES = (
-    "read", "extract", "choose", "learn", "cover", "describe", "propose", "scale", "verify", "p_false", "decide",
-    "solve", "write", "report",
+    "read", "extract", "cameras", "choose", "learn", "cover", "describe", "propose", "scale", "verify",
+    "describe_cameras", "verify_cameras", "p_false", "decide", "solve", "write", "report",
 )  # fmt: skip
-"""Names of the steps of `run` in order, as run.json and progress have them; `scale` is for drives without metres and
-`decide` for decisions alone."""
+"""Names of the steps of `run` in order, as run.json and progress have them; those of cameras are for several, `scale`
+for drives without metres and `decide` for decisions alone."""
 
 
 def run(
@@ -182,7 +182,8 @@ def run(
         features = do(extract, log, topics, selected, pipeline)
         keyframes = decoded(selected, features, pipeline.features)
         decisions = read_decisions(Path(pipeline.decisions.file), keyframes) if pipeline.decisions.file else None
-        views = do(read_cameras, log, path, odometry, keyframes, pipeline, library is None)
+        others = {topic: topics.of_camera(topic) for topic in log.further_cameras() if odometry.metric}
+        views = do(read_cameras, log, others, odometry, keyframes, pipeline, library is None) if others else []
         if library is None:
             images = do(own_images, log, selected, keyframes, features, pipeline.library)
             references = own_references(keyframes, features, images)
@@ -198,8 +199,9 @@ def run(
             odometry, keyframes = in_one_scale(odometry, keyframes, camera, do(scale_ratios, proposals, drive))
             drive = replace(drive, keyframes=keyframes)
         closures = do(verify, proposals, drive)
-        views = [View.of(log, drive, descriptors), *do(describe_cameras, views, state)]
-        closures = do(verify_cameras, closures, views, state, pipeline)
+        views = [View.of(log, drive, descriptors), *(do(describe_cameras, views, state) if views else [])]
+        if len(views) > 1:
+            closures = do(verify_cameras, closures, views, state, pipeline)
         closures = do(
             rate_closures, closures, odometry, drive, pipeline.null_pairs, pipeline.propose, pipeline.noise
         )  # fmt: skip

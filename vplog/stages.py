@@ -11,7 +11,6 @@ if TYPE_CHECKING:
 
     from vplog import data
     from vplog.execution.execution import Execution
-    from vplog.logs import TopicChoice
 
 
 class EncodedFrame(Protocol):
@@ -41,8 +40,8 @@ class Log(Protocol):
 
     def camera(self) -> data.Camera: ...
 
-    def further_cameras(self) -> list[TopicChoice]:
-        """The choice of topics by which the same log has each further camera of the body as its own."""
+    def further_cameras(self) -> list[str]:
+        """Image topics of further cameras of the body; by `TopicChoice.of_camera` a log has each as its own."""
         ...
 
     def stamps(self) -> data.Ints:

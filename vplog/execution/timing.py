@@ -25,13 +25,10 @@ class StageTimer:
         began, cpu = time.perf_counter(), time.process_time()
         yield
         seconds = time.perf_counter() - began
-        before = self.stages.get(name, {})  # of the first camera, where there are several
-        seconds += before.get("seconds", 0.0)
-        items = before.get("items") if items is None else items + before.get("items", 0)
         entry: dict[str, Any] = {
             "seconds": round(seconds, 3),
-            "cpu_seconds": round(time.process_time() - cpu + before.get("cpu_seconds", 0.0), 3),
-            "peak_memory_mb": round(max(peak_memory_mb(), before.get("peak_memory_mb", 0.0)), 1),
+            "cpu_seconds": round(time.process_time() - cpu, 3),
+            "peak_memory_mb": round(peak_memory_mb(), 1),
         }
         if items is not None:
             entry |= {"items": items, "items_per_second": round(items / max(seconds, 1e-9), 2)}

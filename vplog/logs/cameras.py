@@ -136,7 +136,10 @@ def body_from_camera(tree: FrameTree, body: str, frame: str, notes: Notes, ahead
     if found is not None:
         return found
     if ahead:
-        notes.add("The static transforms do not place the camera; it is assumed at the body's origin, looking ahead.")
+        if len(tree):  # a folder of images has none
+            notes.add(
+                "The static transforms do not place the camera; it is assumed at the body's origin, looking ahead."
+            )
         return _AHEAD.copy()
     if len(tree) or (body and frame):
         notes.add(

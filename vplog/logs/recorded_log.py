@@ -66,7 +66,7 @@ class RecordedLog:
     def info(self) -> LogInfo:
         """Reads the chosen topics once, so that the warnings are complete."""
         content = self._content
-        others = {choice.image for choice in self.further_cameras()}
+        others = self.further_cameras()
         topics = [self._topic(channel, count, others) for channel, count in self._contents.counts.items()]
         if self._selection.image is not None:
             self._check_images()
@@ -78,7 +78,7 @@ class RecordedLog:
             [frame for frame in content.frames if frame], content.skew_ms, content.sources, self._truth_name,
         )  # fmt: skip
 
-    def _topic(self, channel: Channel, count: int, others: set[str | None]) -> Topic:
+    def _topic(self, channel: Channel, count: int, others: list[str]) -> Topic:
         part, rate_hz = self._content.chosen.parts.get(channel, ""), self._content.rates_hz.get(channel)
         part = part or ("image" if channel.topic in others else "")
         known = self._candidate(channel) or Candidate(channel, count, "")
@@ -113,16 +113,12 @@ class RecordedLog:
     def odometry(self) -> Odometry | None:
         return self._sidecar.odometry or self._content.odometry
 
-    def further_cameras(self) -> list[TopicChoice]:
-        choice, content = self._choice, self._content
-        topics = choice.cameras
-        if topics is None:
-            known = [] if choice.image is not None else further_cameras(self._candidates, self._selection)
-            mounted = (c for c in known if content.tree.between(self._body or BODY, c.frame) is not None)
-            topics = tuple(c.channel.topic for c in mounted)
-        own = {"depth": None, "right": None, "camera_info": None, "cameras": (), "mask": None}
-        masks = {topic: path for topic, path in choice.masks.items() if topic}
-        return [choice.model_copy(update={**own, "image": topic, "masks": masks}) for topic in topics]
+    def further_cameras(self) -> list[str]:
+        choice, body = self._choice, self._body or BODY
+        if choice.cameras is not None or choice.image is not None:
+            return list(choice.cameras or ())
+        known = further_cameras(self._candidates, self._selection)
+        return [c.channel.topic for c in known if self._content.tree.between(body, c.frame) is not None]
 
     def has_depth(self) -> bool:
         return self._pair is not None or self._depth is not None

@@ -143,8 +143,8 @@ CLOSURES = pa.schema(
         column("residual_before", pa.float64(), "sigma", "Mahalanobis distance to the odometry, null if unused.", True),
         column("residual_after", pa.float64(), "sigma", "Mahalanobis distance to the solution, null if unused.", True),
         column("weight", pa.float64(), "1", "Weight of the robust solve, 0 to 1, null if unused.", True),
-        column("query_camera", pa.int32(), "", "The query's camera by its number in run.json; 0 is the first.", True),
-        column("match_camera", pa.int32(), "", "The match's camera by its number in run.json; 0 is the first.", True),
+        column("query_camera", pa.int32(), "1", "The query's camera by its number in run.json; 0 is the first.", True),
+        column("match_camera", pa.int32(), "1", "The match's camera by its number in run.json; 0 is the first.", True),
     ]
 )
 JOINS = pa.schema(
@@ -634,9 +634,8 @@ def read_poses(table: pa.Table, prefix: str) -> Floats:
 def _values(table: pa.Table, name: str) -> np.ndarray:
     """A column as an array of its own, which may be written to; whole numbers that an older table lacks are 0."""
     column = table[name]
-    if column.null_count and pa.types.is_integer(column.type):
-        return np.zeros(len(column), column.type.to_pandas_dtype())
-    return np.array(column.to_numpy())
+    whole = column.null_count and pa.types.is_integer(column.type)
+    return np.array((column.fill_null(0) if whole else column).to_numpy())
 
 
 def _members(table: pa.Table, name: str, kind: type[T], path: Path | str) -> list[T]:

@@ -7,7 +7,7 @@ camera has it; its closure is carried to the keyframes by the odometry of the mo
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Protocol
@@ -30,8 +30,6 @@ from vplog.run.reference_library import own_images, own_references
 from vplog.run.verification import DriveFeatures, calibrated, for_verification, merged
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vplog.execution.execution import Execution
     from vplog.places.reference_choice import LibrarySettings
     from vplog.stages import Log, PlaceState
@@ -87,27 +85,26 @@ class View:
         return int(np.searchsorted(self.row, keyframe))
 
 
-@step("extract", items=lambda log, path, odometry, keyframes, *_: len(log.further_cameras()) * len(keyframes.stamp_ns))
+@step("cameras")
 def read_cameras(
-    log: Log, path: Path | Sequence[Path], odometry: Odometry, keyframes: Keyframes, settings: RigSettings,
+    log: Log, others: Mapping[str, logs.TopicChoice], odometry: Odometry, keyframes: Keyframes, settings: RigSettings,
     own_library: bool, *, steps: Steps, execution: Execution,
 ) -> list[View]:  # fmt: skip
-    """The pictures of every camera but the first, extracted, those with fewer than two left out with a warning."""
+    """The pictures of the other cameras, extracted; a camera that cannot be used is left out with a warning."""
     found = list[View]()
-    if not odometry.metric:  # nor are the mounts then known in its units
-        return found
-    for choice in log.further_cameras():
+    for topic, choice in others.items():
         try:
-            other = logs.open_drive(files_of(path), choice)
+            other = logs.open_drive(files_of(steps.cache.drive), choice)
             row, selected = pictures_at(keyframes, other.stamps(), odometry)
             features = extract(other, choice, selected, settings, steps=steps, execution=execution)
+            pictures, camera = decoded(selected, features, settings.features), other.camera()
+            chosen = (other, selected, pictures, features, settings.library)
+            images = steps.part(own_images, *chosen) if own_library else ()
         except LogError as error:
-            _log.warning("Camera %s is not used: %s", choice.image, error)
+            _log.warning("Camera %s is not used: %s", topic, error)
             continue
-        pictures = decoded(selected, features, settings.features)
-        images = steps.part(own_images, other, selected, pictures, features, settings.library) if own_library else ()
         row = row[np.searchsorted(selected.stamp_ns, pictures.stamp_ns)]
-        found.append(View(other, DriveFeatures(pictures, other.camera(), features, settings.verify), row, images))
+        found.append(View(other, DriveFeatures(pictures, camera, features, settings.verify), row, images))
         for warning in other.warnings:
             if warning not in log.warnings:
                 _log.warning(warning)
@@ -133,21 +130,19 @@ def pictures_at(keyframes: Keyframes, stamp_ns: Ints, odometry: Odometry) -> tup
     return row[first], Keyframes(keyframes.drive, stamp_ns[taken], poses)
 
 
-@step("describe", items=lambda views, *_: sum(len(view.row) for view in views))
+@step("describe_cameras")
 def describe_cameras(views: Sequence[View], state: PlaceState, *, steps: Steps) -> list[View]:
     """The views with a descriptor for each picture."""
     return [replace(view, places=steps.part(describe, state, view.log, view.pictures.features)) for view in views]
 
 
-@step("verify")
+@step("verify_cameras")
 def verify_cameras(
     closures: Closures, views: Sequence[View], state: PlaceState, settings: RigSettings,
     *, steps: Steps, execution: Execution,
 ) -> Closures:  # fmt: skip
     """The ledger of the first camera with the candidates of all other pairs of cameras, each pair of keyframes once: as
     the two cameras have it with which it is accepted with most inliers."""
-    if len(views) == 1:
-        return closures
     ledgers, indexes = [closures], [state.index(view.places) for view in views]
     shares = [calibrated(view.pictures, steps) for view in views]
     for q, later in enumerate(views):

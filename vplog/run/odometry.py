@@ -223,7 +223,7 @@ def _unknown(stamp_ns: np.ndarray) -> Odometry:
     """A motion of which nothing is known, with a break at every frame, by which keyframes are evenly spread in time."""
     poses = np.tile(np.eye(4), (len(stamp_ns), 1, 1))
     seconds = (stamp_ns - stamp_ns[0]) / 1e9
-    poses[:, 0, 3] = seconds * max(_SPEED, _SHORTEST / seconds[-1])
+    poses[:, 0, 3] = seconds * max(_SPEED, _SHORTEST / max(float(seconds[-1]), 1e-9))
     covariance = np.tile(np.eye(6), (len(stamp_ns), 1, 1))
     return Odometry(stamp_ns, poses, covariance, breaks=np.arange(1, len(stamp_ns)), metric=False)
 

@@ -5,16 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from vplog.data import Bytes, Camera, Frame, Gps, Ints, Lidar, LogInfo, Odometry, Reference, Scan, Trajectory
 from vplog.features.sift import SiftSettings
-
-if TYPE_CHECKING:
-    from vplog.logs import TopicChoice
 
 WIDTH, HEIGHT = 320, 200
 
@@ -74,7 +70,7 @@ class Drive:
     def camera(self) -> Camera:
         return Camera("camera", None, "none", np.zeros(0), WIDTH, HEIGHT, np.eye(4))
 
-    def further_cameras(self) -> list[TopicChoice]:
+    def further_cameras(self) -> list[str]:
         return []
 
     def stamps(self) -> Ints:

@@ -123,10 +123,10 @@ def _picture(end: str, row: dict[str, Any], opened: _Opened) -> tuple[Bytes, Fea
     stamp_ns = np.array([row[f"{end}_stamp_ns"]], np.int64)
     if number := row[f"{end}_camera"] or 0:
         names = run_record.recorded(opened.record, opened.folder / "run.json", list, "cameras")
-        choices = {one.image: one for one in log.further_cameras()}
-        if not 0 < number < len(names) or names[number] not in choices:
+        if not 0 < number < len(names) or names[number] not in log.further_cameras():
             raise ResultError(f"{log.name} has no camera {number} of the run: {otherwise}")
-        log = reopened(opened.record, opened.path, choices[names[number]])
+        topics = logs.TopicChoice.read(opened.record.get("topics") or {}, f"{opened.folder}/run.json")
+        log = reopened(opened.record, opened.path, topics.of_camera(str(names[number])))
         stamps = log.stamps()
         stamp_ns = stamps[[np.abs(stamps - stamp_ns).argmin()]]
     [(image, features)] = frames_at(log, stamp_ns, opened.pipeline, otherwise)
