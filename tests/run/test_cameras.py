@@ -72,7 +72,9 @@ def test_the_rear_camera_closes_the_way_back(rig: Path, verb: Callable[..., Said
 def test_one_camera_that_is_chosen_is_alone(rig: Path, verb: Callable[..., Said], tmp_path: Path) -> None:
     used = {t["name"] for t in verb("info", rig / "drive.mcap", "--json").json["topics"] if t["part"] == "image"}
     assert used == {IMAGE, REAR}
-    found = verb("run", rig / "drive.mcap", "-o", tmp_path / "run", "--json", "--image-topic", IMAGE, *QUICK).json
+    named = ("run", rig / "drive.mcap", "-o", tmp_path / "run", "--json", *QUICK, "--image-topic", IMAGE)
+    assert REAR in verb(*named, "--image-topic", "/raer/image_raw").error
+    found = verb(*named).json
     assert found["cameras"] == [IMAGE]
     assert "accepted" not in found["counts"]["verdicts"]
 

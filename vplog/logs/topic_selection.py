@@ -197,6 +197,8 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
         return not c.supported, sixteen_bits, not (info and info.calibrated), is_right
 
     image = pick("image", "depth", as_image)
+    for topic in choice.cameras or ():
+        _pick(candidates, choice.of_camera(topic), log, "image", "depth")  # raises where it is not there
     depth = calibration = right = right_info = None
     if image is not None:
         if choice.depth is not None or not choice.right:
