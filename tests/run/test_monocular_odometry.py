@@ -15,6 +15,7 @@ import pytest
 from vplog.data import Camera, Frame, Gps, Keyframes, Odometry
 from vplog.demo.scene import make_scene, take_picture
 from vplog.demo.settings import DemoSettings
+from vplog.errors import TruthError
 from vplog.geometry import geodesy, se3
 from vplog.pipeline import load_pipeline, run
 from vplog.results import run_record
@@ -227,3 +228,8 @@ def test_a_run_without_metres_is_evaluated_with_a_scale(finished: Path, drive: D
     assert known["scale"] is None
     assert found["closures"]["accepted_true"] == known["closures"]["accepted_true"]
     assert evaluate(folder, str(drive.truth), options=TruthOptions(align="se3"))["ate_after"]["alignment"] == "SE(3)"
+    lines = [line.split() for line in drive.truth.read_text().splitlines() if not line.startswith("#")]
+    standing = tmp_path / "standing.tum"
+    standing.write_text("".join(f"{line[0]} 1 2 3 {' '.join(line[4:])}\n" for line in lines))
+    with pytest.raises(TruthError, match="move"):
+        evaluate(folder, str(standing))

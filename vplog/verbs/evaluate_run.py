@@ -98,6 +98,10 @@ def evaluate_poses(
     scale = 1.0
     if not has_metres(record):
         scale = trajectory.ate(trajectory.at_truth(after, known)[0], known, alignment="sim3").scale
+        if not (np.isfinite(scale) and scale > 0):
+            raise TruthError(
+                f"{shown(truth)} does not move while the run does, so the run's unit of length is not known."
+            )
         after = Trajectory(after.stamp_ns, se3.stretched(after.world_from_body, scale))
         odometry = replace(odometry, odom_from_body=se3.stretched(odometry.odom_from_body, scale))
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)

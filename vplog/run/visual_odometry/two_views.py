@@ -81,9 +81,10 @@ def _refined(first: Points, second: Points, first_from_second: Floats, at: Float
     if found is None:
         return None
     depth = found.points[:, 2]
-    unit = UNIT_DEPTH / float(np.median(depth))
-    if not unit > 0:
+    middle = float(np.median(depth))
+    if not middle > 0:
         return None
+    unit = UNIT_DEPTH / middle
     pose = se3.inverse(found.world_from_camera[0]) @ found.world_from_camera[1]
     pose[:3, 3] *= unit
     good = depth > 0
