@@ -89,7 +89,7 @@ class TopicChoice(Settings):
     """s after the first image, from which on images are left out."""
 
     def of_camera(self, topic: str) -> TopicChoice:
-        """The same choice with a further camera as the one in use, and no others."""
+        """Choice of topics with a further camera as the one in use, and no others."""
         own = {"depth": None, "right": None, "camera_info": None, "mask": None, "cameras": ()}
         masks = {image: path for image, path in self.masks.items() if image}
         return self.model_copy(update={**own, "image": topic, "masks": masks})

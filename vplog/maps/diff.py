@@ -93,7 +93,7 @@ def _key(component: Component) -> str:
 
 
 def _pairs(ledger: Closures, query: str, match: str, stamps: dict[str, Ints]) -> dict[Pair, None]:
-    """Those in the solution, between drives that are still in the map."""
+    """Closures in the solution between drives that are still in the map."""
     if query not in stamps or match not in stamps:
         return {}
     used = ledger.of(*USED)

@@ -130,7 +130,7 @@ def check_metric(log: Log, topics: TopicChoice) -> None:
 
 
 def about_assumed(camera: Camera) -> str:
-    """What is assumed of a camera that is not calibrated."""
+    """Assumption about a camera that is not calibrated."""
     focal_px = undistort.focal_px(_assumed(camera))
     return (
         f"Camera {camera.name} is not calibrated: a focal length of {focal_px:.0f} px ({_FOCAL_LENGTH} times the "

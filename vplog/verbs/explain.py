@@ -103,7 +103,7 @@ class _Opened:
     record: dict[str, Any]
     pipeline: Pipeline
     path: Path | None
-    """Of the log, where it is not the run's own."""
+    """Path of the log, where it is not the run's own."""
     log: Log
 
 

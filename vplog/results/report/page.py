@@ -90,7 +90,7 @@ class Tracks:
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """What the page shows of closures."""
+    """Pictures of closures in the page."""
 
     views: dict[int, dict[str, Any]]
     """Matches, boxes and votes of a candidate closure by its row, see `closure_views.view`."""
