@@ -34,8 +34,6 @@ _EARLIER = 200
 """Runs before one that may share its displacement: bounds the pairs of graphs with thousands of false closures."""
 _PAIRS = 1 << 12
 """Pairs of runs compared at once: some megabytes."""
-_TOGETHER = 32
-"""Claims whose pairs are all compared at once: a call for each costs more than a thousand of them."""
 _RECENT = 10
 """Last members of a family by which the next one is predicted."""
 _SAMPLE = 200
@@ -97,6 +95,7 @@ class Accidents:
         self.room = log_room(graph, self.chain.poses)
         self._parted: dict[bytes, list[Ints]] = {}
         self._measured: dict[bytes, tuple[float, _Run | None]] = {}
+        self._joint: dict[tuple[int, ...], float] = {}
 
     def among(self, loops: Ints) -> Iterator[Ints]:
         """Runs of the edges `loops` (K,) that agree with each other: of those that do not, each lot is an accident of
@@ -116,6 +115,10 @@ class Accidents:
         if key not in self._measured:
             self._measured[key] = _as_one(self.graph, run, self.chain)
         return self._measured[key]
+
+    def families(self, together: list[_Run]) -> tuple[list[Ints], float]:
+        """See `families`; of sets that differ in a few runs, most families are the same."""
+        return families(Displacements.of(together, self.chain, self._joint), self.room)
 
 
 def log_evidence(factors: Factors, weight: Floats, poses: Floats, accidents: Accidents) -> float:
@@ -259,7 +262,7 @@ def _log_false(accidents: Accidents, false: Ints) -> tuple[float, int]:
             total += inner
             together.append(one)
     if together:
-        total += families(Displacements.of(together, accidents.chain), room)[1]
+        total += accidents.families(together)[1]
     return total, count
 
 
@@ -338,7 +341,7 @@ def agreeing(accidents: Accidents, loops: Ints) -> list[Ints]:
             together.append(one)
     if not together:
         return []
-    found, _ = families(Displacements.of(together, accidents.chain), accidents.room)
+    found, _ = accidents.families(together)
     sets = [np.concatenate([members[run] for run in family.tolist()]) for family in found]
     return sorted(sets, key=len, reverse=True)
 
@@ -396,13 +399,17 @@ class Displacements:
         Ad = self._adjoint(at_b)
         self._own = Ad @ noise @ np.swapaxes(Ad, 1, 2)
         self._after = self._adjoint(se3.inverse(self._displaced))
-        self._all: Floats | None = None
+        self._names = list(range(len(a)))
+        self._joint: dict[tuple[int, ...], float] = {}
 
     @classmethod
-    def of(cls, together: list[_Run], chain: OdometryChain) -> Displacements:
+    def of(cls, together: list[_Run], chain: OdometryChain, joint: dict[tuple[int, ...], float]) -> Displacements:
+        """Of runs that stay in memory; `joint` are densities by their identities, to which new ones are added."""
         a, b = np.array([run.a for run in together]), np.array([run.b for run in together])
         measured = np.array([run.a_from_b for run in together])
-        return cls(chain, a, b, measured, np.array([run.covariance for run in together]))
+        found = cls(chain, a, b, measured, np.array([run.covariance for run in together]))
+        found._names, found._joint = [id(run) for run in together], joint
+        return found
 
     @property
     def count(self) -> int:
@@ -431,6 +438,12 @@ class Displacements:
         """
         if len(members) == 1:
             return 0.0
+        key = tuple(self._names[member] for member in members)
+        if key not in self._joint:
+            self._joint[key] = self._log_joint(members)
+        return self._joint[key]
+
+    def _log_joint(self, members: list[int]) -> float:
         total, a, b = self._chain.total, self._a[members], self._b[members]
         middle = members[len(members) // 2]
         after = self._after[middle]
@@ -442,18 +455,10 @@ class Displacements:
         covariance = after @ shared(a, a) @ after.T + shared(b, b) - mixed - mixed.transpose(1, 0, 3, 2)
         covariance[range(len(a)), range(len(a))] += self._own[members]
         try:
-            return _log_common(self._twists(middle, members), np.swapaxes(covariance, 1, 2))[0]
+            twists = se3.log(se3.between(self._displaced[middle][None], self._displaced[members]))
+            return _log_common(twists[:, self._chain.axes], np.swapaxes(covariance, 1, 2))[0]
         except np.linalg.LinAlgError:
             return -np.inf
-
-    def _twists(self, one: int, others: list[int]) -> Floats:
-        """Twists (K, d) from a displacement to others; of few claims, those of all pairs are computed together."""
-        if self.count > _TOGETHER:
-            return se3.log(se3.between(self._displaced[one][None], self._displaced[others]))[:, self._chain.axes]
-        if self._all is None:
-            apart = se3.between(np.repeat(self._displaced, self.count, 0), np.tile(self._displaced, (self.count, 1, 1)))
-            self._all = se3.log(apart)[:, self._chain.axes].reshape(self.count, self.count, -1)
-        return self._all[one, others]
 
     def _adjoint(self, poses: Floats) -> Floats:
         return se3.adjoint(poses)[:, self._chain.axes][:, :, self._chain.axes]
