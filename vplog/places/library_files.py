@@ -86,7 +86,7 @@ class ReferencesState:
         save_references(self.references, self.settings, folder, self.hash)
 
     def save_small(self, folder: Path) -> None:
-        """Save it with thumbnails in place of the images, which figures alone need: four fifths of a library's bytes."""
+        """Save it with thumbnails in place of the images, which figures alone need: four fifths of its bytes."""
         small = [replace(one, image=one.features.thumbnail) for one in self.references]
         save_references(small, self.settings, folder, self.hash)
 
