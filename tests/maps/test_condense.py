@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import vplog
+from tests.maps.bucket import serving
 from tests.maps.joining.test_join import digests
 from vplog.data import Ranking
 from vplog.execution.execution import Execution
@@ -181,3 +182,14 @@ def test_drives_that_nothing_joins_are_condensed_each_for_itself(whole: Path, tm
     assert told["queries"]["by_other_drives"] == 0
     assert any("No drives are joined" in line for line in told["warnings"])
     assert all(one["places"]["after"] for one in told["drives"])
+
+
+def test_a_map_on_a_store_is_condensed_as_a_folder_is(whole: Path, tmp_path: Path, verb: Verb) -> None:
+    here = verb("map", "condense", whole, "-o", tmp_path / "small", "--loss", "0.05", "--json").json
+    with serving():
+        verb("map", "condense", whole, "-o", "s3://bucket/small", "--loss", "0", "--json")
+        verb("map", "condense", "s3://bucket/small", "-o", "s3://bucket/smaller", "--loss", "0.05", "--json")
+        there = verb("map", "info", "s3://bucket/smaller", "--check", "--json").json
+    assert there["problems"] == there["damaged_files"] == []
+    assert there["places"] <= here["places"]["after"] + 1
+    assert [sorted(one["drives"]) for one in there["components"]] == [sorted(HALVES)]
