@@ -1,29 +1,24 @@
-"""References of a map's library that its right answers owe least to.
+"""References of a map's library that fewest of its places name, found and left out.
 
 Which ones go is not decided by the queries that are lost without them: among a hundred references there are always
-some without which by chance none is lost, and taking these away one after the other until one is removes half of a
-library, which drives that the map has not seen miss (`python -m tests.benchmarks condense`). So they go in the order
-of what they add to right answers, and the queries lost only say how many.
+some without which by chance none is lost. Taking these away one after the other left half of a library before the
+first query of the map's own was lost, and a walk that the map had not seen found .72 of its views instead of .85. So
+references go in the order of the places that name them, and the queries lost only say how many.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pyarrow as pa
 
 from vplog.execution.execution import Execution
 from vplog.maps.condensation.own_queries import OwnAnswers, OwnPlaces, query_own_places, search_in_memory
 
 if TYPE_CHECKING:
-    from vplog.data import Ints
-    from vplog.stages import BoxState, CodedState
-
-_MOST_PAIRS = 20_000
-"""Queries, evenly along the map, whose answers tell what the references add: two hundred for each of a hundred."""
+    from vplog.stages import CodedState
 
 
 def remove_references(
@@ -32,7 +27,8 @@ def remove_references(
 ) -> tuple[OwnPlaces, OwnAnswers, CodedState]:  # fmt: skip
     """The places by the references that stay, their answers, and the recogniser with these. No more than so many
     queries fewer are answered rightly."""
-    order = _least_needed(places, answers, state)
+    start = state.lists(*places.columns).start
+    order = np.argsort(start[:, -1] - start[:, 0], kind="stable")
 
     def without(count: int) -> tuple[OwnPlaces, OwnAnswers, CodedState]:
         retained = np.sort(order[count:])
@@ -46,17 +42,3 @@ def remove_references(
 
     count = bisect_right(range(1, len(order)), most_lost, key=lost)
     return without(count) if count else (places, answers, state)
-
-
-def _least_needed(places: OwnPlaces, answers: OwnAnswers, state: CodedState) -> Ints:
-    """(L,) references by how much of the boxes of queries and their right answers is common on them, least first."""
-    step = -(-len(answers.place) // _MOST_PAIRS) or 1
-    match = np.array([one.rows[0] for one in answers.queries.best[::step]], np.int64)
-    column = pa.concat_arrays(places.columns).take(pa.array(np.concatenate([answers.place[::step], match])))
-    query = np.arange(len(match), dtype=np.int32)
-    shared = cast("BoxState", state).shared(state.from_arrow(column), query, query + np.int32(len(match)))
-    parts = zip(shared.references, shared.overlap, strict=True)
-    needed = np.zeros(state.shape[0])
-    for references, overlap in parts:
-        needed[references] += overlap
-    return np.argsort(needed, kind="stable")
