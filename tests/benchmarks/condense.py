@@ -89,7 +89,7 @@ def _read(name: str) -> Walk:
 
 def _curves(folder: Path, walks: Sequence[Walk], asking: Walk) -> dict[str, list[Point]]:
     """The whole map, and what is left of it at each loss, by how it was chosen."""
-    library, small, pipeline = folder / f"{asking.path.stem}-others", folder / "small", load_pipeline("default")
+    library, made, pipeline = folder / f"{asking.path.stem}-others", folder / "small", load_pipeline("default")
     if not (library / "library.json").exists():
         build_library([walk.path for walk in walks], library, pipeline)
     state: Any = pipeline.places.load(library, Execution())
@@ -99,11 +99,11 @@ def _curves(folder: Path, walks: Sequence[Walk], asking: Walk) -> dict[str, list
 
     def point(references: Ints, kept: Ints) -> Point:
         less = state.subset(references, Execution())
-        less.save_small(small)
+        less.save_small(made)
         index = less.index(less.from_arrow(state.on_subset(column.take(pa.array(kept)), references)))
         asked = Execution().map(less.describe, asking.features)
         best = np.array([kept[index.scores(one).argmax()] for one in asked])
-        return Point(len(references), len(kept), _mb(small, column, len(kept)), _recall(near, best))
+        return Point(len(references), len(kept), _mb(made, column, len(kept)), _recall(near, best))
 
     every, count = np.arange(state.shape[0]), len(places.drive)
     whole = point(every, np.arange(count))
@@ -112,7 +112,8 @@ def _curves(folder: Path, walks: Sequence[Walk], asking: Walk) -> dict[str, list
     for loss in LOSSES:
         found = condense_places(places, answers, state, TOLERANCE, loss)
         kept = np.flatnonzero(found.retained)
-        stamps = [(one.drive, one.stamp_ns) for one in found.state.references]
+        small: Any = found.state
+        stamps = {(one.drive, one.stamp_ns) for one in small.references}
         own = np.flatnonzero([(one.drive, one.stamp_ns) in stamps for one in state.references])
         curve["condense"].append(point(own, kept))
         drawn = [point(*_drawn(seed, (len(every), len(own)), (count, len(kept)))) for seed in range(SEEDS)]

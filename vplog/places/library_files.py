@@ -87,7 +87,8 @@ class ReferencesState:
 
     def save_small(self, folder: Path) -> None:
         """Save it with thumbnails in place of the images, which figures alone need: four fifths of its bytes."""
-        small = [replace(one, image=one.features.thumbnail) for one in self.references]
+        thumbnails = [(one, one.features.thumbnail) for one in self.references]
+        small = [one if thumbnail is None else replace(one, image=thumbnail) for one, thumbnail in thumbnails]
         save_references(small, self.settings, folder, self.hash)
 
 
