@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 
 WALKS = ("gardens_day_left", "gardens_day_right", "gardens_night_right")
 LOSS = 0.01
-LOSSES = (0.0, LOSS, 0.05, 0.2)
+LOSSES = (LOSS, 0.05, 0.2)
 TOLERANCE = 2.0
 """Frames; the walks are aligned to that."""
 SEEDS = 3
 """Of random removal."""
-BAR = 0.97
-"""Least R@1 at the loss stated by default, as a share of that of the whole map."""
+BAR = 0.95
+"""Least R@1 at the loss stated by default, as a share of that of the whole map; of 200 views, with an error of .03."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +68,7 @@ def condense(folder: Path) -> Iterator[Figure]:
     for asking in walks:
         curves[asking.path.stem] = curve = _curves(folder, [walk for walk in walks if walk is not asking], asking)
         [whole], at = curve["whole"], LOSSES.index(LOSS)
-        facts: dict[str, Any] = {"whole": vars(whole)}
-        facts |= {how: vars(curve[how][at]) for how in ("condense", "random", "even")}
+        facts = {how: [vars(one) for one in points] for how, points in curve.items()}
         name = f"R@1 of {asking.path.stem} in the condensed map of the others, share of the whole map's"
         yield Figure(name, curve["condense"][at].r_at_1 / whole.r_at_1, BAR, False, facts)
     _draw(folder, curves)
@@ -164,8 +163,12 @@ def _draw(folder: Path, curves: dict[str, dict[str, list[Point]]]) -> None:
                 )  # fmt: skip
             at = curve["condense"][LOSSES.index(LOSS)]
             axes.plot(at.mb, at.r_at_1, "*", color=colours["condense"], markersize=11, label=f"loss {LOSS}")
-            axes.set(title=f"{walk} in the others", xlabel="library and places of the map, MB", ylim=(0, 1.02))
-            axes.set_xscale("log")
+            axes.set(
+                title=f"{walk} in the others",
+                xlabel="library and places of the map, MB",
+                xlim=(0, None),
+                ylim=(0, 1.02),
+            )
             axes.grid(alpha=0.3)
         figure.axes[0].set_ylabel("R@1")
         figure.axes[0].legend(loc="lower right")
