@@ -174,7 +174,7 @@ class Reference:
     """One image of a raw-image library, with where it came from."""
 
     image: Bytes
-    """(H, W) uint8 grey."""
+    """(H, W) uint8 grey; smaller than the frame of its features in a library that has thumbnails alone."""
     features: Features
     drive: str
     stamp_ns: int

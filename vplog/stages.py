@@ -206,6 +206,14 @@ class CodedState(PlaceState, Protocol):
         """(256, 256) similarity of two codes."""
         ...
 
+    def subset(self, references: data.Ints, execution: Execution) -> CodedState:
+        """The recogniser with some of the references alone, in their order."""
+        ...
+
+    def on_subset(self, column: pa.Array, references: data.Ints) -> pa.Array:
+        """The places of a column by some of the references alone, with the numbers that `subset` gives them."""
+        ...
+
     def lists(self, *columns: pa.Array) -> Any:
         """The inverted lists of the places of several columns. Raises LibraryError where one is of another library."""
         ...

@@ -18,6 +18,7 @@ from vplog.errors import LibraryError, NewerError, SettingsError
 from vplog.execution.execution import Execution
 from vplog.places import library as lib
 from vplog.places import library_files
+from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
 
 if TYPE_CHECKING:
@@ -240,3 +241,18 @@ def test_a_library_that_cannot_be_written(state: PaperBobbState, tmp_path: Path)
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(LibraryError, match="Cannot write the library"):
         state.save(tmp_path / "file")
+
+
+def test_a_library_of_thumbnails_describes_as_the_whole_one(references: list[Reference], tmp_path: Path) -> None:
+    state = BobbSettings().learn(references, Execution())
+    state.save_small(tmp_path)
+    small = BobbSettings().load(tmp_path, Execution())
+    assert small.hash == state.hash
+    seen = noisy(references[3].features, 1, 8.0)
+    assert small.to_arrow([small.describe(seen)]) == state.to_arrow([state.describe(seen)])
+    image, whole = small.references[3].image, references[3].image
+    assert image.size < whole.size
+    assert image.shape[1] / image.shape[0] == pytest.approx(whole.shape[1] / whole.shape[0], rel=0.02)
+    small.save_small(tmp_path)
+    again = BobbSettings().load(tmp_path, Execution())
+    assert again.to_arrow([again.describe(seen)]) == state.to_arrow([state.describe(seen)])

@@ -94,7 +94,7 @@ def run_batch(
             if why := errors.get(urls[drive]):
                 done[drive] = Drive(drive, log, "failed", error=why)
                 options.on_drive(done[drive])
-            elif drive in known and known[drive]["key"] == record["key"] and not _is_damaged(store, drive):
+            elif drive in known and layout.made_alike(known[drive], record) and not _is_damaged(store, drive):
                 done[drive] = Drive(drive, log, "unchanged")
                 map_store.relocate(store, drive, log)
             else:

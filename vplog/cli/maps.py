@@ -73,7 +73,7 @@ def vacuum(arguments: argparse.Namespace) -> None:
 
 
 def condense_map(arguments: argparse.Namespace) -> None:
-    """Copy a map to another without the places that recognition can do without, at a stated loss."""
+    """Copy a map to another without the places and references that recognition can do without, at a stated loss."""
     from vplog.maps.condensation.condense import condense_map as condense
 
     with Progress(arguments) as progress:
@@ -198,7 +198,7 @@ def add_maps(
     sub = verb("vacuum", vacuum, "remove what was replaced on an object store")
     text = "age of what is removed, longer than any reader runs (default: 168, a week)"
     option(sub, "--hours", parser.number(lambda value: value >= 24, "at least 24"), "H", text, default=168.0)
-    sub = verb("condense", condense_map, "leave out the places that recognition can do without", threads)
+    sub = verb("condense", condense_map, "leave out the places and references that recognition can do without", threads)
     option(sub, "-o --target", place, "MAP2", "the new map", required=True)
     text = "recall at rank one that the map's own queries may lose (default: 0.01)"
     option(sub, "--loss", parser.number(lambda value: 0 <= value < 1, "from 0, below 1"), "SHARE", text, default=0.01)

@@ -460,8 +460,9 @@ def print_condensed(found: dict[str, Any]) -> None:
     print(f"recall       {recall['before']:.4f} before, {recall['after']:.4f} after; {found['loss']:g} may be lost")
     if found["faded"]["found"]:
         print(f"faded        {found['faded']['found']} places, {found['faded']['removed']} of them removed")
-    if (known := found["references"]) is not None:
-        print(f"references   {known['after']} of {known['library']} named by places, {known['before']} before")
+    library, known = found["library_bytes"], found["references"]
+    named = "" if known is None else f"{known['after']} of {plural(known['before'], 'reference')}, "
+    print(f"library      {named}{library['after'] / 1e6:.2f} of {library['before'] / 1e6:.2f} MB")
     print(
         f"{found['written']}: {places['after']} of {plural(places['before'], 'place')}, "
         f"{size['after'] / 1e3:.1f} of {size['before'] / 1e3:.1f} kB of descriptors"

@@ -121,7 +121,11 @@ def copy_library(store: Store, other: Store, library: str) -> None:
     made = store.staging / "library"
     shutil.rmtree(made, ignore_errors=True)
     copy_folder(other.library(library), made, f"the library of {other} to {store}")
-    settings = other.head().settings
+    put_library(store, made, library, other.head().settings)
+
+
+def put_library(store: Store, made: Path, library: str, settings: dict[str, Any]) -> None:
+    """Make a folder in staging the library of a new map."""
     store.write_head(map_store.Head(None, settings))  # a folder that holds a library alone is no map
     map_store.add_library(store, made, library)
     store.write_head(map_store.Head(library, settings))

@@ -18,7 +18,7 @@ from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ints, R
 from vplog.errors import LibraryError
 from vplog.places import expected_votes
 from vplog.places.code_search import BLOCK, CodeIndex, CodeLists, Place, build_lists
-from vplog.places.columns import RecordState, from_column
+from vplog.places.columns import RecordState, from_column, to_column
 from vplog.places.library_files import RelearnedSettings
 from vplog.places.matches import Matcher, Matches, Once, WeighedMatchSettings, index_references
 from vplog.places.overlap import list_shared
@@ -270,6 +270,19 @@ class BobbState(RecordState):
         arrays: Any = [self.checked(from_column(column, self.arrow_type)) for column in columns]
         references, weights, boxes = (np.concatenate(part) for part in zip(*arrays, strict=True))
         return build_lists(references, weights, boxes, len(self.matcher), BLOCK)
+
+    def subset(self, references: Ints, execution: Execution) -> BobbState:
+        """The recogniser with some of the references alone, in their order."""
+        return self.settings.prepare([self.references[row] for row in references.tolist()], execution)
+
+    def on_subset(self, column: pa.Array, references: Ints) -> pa.Array:
+        """The places of a column by some of the references alone, with the numbers that `subset` gives them."""
+        known, weights, boxes = self.checked(from_column(column, self.arrow_type))
+        number = np.full(NOBODY + 1, NOBODY, np.uint16)
+        number[references] = np.arange(len(references), dtype=np.uint16)
+        gone = number[known] == NOBODY
+        fields = number[known], np.where(gone, 0, weights), np.where(gone[..., None], NOWHERE, boxes)
+        return to_column(self.arrow_type, iter(fields))
 
     def overlaps(self) -> Bytes:
         """(256, 256) cells that the boxes of two numbers share."""

@@ -27,8 +27,8 @@ from vplog.storage.parquet_limits import check_columns, check_file, check_versio
 from vplog.storage.scratch import put_in_place, sync_all
 from vplog.version import __version__
 
-_FORMAT = 1
-"""Version of library.json. A reader refuses a newer one."""
+_FORMAT = 2
+"""Version of library.json. A reader refuses a newer one. Those with images are of version 1, with thumbnails of 2."""
 _MAX_FEATURES = 50_000_000
 """Features a library file may claim: 6.4 GB of descriptors, far above any library that one machine can search."""
 
@@ -85,6 +85,12 @@ class ReferencesState:
     def save(self, folder: Path) -> None:
         save_references(self.references, self.settings, folder, self.hash)
 
+    def save_small(self, folder: Path) -> None:
+        """Save it with thumbnails in place of the images, which figures alone need: four fifths of its bytes."""
+        thumbnails = [(one, one.features.thumbnail) for one in self.references]
+        small = [one if thumbnail is None else replace(one, image=thumbnail) for one, thumbnail in thumbnails]
+        save_references(small, self.settings, folder, self.hash)
+
 
 def keep_references(references: Iterable[Reference], features: int | None = None) -> list[Reference]:
     """The references with their `features` strongest features, None for all. Raises LibraryError for none."""
@@ -117,8 +123,8 @@ _REFERENCES = pa.schema(
 def save_references(
     references: Sequence[Reference], settings: Settings, folder: Path, digest: str | None = None
 ) -> None:
-    """Write references.parquet (images as PNG), features.parquet and library.json, the last one last; `digest` is the
-    state's hash, where more than references and settings is in it."""
+    """Write references.parquet (images as PNG, or their thumbnails), features.parquet and library.json, the last one
+    last; `digest` is the state's hash, where more than references and settings is in it."""
     check_regular(folder, "library.json")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -137,7 +143,7 @@ def save_references(
         columns = [*zip(*entries, strict=True), images]
         _write(folder / "references.parquet", _REFERENCES, columns, compression="none")
         record = {
-            "format": _FORMAT,
+            "format": _FORMAT if any(r.image.shape != (r.features.height, r.features.width) for r in references) else 1,
             "vplog": __version__,
             "hash": digest or references_hash(references, settings),
             "references": len(references),
@@ -224,12 +230,17 @@ def load_references(folder: Path, execution: Execution = Execution()) -> list[Re
             image = decode_image(entry["image"])
         except BadImageError:
             image = None
-        if image is None or image.shape != (height, width):
+        side = (THUMBNAIL_SIDE, THUMBNAIL_SIDE)
+        if image is None or image.shape not in ((height, width), side):
             raise LibraryError(
                 f"{folder}: the image of reference {row} is damaged; build it again with `vplog library`."
             )
         nothing = np.full(part.stop - part.start, np.nan, np.float32)
-        thumbnail = cv2.resize(image, (THUMBNAIL_SIDE, THUMBNAIL_SIDE), interpolation=cv2.INTER_AREA).astype(np.uint8)
+        thumbnail = image if image.shape == side else cv2.resize(image, side, interpolation=cv2.INTER_AREA)
+        thumbnail = thumbnail.astype(np.uint8, copy=False)
+        if image.shape != (height, width):  # in the image's proportions, no larger: its size is what a file claims
+            across, down = (max(THUMBNAIL_SIDE * one // max(width, height), 1) for one in (width, height))
+            image = cv2.resize(image, (across, down), interpolation=cv2.INTER_AREA)
         found = Features(points[part], sizes[part], descriptors[part], nothing, width, height, thumbnail)
         return Reference(image.astype(np.uint8, copy=False), found, entry["drive"], entry["stamp_ns"])
 

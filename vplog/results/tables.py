@@ -478,12 +478,15 @@ def on_keyframes(keyframe: Int32s) -> Ints | None:
     return np.searchsorted(middle, np.arange(keyframe[-1] + 1), side="left")
 
 
-def write_some_descriptors(source: Path, path: Path, rows: Ints) -> None:
-    """Some rows of a table of descriptors, as they are, under its header. Raises ResultError."""
+def write_some_descriptors(source: Path, path: Path, rows: Ints, descriptors: pa.Array, library: str) -> None:
+    """Some rows of a table of descriptors (N,), by a library of this hash, else as they are. Raises ResultError."""
     with reading(source), open_table(source) as file:
         _check_name(source, "descriptors", file.schema_arrow)
-        table = read_table(source, file, ["keyframe", "stamp_ns", "descriptor"]).take(pa.array(rows))
+        table = read_table(source, file, ["keyframe", "stamp_ns", "descriptor"])
+    field = table.schema.field("descriptor")
+    table = table.set_column(2, field, descriptors.cast(field.type)).take(pa.array(rows))
     header = {key: value for key, value in (table.schema.metadata or {}).items() if key != VERSION_KEY.encode()}
+    header[b"vplog.library"] = library.encode()
     with replacing(path) as stream:
         write_table(stream, table.replace_schema_metadata(header), DESCRIPTORS_PER_GROUP, compression="zstd")
 

@@ -1,1 +1,1 @@
-"""The places of a map that recognition can do without are found, and left out of a new map."""
+"""The places and references of a map that recognition can do without are found, and left out of a new map."""

@@ -17,7 +17,8 @@ from vplog.geometry import se3
 from vplog.maps.condensation.redundancy import OwnQueries
 from vplog.maps.joining.joint_record import joint_components, keyframe_poses
 from vplog.maps.search.exact import Answers, best_places, merge, no_answers
-from vplog.maps.search.index import place_keyframes, read_column, update_index
+from vplog.maps.search.index import SegmentView, place_keyframes, read_column, update_index
+from vplog.maps.search.segment import Segment
 from vplog.maps.storage.layout import PICTURES
 from vplog.stages import CodedState, PlaceState, index_of_part
 
@@ -112,8 +113,13 @@ def search_of(
     return search_in_memory(places, state), []
 
 
-def search_in_memory(places: OwnPlaces, state: PlaceState) -> Search:
-    """The search for single views by an index of each drive."""
+def search_in_memory(places: OwnPlaces, state: PlaceState, execution: Execution = Execution()) -> Search:
+    """The search for single views by inverted lists where the recogniser has them, else by an index of each drive."""
+    if isinstance(state, CodedState):
+        segment = Segment("", (), places.first, state.lists(*places.columns))
+        part = SegmentView(segment, None, np.arange(len(places.drives), dtype=np.int32))
+        threads = Execution(execution.threads)
+        return lambda views, top: best_places([part], state, views, top, threads)
     indexes = [index_of_part(state, state.from_arrow(column)) for column in places.columns]
 
     def by_drive(views: Sequence[Any], top: int) -> Answers:

@@ -17,7 +17,7 @@ from vplog.errors import LogError, ResultError
 from vplog.features.store import FeatureStore
 from vplog.loops.calibration import turning_pairs
 from vplog.loops.verify import VerifySettings, calibration_share, drive_of
-from vplog.maps.storage.layout import folder_name
+from vplog.maps.storage.layout import described_with, folder_name
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables
 from vplog.results.camera_record import camera_from
@@ -68,7 +68,7 @@ def member_of(store: Store, about: dict[str, Any]) -> Member:
     topics = run_record.read_run_json(record).get("topics")
     made_from = {
         "inputs": about["inputs"],
-        "library": about["library"],
+        "library": described_with(about),
         "code": about.get("code"),
         "topics": about.get("topics"),
         "gps": pipeline.gps.use,

@@ -30,7 +30,10 @@ ADD_AGAIN = "compute the drive again: vplog batch LOG -o MAP"
 """Remedy for a damaged drive in messages."""
 PICTURES = "pictures"
 """Field in drive.json of a folder of images without odometry: its places have no poses."""
-_NOT_IN_KEY = ("key", "log", "earth", "format", "files", PICTURES)
+DESCRIBED_WITH = "described_with"
+"""Field in drive.json of a drive whose places were made with a larger library than the map has since it was condensed:
+the hash of that one, by which its key and its joins are known."""
+_NOT_IN_KEY = ("key", "log", "earth", "format", "files", PICTURES, DESCRIBED_WITH)
 """Fields of drive.json that its key does not depend on."""
 _MOST_NAME = 200
 """Characters of a drive's name in a file's; what stands around them takes up to thirty more."""
@@ -128,9 +131,23 @@ def free_name(drive: str, log: str, known: Collection[str]) -> str:
 
 def renamed(record: dict[str, Any], drive: str) -> dict[str, Any]:
     """drive.json of the drive under another ID: with the key that a batch would give it."""
+    own = _key(record) == record["key"]
+    return {**record, "drive": drive, "key": _key({**record, "drive": drive}) if own else record["key"]}
+
+
+def described_with(record: dict[str, Any]) -> str:
+    """Hash of the library that a drive's places were made with."""
+    return str(record.get(DESCRIBED_WITH, record["library"]))
+
+
+def made_alike(known: dict[str, Any], record: dict[str, Any]) -> bool:
+    """Whether a drive of a map is made from what a record names, be it with the library before it was condensed."""
+    return bool(known["key"] == _key({**record, DESCRIBED_WITH: known.get(DESCRIBED_WITH, record["library"])}))
+
+
+def _key(record: dict[str, Any]) -> str:
     made_from = {name: value for name, value in record.items() if name not in _NOT_IN_KEY}
-    own = key_of(made_from) == record["key"]
-    return {**record, "drive": drive, "key": key_of({**made_from, "drive": drive}) if own else record["key"]}
+    return key_of({**made_from, "library": described_with(record)})
 
 
 def set_drive_id(path: Path, drive: str) -> None:
