@@ -404,7 +404,7 @@ class Displacements:
 
     @classmethod
     def of(cls, together: list[_Run], chain: OdometryChain, joint: dict[tuple[int, ...], float]) -> Displacements:
-        """The claims of runs; `joint` holds densities by the identities of runs that stay in memory, and gets new ones."""
+        """The claims of runs that stay in memory; `joint` holds densities by their identities, and gets new ones."""
         a, b = np.array([run.a for run in together]), np.array([run.b for run in together])
         measured = np.array([run.a_from_b for run in together])
         found = cls(chain, a, b, measured, np.array([run.covariance for run in together]))
