@@ -100,15 +100,13 @@ def test_columns_that_are_missing_or_of_another_type(tmp_path: Path, number: int
 
 def test_records_of_a_newer_version_are_refused(tmp_path: Path) -> None:
     """A run folder, a library; those before versions are of the first."""
-    run, library = tmp_path / "run.json", tmp_path / "library.json"
-    for version, newer in ((None, False), (1, False), (2, True)):
-        record = {"vplog": "9.8", "finished": True, "hash": "a", "settings": {}}
-        text = json.dumps(record if version is None else {**record, "format": version})
-        run.write_text(text)
-        library.write_text(text)
-        for read in (read_finished_run, read_library_record):
-            if not newer:
+    for read, name, newest in ((read_finished_run, "run.json", 1), (read_library_record, "library.json", 2)):
+        for version in (None, *range(1, newest + 2)):
+            record = {"vplog": "9.8", "finished": True, "hash": "a", "settings": {}}
+            (tmp_path / name).write_text(json.dumps(record if version is None else {**record, "format": version}))
+            if version is None or version <= newest:
                 assert read(tmp_path)["hash"] == "a"
                 continue
-            with pytest.raises(NewerError, match=r"by vplog 9.8 in version 2 .* reads up to version 1. Update vplog"):
+            refused = rf"by vplog 9.8 in version {newest + 1} .* reads up to version {newest}. Update vplog"
+            with pytest.raises(NewerError, match=refused):
                 read(tmp_path)
