@@ -20,6 +20,7 @@ from vplog.demo import SMALL, make_drive
 from vplog.execution.execution import Execution
 from vplog.execution.process_pool import OwnProcesses
 from vplog.pipeline import load_pipeline, run
+from vplog.run.figures import canvas
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -97,9 +98,10 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def no_lines() -> Iterator[None]:
-    """A slow machine adds no line a minute to what verbs say on stderr."""
+    """A slow machine adds no line a minute to what verbs say on stderr, and figures are of few pixels."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(progress, "LINE_EVERY_S", 1e9)
+        patch.setattr(canvas, "DPI", 40)
         yield
 
 
