@@ -8,6 +8,7 @@ import os
 import shutil
 from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,6 @@ from vplog.demo import SMALL, make_drive
 from vplog.execution.execution import Execution
 from vplog.execution.process_pool import OwnProcesses
 from vplog.pipeline import load_pipeline, run
-from vplog.run.figures import canvas
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -97,11 +97,13 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def no_lines() -> Iterator[None]:
-    """A slow machine adds no line a minute to what verbs say on stderr, and figures are of few pixels."""
+def quick() -> Iterator[None]:
+    """A slow machine adds no line a minute to what verbs say on stderr, verbs are parsed by one parser, which takes 25 ms
+    to make, and no disk is waited for."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(progress, "LINE_EVERY_S", 1e9)
-        patch.setattr(canvas, "DPI", 40)
+        patch.setattr(main, "_parser", cache(main._parser))
+        patch.setattr(os, "fsync", lambda _: None)
         yield
 
 
