@@ -98,8 +98,8 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def quick() -> Iterator[None]:
-    """A slow machine adds no line a minute to what verbs say on stderr, verbs are parsed by one parser, which takes 25 ms
-    to make, and no disk is waited for."""
+    """No line a minute on stderr, however slow the machine; one parser of all verbs, which takes 25 ms to make; and no
+    waiting for the disk."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(progress, "LINE_EVERY_S", 1e9)
         patch.setattr(main, "_parser", cache(main._parser))
