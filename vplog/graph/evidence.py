@@ -18,6 +18,7 @@ from vplog.geometry import se3
 from vplog.graph.build import AXES, informed, parts
 from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, residual_sigma
 from vplog.graph.least_squares import GAUGE_SIGMA, Objective
+from vplog.graph.leave_one_out import tension
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -45,6 +46,8 @@ _TAIL = 3.0
 """Noise of closures that err by much as a multiple of that of the others."""
 _TAIL_SHARES = np.array([0.0, 0.01, 0.02, 0.05, 0.1, 0.2])[:, None]
 """Shares of them among the true ones, as likely as each other."""
+_MULTIPLES = 2.0 ** np.arange(-5.0, 6.5, 0.5)
+"""Noise of single closures as multiples of the sigma that they have on average."""
 _LOG_2PI = math.log(2.0 * math.pi)
 _LEAST_SIDE = 0.1
 """Shortest side of the box of places as a share of its longest: a flat drive still has false closures off its plane."""
@@ -57,6 +60,21 @@ _LEAST_SIDE_M = 5.0
 _VIEW_RAD = 0.2
 """Rotations that SIFT features stand."""
 _VIEW_M = 0.5
+
+
+def _student() -> Floats:
+    """(M, 23) probability of each of `_MULTIPLES` under t distributions of several degrees of freedom and scales, as
+    likely as each other; the first is the normal one."""
+    found = [np.where(_MULTIPLES == 1.0, 1.0, 0.0)]
+    for freedom in (1.0, 2.0, 4.0, 8.0):
+        for scale in _MULTIPLES[(_MULTIPLES >= 0.125) & (_MULTIPLES <= 1.0)].tolist():
+            log_precision = 2.0 * np.log(scale / _MULTIPLES)
+            density = np.exp(0.5 * freedom * (log_precision - np.exp(log_precision)))  # gamma, by its logarithm
+            found.append(density / density.sum())
+    return np.array(found)
+
+
+_STUDENT = _student()
 
 
 class _Run(NamedTuple):
@@ -143,6 +161,35 @@ def log_tails(chi2: Floats, d: int) -> float:
     with np.errstate(divide="ignore"):
         gain = np.logaddexp(np.log1p(-_TAIL_SHARES), np.log(_TAIL_SHARES) + wide).sum(1)
     return float(np.logaddexp.reduce(gain)) - math.log(len(gain))
+
+
+def log_student(factors: Factors, weight: Floats, poses: Floats, multiple: Floats) -> float:
+    """Log of how much likelier the residuals of the closures of positive weight are where their noise is Student's t in
+    place of normal.
+
+    `multiple` (E,) is by what the factors have the sigma of single closures multiplied already; NaN where that is open.
+
+    Each is compared with the prediction of all others, so those of closures that nothing checks tell nothing. t is a
+    normal distribution whose variance is drawn for each closure (Lange, Little and Taylor, Robust statistical modeling
+    using the t distribution, JASA 1989); its degrees of freedom and scale are integrated over, the normal among them.
+    """
+    loops = np.flatnonzero(~factors.graph.odometry & (weight > 0))
+    closures = tension(factors, weight, poses, loops)
+    gain = np.empty((len(loops), len(_MULTIPLES)))
+    for column, times in enumerate(_MULTIPLES.tolist()):
+        less = 1.0 - times**2
+        ratio = 1.0 - closures.redundancy * less  # of the variances of a residual's prediction error
+        gain[:, column] = -0.5 * (np.log(ratio) + closures.whitened**2 * less / ratio).sum(1)
+    known = np.isfinite(multiple[loops])
+    gain[known] = np.where(_nearest_multiple(multiple[loops[known]])[:, None] == _MULTIPLES, 0.0, -np.inf)
+    most = gain.max(1, keepdims=True)
+    density = np.log(np.maximum(np.exp(gain - most) @ _STUDENT.T, 1e-300)).sum(0) + most.sum()
+    return float(np.logaddexp.reduce(density)) - math.log(len(density))
+
+
+def _nearest_multiple(multiple: Floats) -> Floats:
+    """(K,) the nearest of `_MULTIPLES` to each."""
+    return _MULTIPLES[np.abs(np.log(multiple)[:, None] - np.log(_MULTIPLES)).argmin(1)]
 
 
 def log_room(graph: PoseGraph, places: Floats) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from vplog.errors import GraphError
 from vplog.graph.build import informed
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, is_loop, residual_sigma
-from vplog.graph.evidence import Accidents, agreeing, log_evidence, log_room, runs
+from vplog.graph.evidence import Accidents, agreeing, log_evidence, log_room, log_student, log_tails, runs
 from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
 from vplog.graph.least_squares import Objective, descend
@@ -73,6 +73,12 @@ class Hypothesis:
     sigmas: Sigmas
     log_evidence: float
 
+    def by_heavy_tails(self, factors: Factors, multiple: Floats) -> float:
+        """By how much the evidence grows where the noise of closures is Student's t; see `log_student`."""
+        of_loops = (residual_sigma(factors.graph, self.poses) ** 2)[~factors.graph.odometry & (self.weight > 0)]
+        log_normal = log_tails(of_loops, degrees_of_freedom(factors.graph))
+        return log_student(factors, self.weight, self.poses, multiple) - log_normal
+
 
 def best_hypothesis(
     graph: PoseGraph, optimiser: Optimiser, cost: Cost | None = None, log_odds: Floats | None = None
@@ -111,8 +117,17 @@ def best_hypothesis(
 
 
 def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: Cost | None) -> list[Hypothesis]:
-    """The hypothesis with the closures that it predicts within the noise that the log claims, where that makes it
-    likelier: estimated from those that fit best, noise is too small for some, which then err as claimed."""
+    """The hypothesis with the closures that it predicts within the noise that the log claims, where noise of heavy
+    tails makes that likelier: estimated from those that fit best, noise is too small for the others. No margin is asked
+    for, since none of them pulls far.
+
+    The poses of greatest density are near those where they err as the others do, or those where they err as claimed.
+    """
+
+    def value(one: Hypothesis, factors: Factors, multiple: Floats) -> float:
+        other = 0.0 if cost is None else cost(factors, one.weight, one.poses)
+        return one.log_evidence + one.by_heavy_tails(factors, multiple) - other
+
     rejected = np.flatnonzero(best.weight == 0)
     if not len(rejected) or not isinstance(optimiser, GncSettings):
         return []
@@ -121,21 +136,21 @@ def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: 
     within = rejected[apart <= chi2_quantile(optimiser.inlier_probability, degrees_of_freedom(claimed.graph))]
     if not len(within):
         return []
-    at, weight = AtSigmas.of(claimed, best.sigmas), np.array(best.weight)
+    weight = np.array(best.weight)
     weight[within] = 1.0
-    information = at.factors.graph.information.copy()
-    information[within] = claimed.graph.information[within]
-    some = replace(at, factors=replace(at.factors, graph=replace(at.factors.graph, information=information)))
-    more, true = some.hypothesis(weight, best.poses), int(weight[is_loop(claimed.graph)].sum())
-    gain = more.log_evidence - best.log_evidence - _log_ways(true, len(within)) + _log_ways(true - len(within), 0)
-    if cost is not None:
-        gain -= cost(some.factors, weight, more.poses) - cost(at.factors, best.weight, best.poses)
-    return [_refit(claimed, weight, best.poses, best.sigmas)] if gain > 0.0 else []  # none of them pulls far
-
-
-def _log_ways(count: int, some: int) -> float:
-    """Log of in how many ways so many of them, any number being as likely as another, are some of a count."""
-    return math.lgamma(count + 1) - math.lgamma(some + 1) - math.lgamma(count - some + 1) + math.log(count + 1)
+    more, at, unknown = (
+        _refit(claimed, weight, best.poses, best.sigmas),
+        AtSigmas.of(claimed, best.sigmas),
+        weight * np.nan,
+    )
+    information, multiple = at.factors.graph.information.copy(), unknown.copy()
+    information[within], multiple[within] = claimed.graph.information[within], 1.0 / best.sigmas.of_closures
+    wide = replace(at, factors=replace(at.factors, graph=replace(at.factors.graph, information=information)))
+    values = (
+        value(more, _times(claimed, more.sigmas), unknown),
+        value(wide.hypothesis(weight, best.poses), wide.factors, multiple),
+    )
+    return [more] if max(values) > value(best, at.factors, unknown) else []
 
 
 def _recognised(

@@ -37,6 +37,10 @@ class Tension:
 
     cost: Floats
     """(K,) by how much chi-square falls without the closure, to first order."""
+    whitened: Floats
+    """(K, d) residuals in sigma, along axes on which the noise of the rest's prediction is independent."""
+    redundancy: Floats
+    """(K, d) share of a closure's error that its residual shows along these axes: 0 where nothing else checks it."""
     covariance: Floats
     """(K, d, d) of the motion between the ends, the closure itself included, in the frame of b."""
     force: Floats
@@ -62,6 +66,8 @@ def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Ten
     whitened = (np.swapaxes(turn, 1, 2) @ (root @ error[:, axes, None]))[:, :, 0]
     return Tension(
         cost=(whitened**2 / rest).sum(1),
+        whitened=whitened,
+        redundancy=rest,
         log_spread=-0.5 * (np.linalg.slogdet(information)[1] + np.log(rest).sum(1)),
         covariance=covariance,
         force=(information @ error[:, axes, None])[:, :, 0],
