@@ -432,6 +432,9 @@ class Map:
         *,
         topics: Topics | None = None,
         sequence: int | None = None,
+        drives: Sequence[str] = (),
+        box: tuple[float, float, float, float] | None = None,
+        near_fixes_m: float | None = None,
         out: Place | None = None,
         engine: str = "local",
         address: str | None = None,
@@ -443,6 +446,8 @@ class Map:
         """The `top` places of the map most like each view of a log.
 
         sequence: views in a window, odd; 1 ranks each by itself, None as the map's settings say.
+        drives, box, near_fixes_m: search only drives of these names, that may have places in a box of degrees (south,
+            west, north, east), or within metres of the log's own satellite fixes.
         out: a Parquet file for the answers.
         engine, address: who searches, as in `batch`.
         cache, cache_gb: folder and size of the cache of a map by URL.
@@ -455,7 +460,8 @@ class Map:
         threads = threads or available()
         downloads = cache_in(cache, cache_gb) if isinstance(self.place, RemotePath) else None
         with limited(threads), open_engine(BatchOptions(engine=engine, address=address), threads) as workers:
-            query = MapQuery(top, sequence, None if out is None else located(out), workers.executor, downloads)
+            place = None if out is None else located(out)
+            query = MapQuery(top, sequence, place, workers.executor, downloads, drives, box, near_fixes_m)
             found = query_map(self.place, located(log), _topics(topics), query, Execution(threads, progress))
         return Answers(found)
 

@@ -28,6 +28,7 @@ from tests.benchmarks.mining import describing, mining
 from tests.benchmarks.reading import LARGE_GB, SMALL_GB, reading
 from tests.benchmarks.scale import scale
 from tests.benchmarks.search import free_memory_gb, growth, search
+from tests.benchmarks.serve import serve
 from vplog.pipeline import load_pipeline, pipeline_folder
 from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
@@ -49,7 +50,7 @@ DISCOVERY_BAR = 1000.0
 SEARCH_BARS = (4.0, 40.0)
 """Times faster than a scan of binary codes, and of vectors of floats."""
 SIZES = (10_000, 100_000, 1_000_000, 10_000_000)
-LONG = {"large", "batch", "localize", "condense", "ask"}
+LONG = {"large", "batch", "localize", "condense", "ask", "serve"}
 """What is measured where it is named."""
 LARGEST_NEEDS_GB = 12.0
 """Memory that must be free for the largest map: the places, the index, and what the system needs beside."""
@@ -81,6 +82,7 @@ def _arguments() -> argparse.Namespace:
         "search",
         "growth",
         "scale",
+        "serve",
         "graphs",
         "reading",
         "large",
@@ -157,6 +159,9 @@ def _long(arguments: argparse.Namespace) -> Iterator[Figure]:
     if "condense" in arguments.what:
         with tempfile.TemporaryDirectory() as made:
             yield from condense(arguments.folder or Path(made))
+    if "serve" in arguments.what:
+        with tempfile.TemporaryDirectory() as made:
+            yield from serve(arguments.places, arguments.folder or Path(made))
     if "ask" in arguments.what:
         yield from ask(arguments.questions, arguments.seeds, arguments.runs)
     if "localize" in arguments.what:

@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 from tests.results.example import COUNT, make_run
 from vplog.geometry import tum
 from vplog.maps.storage import layout, map_store
+from vplog.pipeline import load_pipeline
 from vplog.results import run_record, tables
 
 if TYPE_CHECKING:
@@ -67,6 +68,18 @@ def _written(folder: Path, drive: str, seed: int, library: str, world_from_enu: 
     log = f"/logs/{seed}/{drive.partition('-')[0]}.mcap"
     run_record.write_run_json(folder / "drive.json", {**made_from, "key": layout.key_of(made_from), "log": log})
     return folder
+
+
+def map_of_run(root: Path, finished: Path) -> Path:
+    """A map of three drives: every place of a finished run, its second half backwards, and its first ten."""
+    library = json.loads((finished / "library" / "library.json").read_text())["hash"]
+    with map_store.writing(root) as store:
+        shutil.copytree(finished / "library", store.staging / "library")
+        map_store.add_library(store, store.staging / "library", library)
+        store.write_head(map_store.Head(library, load_pipeline("default").model_dump(mode="json")))
+        for name, rows in (("all", slice(None)), ("back 1/2", slice(None, 20, -1)), ("ten", slice(10))):
+            put_rows(store, name, finished, library, rows)
+    return root
 
 
 def make_map(root: Path, drives: dict[str, int], library: str = LIBRARY) -> Path:

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from tests.maps.runs import put_rows
+from tests.maps.runs import map_of_run, put_rows
 from vplog.execution.execution import Execution
 from vplog.maps.search.query import MapQuery, search
 from vplog.maps.storage import map_store
@@ -40,16 +40,8 @@ def library(finished: Path) -> str:
 
 
 @pytest.fixture
-def root(finished: Path, library: str, tmp_path: Path) -> Path:
-    """A map of three drives: every place of the run, its second half backwards, and its first ten."""
-    root = tmp_path / "map"
-    with map_store.writing(root) as store:
-        shutil.copytree(finished / "library", store.staging / "library")
-        map_store.add_library(store, store.staging / "library", library)
-        store.write_head(map_store.Head(library, load_pipeline("default").model_dump(mode="json")))
-        for name, rows in (("all", slice(None)), ("back 1/2", slice(None, 20, -1)), ("ten", slice(10))):
-            put_rows(store, name, finished, library, rows)
-    return root
+def root(finished: Path, tmp_path: Path) -> Path:
+    return map_of_run(tmp_path / "map", finished)
 
 
 def test_a_map_tells_what_is_in_it(root: Path, finished: Path, library: str, verb: Verb) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -148,6 +150,35 @@ def localize(arguments: argparse.Namespace) -> None:
     print_result(arguments, found, printing.print_localized)
 
 
+def serve_map(arguments: argparse.Namespace) -> None:
+    """Answer queries and localisations over HTTP, read only, until Ctrl-C: POST an image to /query or /localize. A map
+    that changes meanwhile is read again. There is no login: other machines come through a proxy that has one."""
+    from vplog.errors import SettingsError
+    from vplog.maps.storage.download_cache import cache_in
+
+    try:
+        from vplog.maps.service.http import Limits, serve
+    except ImportError:
+        raise SettingsError("`map serve` needs FastAPI and uvicorn. Install them: pip install 'vplog[serve]'") from None
+    from vplog.maps.service.open_state import NewestState
+
+    cache = None if isinstance(arguments.map, Path) else cache_in(arguments.cache, arguments.cache_gb)
+    with Progress(arguments) as progress:
+        newest = NewestState(arguments.map, cache, Execution(arguments.threads, progress))
+
+    def ready(url: str) -> None:
+        now = newest.now
+        counts = f"{plural(now.places, 'place')} of {plural(len(now.drives), 'drive')}"
+        print(f"{arguments.map}: {counts} at {url}, until Ctrl-C", file=sys.stderr, flush=True)
+
+    limits = call(Limits, arguments)
+    try:
+        serve(newest, arguments.host, arguments.port, limits, arguments.calibration, ready)
+    except OSError as error:
+        where, why = f"{arguments.host}:{arguments.port}", os.strerror(error.errno) if error.errno else str(error)
+        raise SettingsError(f"Cannot listen on {where}: {why}. Choose another --port or --host.") from None
+
+
 def index_map(arguments: argparse.Namespace) -> None:
     """Bring the index that queries search up to date with the drives of a map, as the next query would."""
     from vplog.maps.search.query import index_map as update
@@ -186,6 +217,7 @@ def add_maps(
     _add_query(verb("query", query_map, "find where a log's views are in a map", topics, threads))
     sub = verb("index", index_map, "build the index that queries search", threads)
     parser.cache_options(sub, "what is read of a map by URL is kept")
+    _add_serve(verb("serve", serve_map, "answer queries and localisations over HTTP", threads))
     _add_export(verb("export", export_map, "the places of a map or of runs, in one file", of_map=False))
     sub = verb("merge", merge_maps, "copy drives of maps into another map", of_map=False)
     option(sub, "maps", place, "MAP|FILE.parquet", "maps, or places that `map export` wrote", nargs="+")
@@ -214,10 +246,29 @@ def _add_query(sub: argparse.ArgumentParser) -> None:
     option(sub, "log", place, "LOG")
     option(sub, "--top", parser.at_least_one, "K", "places for each view (default: 10)", default=10)
     option(sub, "--sequence", parser.at_least_one, "L", "views in a window, odd; 1: none (default: as the map's)")
+    option(sub, "--drive", str, "ID", "search only this drive; repeatable", action="append", default=[], dest="drives")
+    where = sub.add_mutually_exclusive_group()
+    text = "search only drives that may have places in this box, in degrees (write --box=-33.9,...)"
+    option(where, "--box", _box, "LAT0,LON0,LAT1,LON1", text)
+    text = "search only drives that may have places within M metres of a point"
+    option(where, "--near", _near, "LAT,LON,M", text, dest="box")
+    text = "search only drives that may have places within M metres of the log's satellite fixes"
+    option(where, "--near-fixes", parser.positive, "M", text, dest="near_fixes_m")
     option(sub, "-o --output", parser.output_file, "FILE.parquet", "write the answers")
     text = "who searches: this process, or Ray workers that see the map under the same path (default: local)"
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     option(sub, "--address", str, "HOST:PORT", "Ray cluster (default: one of this machine's cores)")
+    parser.cache_options(sub, "what is read of a map by URL is kept")
+
+
+def _add_serve(sub: argparse.ArgumentParser) -> None:
+    option(sub, "--host", str, "ADDRESS", "address to listen on (default: 127.0.0.1)", default="127.0.0.1")
+    option(sub, "--port", parser.at_least(0), "N", "port; 0: any free one (default: 8080)", default=8080)
+    text = "requests that are open at once; more are refused with 503 (default: 64)"
+    option(sub, "--waiting", parser.at_least_one, "N", text, default=64)
+    option(sub, "--megabytes", parser.positive, "MB", "longest body of a request (default: 16)", default=16.0)
+    text = "camera of pictures that come without fx, fy, cx and cy: camera_info, Kalibr camchain or EuRoC sensor.yaml"
+    option(sub, "--calibration", place, "FILE", text)
     parser.cache_options(sub, "what is read of a map by URL is kept")
 
 
@@ -228,6 +279,18 @@ def _add_export(sub: argparse.ArgumentParser) -> None:
     option(sub, "--box", _box, "LAT0,LON0,LAT1,LON1", text)
     sub.add_argument("--format", choices=("parquet", "geoparquet"), default="parquet", help="(default: parquet)")
     option(sub, "-o --output", parser.output_file, "FILE.parquet", "file to write", required=True)
+
+
+def _near(text: str) -> tuple[float, float, float, float]:
+    try:
+        latitude, longitude, radius_m = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError("must be three numbers, LAT,LON,M") from None
+    if not (-90 <= latitude <= 90 and -180 <= longitude <= 180 and 0 < radius_m < 1e8):
+        raise argparse.ArgumentTypeError("must have LAT within -90..90, LON within -180..180 and M above 0")
+    from vplog.maps.geo_bounds import box_around
+
+    return box_around(latitude, longitude, latitude, longitude, radius_m)
 
 
 def _box(text: str) -> tuple[float, float, float, float]:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vplog.data import Floats
+from vplog.data import Floats, Gps
+from vplog.errors import ResultError, SettingsError, plural
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.geo import Earth, on_earth
 from vplog.run.figures.run_figures import earth_of
@@ -18,6 +21,8 @@ Box = tuple[float, float, float, float]
 """South, west, north, east in degrees; west of more than east crosses the antimeridian."""
 
 
+_M_PER_DEG = 110_574.0
+"""Least metres of a degree of latitude, at the equator of WGS84: boxes around a point are rather too large."""
 _DECIMALS = 7
 """Decimals of a degree, the last of which is a centimetre."""
 
@@ -76,3 +81,49 @@ def in_box(where: Floats, box: Box) -> NDArray[np.bool_]:
     longitude, latitude = where[:, 0], where[:, 1]
     along = (longitude >= west) & (longitude <= east) if west <= east else (longitude >= west) | (longitude <= east)
     return (latitude >= south) & (latitude <= north) & along
+
+
+def box_around(south: float, west: float, north: float, east: float, radius_m: float) -> Box:
+    """The box grown by metres to each side; from pole to pole and all around where it meets a pole."""
+    up = radius_m / _M_PER_DEG
+    south, north = max(south - up, -90.0), min(north + up, 90.0)
+    along = up / max(math.cos(math.radians(max(-south, north))), 1e-9)
+    if east - west + 2.0 * along >= 360.0:
+        return south, -180.0, north, 180.0
+    return south, (west - along + 180.0) % 360.0 - 180.0, north, (east + along + 180.0) % 360.0 - 180.0
+
+
+def box_of_fixes(gps: Gps | None, radius_m: float, name: str) -> Box:
+    """The box of a log's fixes, grown by metres. Raises ResultError where it has none."""
+    if gps is None or not len(gps.stamp_ns):
+        raise ResultError(f"{name} has no satellite fixes to search near. Give a point: --near LAT,LON,M.")
+    latitude, longitude = gps.latitude_deg, gps.longitude_deg
+    return box_around(latitude.min(), longitude.min(), latitude.max(), longitude.max(), radius_m)
+
+
+def drives_within(
+    drives: Mapping[str, Mapping[str, Any]], wanted: Sequence[str], box: Box | None, name: str
+) -> tuple[list[str], list[str]]:
+    """The drives of a map that are wanted, all of them if none is, and may have places in a box; and warnings.
+
+    A drive whose place on earth is not known is not in any box. Raises SettingsError where the map has no drive of such
+    a name, and ResultError where none is left.
+    """
+    if unknown := [drive for drive in wanted if drive not in drives]:
+        raise SettingsError(f"{name} has no drive {unknown[0]!r}. `vplog map info {name}` names them.")
+    chosen, warnings = [drive for drive in drives if not wanted or drive in wanted], list[str]()
+    if box is None:
+        return chosen, warnings
+    bounds = {drive: bounds_of(drives[drive].get("earth")) for drive in chosen}
+    within = [drive for drive, own in bounds.items() if own is not None and _overlap(own, box)]
+    unplaced = sum(own is None for own in bounds.values())
+    without = f"{plural(unplaced, 'drive')} of {len(chosen)} without a place on earth."
+    if not within:
+        raise ResultError(f"No drive of {name} is in the box that is searched; {without}")
+    return within, [f"Not searched: {without}"] if unplaced else []
+
+
+def _overlap(bounds: Sequence[float], box: Box) -> bool:
+    south, west, north, east = box
+    parts = [(west, east)] if west <= east else [(west, 180.0), (-180.0, east)]
+    return bounds[0] <= north and bounds[2] >= south and any(bounds[1] <= b and bounds[3] >= a for a, b in parts)

@@ -271,6 +271,9 @@ def _find_best(query, comparison, lists, longest, extent, wanted, drives):
     least = _reached(worst)
     for b in range(begin, end if k > 0 else begin):
         rows = min(stop - b * block, block)
+        some, most = np.searchsorted(runs, b * block, side="right") - 1, np.searchsorted(runs, b * block + rows)
+        if not counts[some:most].any():
+            continue
         bound[:rows] = 0
         for j in range(references.shape[0]):
             first, last = _entries(start, offset, b, references[j], rows)

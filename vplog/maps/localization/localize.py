@@ -21,11 +21,12 @@ from vplog.geometry.masking import masked
 from vplog.loops.localize import Localization, localize
 from vplog.results.geo import on_earth
 from vplog.results.tables import POSE_COLUMNS
-from vplog.stages import EncodedFrame, FrameState, Log, StoredState
+from vplog.stages import EncodedFrame, FrameState, Log, PlaceState, StoredState
 from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
     from vplog.maps.localization.places import Places
+    from vplog.pipeline import Pipeline
 
 TOP = 10
 """Places that a picture is verified against."""
@@ -103,7 +104,8 @@ def localize_image(places: Places, image: Bytes | Path | str, camera: Camera | P
 
 
 def localize_frame(places: Places, frame: Frame, execution: Execution) -> LocalizedPicture:
-    return next(_localized(places, [_describe(places, frame)], execution, TOP, {}))
+    picture = described(places.state, places.pipeline, frame, places.name)
+    return next(_localized(places, [picture], execution, TOP, {}))
 
 
 def _frame(image: Bytes | Path | str, camera: Camera | Path | str) -> Frame:
@@ -128,7 +130,7 @@ def _of_pixels(image: Any, camera: Camera) -> Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class _Picture:
+class Picture:
     """A decoded picture."""
 
     stamp_ns: int
@@ -138,45 +140,45 @@ class _Picture:
     problem: str = ""
 
 
-def _described(places: Places, frames: Iterator[EncodedFrame], execution: Execution) -> Iterator[_Picture]:
+def _described(places: Places, frames: Iterator[EncodedFrame], execution: Execution) -> Iterator[Picture]:
     colour = isinstance(places.state, FrameState) and places.state.colour
 
-    def work(encoded: EncodedFrame) -> _Picture:
+    def work(encoded: EncodedFrame) -> Picture:
         try:
-            return _describe(places, encoded.decode(colour))
+            return described(places.state, places.pipeline, encoded.decode(colour), places.name)
         except LogError as error:
-            return _Picture(encoded.stamp_ns, None, None, problem=str(error))
+            return Picture(encoded.stamp_ns, None, None, problem=str(error))
 
     return execution.map(work, frames, ahead=2)
 
 
-def _describe(places: Places, frame: Frame) -> _Picture:
-    state, pipeline = places.state, places.pipeline
+def described(state: PlaceState, pipeline: Pipeline, frame: Frame, name: str) -> Picture:
+    """A picture as the places of a run or map of this name are described. Raises LibraryError where it cannot be."""
     if isinstance(state, StoredState):
         raise LibraryError(
-            f"The places of {places.name} have descriptors from a file, which new pictures lack. Make the map with a "
+            f"The places of {name} have descriptors from a file, which new pictures lack. Make the map with a "
             "recogniser that describes pictures: --set places.kind=bobb."
         )
     features = describe(pipeline.features, frame)  # depths of a pair would cost as much again, and add little
     descriptor = state.describe_frame(masked(frame)) if isinstance(state, FrameState) else state.describe(features)
-    return _Picture(frame.stamp_ns, frame.camera, features, descriptor)
+    return Picture(frame.stamp_ns, frame.camera, features, descriptor)
 
 
 def _localized(
-    places: Places, block: Sequence[_Picture], execution: Execution, top: int, names: dict[int, str]
+    places: Places, block: Sequence[Picture], execution: Execution, top: int, names: dict[int, str]
 ) -> Iterator[LocalizedPicture]:
     sound = [one for one in block if one.features is not None]
     likely = dict(zip(map(id, sound), places.search([one.descriptor for one in sound], top), strict=True))
     for drive in sorted({drive for found in likely.values() for drive, _ in found}):
         _ = places.drives[drive].loaded  # before workers wait for it
 
-    def work(one: _Picture) -> LocalizedPicture:
+    def work(one: Picture) -> LocalizedPicture:
         return _answer(places, one, likely.get(id(one), []), names.get(one.stamp_ns, str(one.stamp_ns)))
 
     return execution.map(work, block)
 
 
-def _answer(places: Places, one: _Picture, likely: list[tuple[int, int]], name: str) -> LocalizedPicture:
+def _answer(places: Places, one: Picture, likely: list[tuple[int, int]], name: str) -> LocalizedPicture:
     if one.features is None or one.camera is None:
         return LocalizedPicture(name, one.stamp_ns, None, Localization(Verdict.TOO_FEW_MATCHES, -1, 0, 0), one.problem)
     verify = places.pipeline.verify

@@ -180,8 +180,7 @@ def _map_search(
             poseless = {*store.damaged, *(name for name, about in known.items() if about.get(PICTURES))}
             there = {at: name for name, at in number.items() if name not in poseless}
             if isinstance(state, CodedState):
-                own = [replace(one, numbers=np.where(np.isin(one.numbers, [*there]), one.numbers, -1)) for one in parts]
-                found = best_places(own, state, descriptors, top, execution)
+                found = best_places([one.of(there) for one in parts], state, descriptors, top, execution)
             else:
                 found = best_lines(store, there, state, descriptors, top, SequenceSettings(length=1), execution)
             for at in np.unique(found.drive[found.score > NO_SCORE]).tolist():

@@ -10,9 +10,9 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,6 +54,10 @@ class SegmentView:
     def places(self) -> int:
         """Number of places that the map still has."""
         return int(np.diff(self.segment.first)[self.numbers >= 0].sum())
+
+    def of(self, numbers: Iterable[int]) -> SegmentView:
+        """Without the drives of other numbers."""
+        return replace(self, numbers=np.where(np.isin(self.numbers, list(numbers)), self.numbers, np.int32(-1)))
 
 
 def update_index(

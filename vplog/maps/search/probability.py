@@ -6,7 +6,7 @@ place, and say nothing of look-alikes. A map is larger than one drive, and the b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 
 
 def answer_probabilities(
-    store: Store, drives: Sequence[str], state: PlaceState, descriptors: Sequence[Any], answers: Answers,
+    store: Store, drives: Mapping[int, str], state: PlaceState, descriptors: Sequence[Any], answers: Answers,
     settings: SequenceSettings, execution: Execution = Execution(),
 ) -> Floats:  # fmt: skip
     """(Q,) probability of the first answer of each view; NaN without one, and of all where too few have look-alikes.
 
-    Drives that hold first answers are searched again, one after the other, for the scores of all their places, which
-    are on disk meanwhile.
+    `drives` are those that were searched, by number. Those that hold first answers are searched again, one after the
+    other, for the scores of all their places, which are on disk meanwhile.
     """
     best, size = np.full((len(descriptors), 3), np.nan), np.ones(len(descriptors))
     answered = answers.count > 0
@@ -45,7 +45,7 @@ def answer_probabilities(
             extent = place_extent(scores)
             best[views] = [best_places(row, extent) for row in scores]
         size[views] = len(index)
-    total = sum(store.rows("descriptors", drive) for drive in drives) if answered.any() else 0
+    total = sum(store.rows("descriptors", drive) for drive in drives.values()) if answered.any() else 0
     found = probabilities(best, np.maximum(total / size, 1.0))
     return np.full(len(descriptors), np.nan) if found is None else found
 

@@ -15,6 +15,7 @@ from vplog.data import Floats, Ints, Keyframes
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
+from vplog.maps.geo_bounds import box_of_fixes, drives_within
 from vplog.maps.search.exact import Answers, best_places
 from vplog.maps.search.index import SegmentView, place_keyframes, update_index
 from vplog.maps.search.probability import answer_probabilities
@@ -36,6 +37,7 @@ from vplog.storage.scratch import check_file_output
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from vplog.maps.geo_bounds import Box
     from vplog.maps.storage.download_cache import Cache
     from vplog.maps.storage.map_store import Store
 
@@ -54,6 +56,12 @@ class MapQuery:
     """Workers that search the map, whose folder they see under the same path."""
     cache: Cache | None = None
     """Where the files of a map on an object store are read from, but for its manifests."""
+    drives: Sequence[str] = ()
+    """The drives to search; all if there are none."""
+    box: Box | None = None
+    """Only drives that may have places in it are searched."""
+    near_fixes_m: float | None = None
+    """Only drives that may have places as near to the log's own satellite fixes are searched."""
 
 
 def query_map(
@@ -74,13 +82,19 @@ def query_map(
         log = logs.open(path, topics)
         if query.sequence is None and log.file_names() is not None and log.odometry() is None:
             settings = settings.model_copy(update={"length": 1})  # pictures are spaced as they come
+        if query.near_fixes_m is not None:
+            query = replace(query, box=box_of_fixes(log.gps(), query.near_fixes_m, log.name))
+        drives_within(map_store.common_library(store)[1], query.drives, query.box, str(store))  # before any work
         stamps, descriptors, warnings = describe_log(log, pipeline, state, execution)
 
         def attempt() -> tuple[list[str], Answers, list[str], pa.Table, list[dict[str, Any]]]:
             drives = map_store.common_library(store)[1]
-            short = _short_drives(store, drives, settings.length)
-            answers, more = search(store, drives, state, descriptors, query, settings, execution)
-            p_match = answer_probabilities(store, list(drives), state, descriptors, answers, settings, execution)
+            chosen, short = drives_within(drives, query.drives, query.box, str(store))
+            short += _short_drives(store, chosen, settings.length)
+            part = replace(query, drives=chosen)
+            answers, more = search(store, drives, state, descriptors, part, settings, execution)
+            numbered = _numbered(drives, chosen)
+            p_match = answer_probabilities(store, numbered, state, descriptors, answers, settings, execution)
             table = _table(store, list(drives), answers, stamps, p_match)
             return list(drives), answers, short + more, table, _named(store, drives, table, log)
 
@@ -205,18 +219,20 @@ def search(
     store: Store, drives: Mapping[str, Mapping[str, Any]], state: PlaceState, descriptors: Sequence[Any],
     query: MapQuery, settings: SequenceSettings, execution: Execution = Execution(),
 ) -> tuple[Answers, list[str]]:  # fmt: skip
-    """The best places of all drives for each of Q views in order, and warnings.
+    """The best places of the map's drives, or of `query.drives` of them, for each of Q views in order, and warnings.
 
     Ties go to the earlier drive, then row. Single views are ranked exactly, by the map's index where the recogniser is
     `bobb`. Lines are drawn in every drive of a map of up to EXACT_PLACES, else in the likely ones (`sequences.py`).
     """
-    numbered, warnings, executor = dict(enumerate(drives)), list[str](), query.executor
+    numbered = _numbered(drives, query.drives or drives)
+    count, warnings, executor = len(numbered), list[str](), query.executor
     if not isinstance(state, CodedState):
-        places = sum(store.rows("descriptors", drive) for drive in drives)
+        places = sum(store.rows("descriptors", drive) for drive in numbered.values())
         if executor is not None:
             warnings.append("Ray was not used: a map of another recogniser than bobb is searched here.")
     else:
         parts, warnings = update_index(store, drives, state, execution)
+        parts = [part for one in parts if (part := one.of(numbered)).places]
         if store.mirror is not None:  # workers elsewhere do not see these files
             parts = [replace(part, path=None) for part in parts]
         places = sum(part.places for part in parts)
@@ -225,11 +241,16 @@ def search(
         if places > EXACT_PLACES:
             single = best_places(parts, state, descriptors, PLACES_A_VIEW, execution, executor)
             numbered = {number: numbered[number] for number in drives_by_credit(single, settings.length).tolist()}
-            count = f"{len(numbered)} of {len(drives)}"
-            warnings.append(f"Sequences were searched in the {count} drives most like single views.")
+            warnings.append(f"Sequences were searched in the {len(numbered)} of {count} drives most like single views.")
         elif executor is not None:
             warnings.append(f"Ray was not used: sequences in maps of up to {EXACT_PLACES} places are searched here.")
     return best_lines(store, numbered, state, descriptors, min(query.top, places), settings, execution), warnings
+
+
+def _numbered(drives: Iterable[str], chosen: Iterable[str]) -> dict[int, str]:
+    """The chosen ones of the drives of a map, by number."""
+    wanted = set(chosen)
+    return {number: drive for number, drive in enumerate(drives) if drive in wanted}
 
 
 def _short_drives(store: Store, drives: Iterable[str], length: int) -> list[str]:

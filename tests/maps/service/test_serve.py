@@ -1,0 +1,182 @@
+"""Queries and localisations over HTTP are those of the verbs, of the newest state of the map, and bounded."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+import time
+from contextlib import contextmanager
+from http.client import HTTPConnection
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+
+import vplog
+from tests.maps.runs import map_of_run, put_rows
+from vplog.errors import ResultError, SettingsError
+from vplog.execution.execution import Execution
+from vplog.maps import geo_bounds
+from vplog.maps.localization.places import opened as opened_places
+from vplog.maps.service import http, open_state
+from vplog.maps.service.open_state import NewestState
+from vplog.maps.storage import map_store
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from conftest import Said
+
+    from vplog.demo.record import Drive
+
+
+@contextmanager
+def served(root: Path, **limits: Any) -> Iterator[tuple[NewestState, Callable[..., tuple[int, dict[str, Any]]]]]:
+    """The open state, and what asks the service; its server ends with the process."""
+    newest, where = NewestState(root, None, Execution()), list[str]()
+    ready = threading.Event()
+
+    def told(url: str) -> None:
+        where.append(url.removeprefix("http://"))
+        ready.set()
+
+    threading.Thread(
+        target=http.serve, args=(newest, "127.0.0.1", 0, http.Limits(**limits), None, told), daemon=True
+    ).start()
+    assert ready.wait(30)
+
+    def ask(path: str, body: bytes | None = None) -> tuple[int, dict[str, Any]]:
+        connection = HTTPConnection(where[0], timeout=60)
+        connection.request("GET" if body is None else "POST", path, body)
+        answer = connection.getresponse()
+        return answer.status, json.loads(answer.read())
+
+    yield newest, ask
+
+
+@pytest.fixture(scope="module")
+def root(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return map_of_run(tmp_path_factory.mktemp("served") / "map", finished)
+
+
+def test_answers_are_those_of_the_verb(
+    root: Path, finished: Path, drive: Drive, verb: Callable[..., Said], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    run = shutil.copytree(finished, tmp_path / "run")
+    with served(root) as (_, ask):
+        status, about = ask("/map")
+        assert (status, about["drives"], about["recogniser"]) == (200, 3, "bobb")
+        body = (finished / "descriptors.parquet").read_bytes()
+        status, found = ask("/query?top=3", body)
+        assert status == 200
+        log = ("map", "query", root, drive.log, "--top", 3, "--sequence", 1, "--json")
+        names = ("query", "rank", "drive", "keyframe", "score")
+        assert [[one[name] for name in names] for one in found["answers"]] == [
+            [one[name] for name in names] for one in verb(*log).json["answers"]
+        ]
+        _, found = ask("/query?drive=ten&top=1", body)
+        only = verb(*log, "--drive", "ten").json["answers"]
+        assert {one["drive"] for one in found["answers"]} == {one["drive"] for one in only} == {"ten"}
+        opened = vplog.open_log(drive.log)
+        frame = next(iter(opened.frames(opened.stamps()[:1]))).decode()
+        picture = cv2.imencode(".png", frame.image)[1].tobytes()
+        _, found = ask("/query?top=1", picture)
+        assert found["answers"][0]["keyframe"] == 0
+        assert frame.camera.matrix is not None
+        (fx, _, cx), (_, fy, cy), _ = frame.camera.matrix.tolist()
+        # the drives of this map have no features of their own
+        monkeypatch.setattr(open_state, "opened", lambda _, execution: opened_places(run, execution))
+        _, found = ask(f"/localize?fx={fx}&fy={fy}&cx={cx}&cy={cy}", picture)
+        assert found["localized"]
+        assert found["keyframe"] <= 2
+
+
+def test_a_drive_that_comes_later_is_found(root: Path, finished: Path) -> None:
+    with served(root, refresh_s=0.1) as (newest, ask):
+        before = newest.now
+        with map_store.writing(root) as store:
+            put_rows(store, "new", finished, before.state.hash, slice(5, 9))
+        began = time.monotonic()
+        while newest.now is before and time.monotonic() - began < 30:
+            time.sleep(0.05)
+        _, found = ask("/query?drive=new", (finished / "descriptors.parquet").read_bytes())
+        assert {one["drive"] for one in found["answers"]} == {"new"}
+        assert len(before.answers(list(before.state.from_arrow(_column(finished))), http.MapQuery(1))[0]) > 0
+
+
+def _column(finished: Path) -> Any:
+    return http.tables.read_descriptors(finished / "descriptors.parquet")[0]
+
+
+def test_requests_are_bounded_and_told_why(root: Path, finished: Path) -> None:
+    with served(root, waiting=2, megabytes=0.5, views=3) as (_, ask):
+        assert ask("/query", bytes(600_000))[0] == 413
+        assert ask("/query", (finished / "descriptors.parquet").read_bytes())[0] == 413
+        assert ask("/query", b"")[0] == 400
+        status, told = ask("/query", b"no image")
+        assert (status, told["detail"]) == (400, "The body is neither an image nor a descriptors.parquet.")
+        assert ask("/query?near=1,2", b"x")[0] == 422
+        image = cv2.imencode(".png", np.zeros((48, 64), np.uint8))[1].tobytes()
+        assert ask("/query?drive=nowhere", image)[1]["detail"].startswith(f"{root} has no drive 'nowhere'.")
+        assert ask("/localize?fx=100", image)[0] == 400
+
+
+def test_what_comes_while_the_queue_is_full_is_refused(
+    root: Path, finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+
+    def slow(*_: object) -> dict[str, Any]:
+        begun.set()
+        go_on.wait(30)
+        return {"answers": []}
+
+    monkeypatch.setattr(http, "_answered", slow)
+    with served(root, waiting=2) as (_, ask):
+        first = threading.Thread(target=ask, args=("/query", b"one"))
+        first.start()
+        assert begun.wait(30)
+        statuses = []
+        threads = [threading.Thread(target=lambda: statuses.append(_status(ask))) for _ in range(3)]
+        for one in threads:
+            one.start()
+        time.sleep(0.5)
+        go_on.set()
+        for one in [first, *threads]:
+            one.join()
+        assert 503 in statuses
+
+
+def _status(ask: Callable[..., Any]) -> int:
+    try:
+        return int(ask("/query", b"two")[0])
+    except ValueError:  # the refusal is plain text
+        return 503
+
+
+def test_boxes_around_a_point_and_drives_within_them() -> None:
+    south, west, north, east = geo_bounds.box_around(48.0, 11.0, 48.0, 11.0, 1000.0)
+    assert 0.0089 < north - 48.0 < 0.0091
+    assert (east - 11.0) / (north - 48.0) == pytest.approx(1.0 / np.cos(np.radians(north)), rel=1e-6)
+    assert (south + north, west + east) == pytest.approx((96.0, 22.0))
+    assert geo_bounds.box_around(89.999, 0.0, 89.999, 0.0, 1000.0)[1::2] == (-180.0, 180.0)
+    over = geo_bounds.box_around(0.0, 179.999, 0.0, 179.999, 1000.0)
+    assert over[1] > 179.0
+    assert over[3] < -179.0
+    drives = {
+        "east": {"earth": {"bounds": [-0.001, 179.9995, 0.001, 179.9999]}},
+        "west": {"earth": {"bounds": [-0.001, -179.9999, 0.001, -179.9995]}},
+        "far": {"earth": {"bounds": [10.0, 0.0, 10.1, 0.1]}},
+        "nowhere": {},
+    }
+    chosen, warnings = geo_bounds.drives_within(drives, (), over, "MAP")
+    assert chosen == ["east", "west"]
+    assert warnings == ["Not searched: 1 drive of 4 without a place on earth."]
+    assert geo_bounds.drives_within(drives, ["far"], None, "MAP")[0] == ["far"]
+    with pytest.raises(ResultError, match="No drive of MAP is in the box"):
+        geo_bounds.drives_within(drives, ["far"], over, "MAP")
+    with pytest.raises(SettingsError, match="no drive 'none'"):
+        geo_bounds.drives_within(drives, ["none"], None, "MAP")

@@ -1,0 +1,139 @@
+"""A state of a map that is held open, and the newest one, which takes its place while others still answer by it."""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vplog.data import Int32s, Ints
+from vplog.errors import VplogError
+from vplog.execution.execution import Execution
+from vplog.maps.geo_bounds import drives_within
+from vplog.maps.localization.places import opened
+from vplog.maps.search.exact import best_places
+from vplog.maps.search.index import SegmentView, place_keyframes, update_index
+from vplog.maps.search.query import MapQuery, open_map, search
+from vplog.maps.storage import map_store, objects
+from vplog.maps.storage.damage import reading_drive
+from vplog.places.sequence import SequenceSettings
+from vplog.results import tables
+from vplog.stages import CodedState, PlaceState
+from vplog.storage.remote_path import RemotePath
+
+if TYPE_CHECKING:
+    from vplog.maps.localization.places import Places
+    from vplog.maps.storage.download_cache import Cache
+    from vplog.maps.storage.map_store import Store
+    from vplog.pipeline import Pipeline
+
+_DRIVES = 4096
+"""Drives whose stamps stay in memory: some 100 MB of drives of 2000 keyframes."""
+
+
+@dataclass(frozen=True, eq=False)
+class OpenState:
+    """A state of a map; its index stays in memory, or mapped into it."""
+
+    store: Store
+    drives: dict[str, dict[str, Any]]
+    pipeline: Pipeline
+    state: PlaceState
+    parts: list[SegmentView]
+    warnings: list[str]
+
+    @cached_property
+    def places(self) -> int:
+        """Number of places."""
+        if isinstance(self.state, CodedState):
+            return sum(part.places for part in self.parts)
+        return sum(self.store.rows("descriptors", drive) for drive in self.drives)
+
+    def answers(self, descriptors: Sequence[Any], query: MapQuery) -> tuple[list[dict[str, Any]], list[str]]:
+        """The best places for each view by itself, best first, as plain values; and warnings."""
+        chosen, warnings = drives_within(self.drives, query.drives, query.box, str(self.store))
+        if isinstance(self.state, CodedState):
+            wanted = set(chosen)
+            numbers = [number for number, drive in enumerate(self.drives) if drive in wanted]
+            parts = [part for one in self.parts if (part := one.of(numbers)).places]
+            top = min(query.top, sum(part.places for part in parts))
+            found = best_places(parts, self.state, descriptors, top)
+        else:
+            only = MapQuery(query.top, drives=chosen)
+            found, more = search(self.store, self.drives, self.state, descriptors, only, SequenceSettings(length=1))
+            warnings += more
+        names, answers = list(self.drives), []
+        for view, count in enumerate(found.count.tolist()):
+            for rank in range(count):
+                drive, row = names[int(found.drive[view, rank])], int(found.keyframe[view, rank])
+                keyframe_of, stamp_ns = self._keyframes(drive)
+                keyframe, score = int(keyframe_of[row]), float(found.score[view, rank])
+                known = {"drive": drive, "keyframe": keyframe, "stamp_ns": int(stamp_ns[row]), "score": score}
+                answers.append({"query": view, "rank": rank, **known})
+        return answers, warnings
+
+    @cached_property
+    def _keyframes(self) -> Any:
+        """Keyframe and stamp of the places of a drive, of the last `_DRIVES` that were asked for."""
+
+        def read(drive: str) -> tuple[Int32s, Ints]:
+            path = self.store.file(drive, "descriptors.parquet")
+            with reading_drive(drive):
+                return place_keyframes(self.store, drive), tables.read_stamps(path)
+
+        return lru_cache(_DRIVES)(read)
+
+
+class NewestState:
+    """The newest state of a map, and the places that pictures are localised among."""
+
+    def __init__(self, root: Path, cache: Cache | None, execution: Execution) -> None:
+        """Raises VplogError where it cannot be read."""
+        self.root, self._cache, self._execution = root, cache, execution
+        self._mark = self._marked()
+        self.now = self._opened(execution)
+        self.localizing = threading.Lock()
+        self._localized: tuple[OpenState, Places] | None = None
+
+    def refresh(self) -> bool:
+        """Open the newest state if it is another one; whether it is. A state that cannot be read is tried again."""
+        with suppress(VplogError, OSError):
+            mark = self._marked()
+            if mark != self._mark:
+                self.now, self._mark = self._opened(Execution(self._execution.threads)), mark
+                return True
+        return False
+
+    def localized_in(self) -> Places:
+        """The newest state's places with poses and landmarks; `localizing` is held meanwhile. Raises VplogError."""
+        now = self.now
+        if self._localized is None or self._localized[0] is not now:
+            with ExitStack() as stack:
+                places = stack.enter_context(opened(self.root, Execution()))
+                weakref.finalize(places, stack.pop_all().close)
+            self._localized = now, places
+        return self._localized[1]
+
+    def _marked(self) -> Any:
+        """What differs where the map does: of a folder, times of what is replaced and of what is renamed into it."""
+        if isinstance(self.root, RemotePath):
+            found = objects.get_with_version(self.root / "map.json")
+            return None if found is None else found.version
+        names = ("map.json", "runs", "removed.json")
+        return [(self.root / name).stat().st_mtime_ns for name in names if (self.root / name).exists()]
+
+    def _opened(self, execution: Execution) -> OpenState:
+        with ExitStack() as stack:
+            store = stack.enter_context(map_store.reading(self.root, self._cache))
+            drives, pipeline, state = open_map(store, execution)
+            parts, warnings = list[SegmentView](), list[str]()
+            if isinstance(state, CodedState):
+                parts, warnings = update_index(store, drives, state, execution)
+            found = OpenState(store, drives, pipeline, state, parts, warnings)
+            weakref.finalize(found, stack.pop_all().close)  # when the last answer by it is given
+        return found
