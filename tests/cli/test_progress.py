@@ -68,7 +68,8 @@ def test_work_of_one_stage_has_its_begin_and_end(verb: Verb, tmp_path: Path) -> 
     graph, path = tmp_path / "g.g2o", tmp_path / "events.jsonl"
     graph.write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
     assert verb("optimize", graph, "-o", tmp_path / "out.g2o", "--events", path).code == 0
-    assert [(one["event"], one.get("stage")) for one in told(path)] == [
+    events = [(one["event"], one.get("stage")) for one in told(path) if one["event"] != "progress"]  # if it is slow
+    assert events == [
         ("started", None), ("stage_started", "solve"), ("stage_finished", "solve"), ("finished", None),
     ]  # fmt: skip
 

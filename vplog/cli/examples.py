@@ -21,6 +21,7 @@ EXAMPLES = {
     "vplog map info": "vplog map info out/map --check",
     "vplog map query": "vplog map query out/map drive.mcap -o answers.parquet",
     "vplog map index": "vplog map index out/map",
+    "vplog map serve": "vplog map serve out/map --port 8080",
     "vplog map export": "vplog map export out/map --drive a -o places.parquet",
     "vplog map merge": "vplog map merge out/east out/west -o out/both",
     "vplog map condense": "vplog map condense out/map -o out/small --loss 0.01",

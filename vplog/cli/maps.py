@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -169,7 +168,7 @@ def serve_map(arguments: argparse.Namespace) -> None:
     def ready(url: str) -> None:
         now = newest.now
         counts = f"{plural(now.places, 'place')} of {plural(len(now.drives), 'drive')}"
-        print(f"{arguments.map}: {counts} at {url}, until Ctrl-C", file=sys.stderr, flush=True)
+        printing.print_status(f"{arguments.map}: {counts} at {url}, until Ctrl-C")
 
     limits = call(Limits, arguments)
     try:
