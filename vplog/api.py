@@ -361,6 +361,8 @@ def batch(
     nothing: `failed` of the result counts them, `drives` has the state and the error of each, and `join_error` says why
     drives that are in the map could not be joined.
 
+    logs: logs, folders and prefixes of a store with logs below them, patterns with `*`, `@LIST.txt` with one of these a
+        line, or manifests, `drives.csv` or `drives.parquet`, with a row for each drive.
     pipeline: None for the settings of the map, or the default for a new one.
     jobs: drives at once, each with so many `threads`.
     engine, address: `local` processes, or `ray` with the HOST:PORT of a cluster.
@@ -368,15 +370,16 @@ def batch(
     join: whether closures between drives are searched at the end.
     on_drive: called with each drive as it ends.
     """
+    from vplog.batch.drive_inputs import drive_inputs
     from vplog.storage.remote_path import local_copy, located
 
-    paths, parts, threads = _paths(list(logs)), _topics(topics), threads or available()
-    if parts is not None and parts.odometry_file is not None and len(paths) > 1:
+    inputs, parts, threads = drive_inputs(_paths(list(logs))), _topics(topics), threads or available()
+    if parts is not None and parts.odometry_file is not None and len(inputs) > 1:
         raise SettingsError(
-            f"--odometry-file {parts.odometry_file} is of one drive, and {len(paths)} logs are given. "
-            "Give each log by itself with its own file; each command adds a drive to the map."
+            f"--odometry-file {parts.odometry_file} is of one drive, and {len(inputs)} logs are given. "
+            "Give each drive its own in the column odometry_file of a manifest, drives.csv."
         )
-    with limited(threads), drive_processes(engine, jobs, len(paths)) as processes, ExitStack() as stack:
+    with limited(threads), drive_processes(engine, jobs, len(inputs)) as processes, ExitStack() as stack:
         from vplog.batch.batch import run_batch, settings_for
         from vplog.batch.engine import BatchOptions
 
@@ -387,7 +390,7 @@ def batch(
             chosen = _pipeline(pipeline, settings)
         references = None if library is None else stack.enter_context(local_copy(located(library)))
         options = BatchOptions(jobs, engine, address, retries, processes, join, keep_cache, on_drive)
-        return run_batch(paths, root, chosen, references, parts, Execution(threads, progress), options)
+        return run_batch(inputs, root, chosen, references, parts, Execution(threads, progress), options)
 
 
 @contextmanager

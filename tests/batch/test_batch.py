@@ -26,6 +26,7 @@ from tests.joined import rewritten
 from vplog.batch import batch
 from vplog.batch.batch import run_batch
 from vplog.batch.engine import BatchOptions, LocalEngine, as_completed
+from vplog.batch.plan import DriveInput, PlannedDrive, absolute_log, given_logs, name_of
 from vplog.batch.worker import Outcome, Task
 from vplog.demo.record import IMAGE
 from vplog.errors import LibraryError, ResultError, SettingsError
@@ -453,9 +454,32 @@ def test_what_was_found_stays_known_after_ctrl_c(
     assert list(read_run_json(root / "failures.json")) == ["bad"]
 
 
+def test_a_manifest_names_tags_which_stay(
+    whole: Path, logs: list[Path], tmp_path: Path, verb: Callable[..., Said]
+) -> None:
+    root, manifest = shutil.copytree(whole, tmp_path / "map"), tmp_path / "drives.csv"
+    manifest.write_text(f"log,vehicle,truth\n{logs[0]},v1,t.tum\n{logs[1]},v2,\n")
+    for given in ([manifest], logs):
+        done = verb("batch", *given, "-o", root, "--no-join", "--json", *OPTIONS).json
+        assert [(one["drive"], one["state"]) for one in done["drives"]] == [
+            ("drive", "unchanged"),
+            ("drive-2", "unchanged"),
+        ]
+        record = read_run_json(root / "runs/drive=drive/drive.json")
+        assert (record["tags"], record["truth"]) == ({"vehicle": "v1"}, str(tmp_path / "t.tum"))
+        assert "vehicle=v2" in verb("map", "info", root).out
+
+
+def test_logs_that_are_refused_leave_no_map(whole: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:
+    [library] = (whole / "libraries").iterdir()
+    for more in ([], ["--library", library]):
+        assert "gone.bag" in verb("batch", tmp_path / "gone.bag", "-o", tmp_path / "map", *more, *OPTIONS).error
+        assert not (tmp_path / "map").exists()
+
+
 def test_one_odometry_file_is_of_one_drive(logs: list[Path], tmp_path: Path, verb: Callable[..., Said]) -> None:
     said = verb("batch", *logs, "-o", tmp_path / "map", "--odometry-file", tmp_path / "poses.tum")
-    assert "2 logs are given. Give each log by itself" in said.error
+    assert "2 logs are given. Give each drive its own" in said.error
 
 
 @pytest.mark.parametrize(("bad", "closed", "code"), [(False, "| true", 0), (True, "2>&1 | true", 1)])
@@ -479,12 +503,12 @@ def test_the_exit_status_is_that_of_the_batch(
 def test_a_drive_is_called_as_its_folder_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "monday").mkdir()
     monkeypatch.chdir(tmp_path / "monday")
-    found = (batch._name(Path()), batch._name(Path("../monday")), batch._absolute_log(Path("../monday")))
+    found = (name_of(Path()), name_of(Path("../monday")), absolute_log(Path("../monday")))
     assert found == ("monday", "monday", str(tmp_path / "monday"))
     (tmp_path / "far" / "below").mkdir(parents=True)
     (tmp_path / "link").symlink_to("far/below")
-    assert batch._absolute_log(Path("../link/../a.mcap")) == str(tmp_path / "far" / "a.mcap"), "as the system reads it"
-    assert (batch._absolute_log(Path("../link")), batch._name(Path("../link"))) == (str(tmp_path / "link"), "link")
+    assert absolute_log(Path("../link/../a.mcap")) == str(tmp_path / "far" / "a.mcap"), "as the system reads it"
+    assert (absolute_log(Path("../link")), name_of(Path("../link"))) == (str(tmp_path / "link"), "link")
 
 
 def test_the_name_of_a_drive_that_failed_is_its_own(tmp_path: Path) -> None:
@@ -512,14 +536,14 @@ def test_the_longest_log_is_begun_first(tmp_path: Path) -> None:
     at = {name: tmp_path / name for name in ("short", "gone", "long", "same")}
     for name, size in (("short", 10), ("long", 30), ("same", 10)):
         at[name].write_bytes(bytes(size))
-    logs = {name: str(path) for name, path in at.items()}
     like = Task("", "", tmp_path, tmp_path, load_pipeline("default"), TopicChoice(), 1, {})
-    wanted: list[dict[str, Any]] = [{"drive": name} for name in at]
+    given = given_logs([DriveInput(path) for path in at.values()], None)
+    wanted = [PlannedDrive(log, {"drive": log.name}, "compute") for log in given]
     with map_store.writing(tmp_path / "map") as store:
-        found = batch._tasks(store, wanted, like, logs, longest_first=True)
+        found = batch._tasks(store, wanted, like, longest_first=True)
         assert [task.drive for task in found] == ["long", "short", "same", "gone"]
         assert [task.in_parts for task in found] == [True, False, False, False], "longer than all others together"
-        assert [task.in_parts for task in batch._tasks(store, wanted[:2], like, logs, True)] == [True, False]
+        assert [task.in_parts for task in batch._tasks(store, wanted[:2], like, True)] == [True, False]
         at["same"].write_bytes(bytes(20))
-        assert not any(task.in_parts for task in batch._tasks(store, wanted, like, logs, True))
-        assert batch._tasks(store, wanted[1:2], like, logs, True)[0].in_parts, "it has all machines for itself"
+        assert not any(task.in_parts for task in batch._tasks(store, wanted, like, True))
+        assert batch._tasks(store, wanted[1:2], like, True)[0].in_parts, "it has all machines for itself"

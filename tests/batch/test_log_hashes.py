@@ -12,6 +12,7 @@ import pytest
 
 from vplog.batch import log_hashes
 from vplog.batch.log_hashes import known_hashes
+from vplog.batch.plan import GivenLog
 from vplog.execution.execution import Execution
 from vplog.logs import TopicChoice
 from vplog.logs.formats.mcap_file import MAGIC
@@ -45,7 +46,11 @@ def logs(tmp_path: Path) -> dict[str, Path]:
 
 
 def asked(logs: dict[str, Path], record: Path, **beside: Path) -> tuple[list[dict[str, str]], dict[str, str]]:
-    return known_hashes(logs, TopicChoice.model_validate(beside), record, Execution(2))
+    return known_hashes(given(logs, TopicChoice.model_validate(beside)), record, Execution(2))
+
+
+def given(logs: dict[str, Path], topics: TopicChoice) -> list[GivenLog]:
+    return [GivenLog(path, name, name, topics, {}) for name, path in logs.items()]
 
 
 def log(text: str) -> bytes:
@@ -189,7 +194,7 @@ def test_reading_tells_how_far_it_is_and_ends_at_once(tmp_path: Path, monkeypatc
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        known_hashes({"large": large}, TopicChoice(), tmp_path / ".inputs.json", Execution(2, interrupt))
+        known_hashes(given({"large": large}, TopicChoice()), tmp_path / ".inputs.json", Execution(2, interrupt))
     assert told[-1][0] == "check (MB)"
     assert 0 < told[-1][1] < told[-1][2] == 10**7
 
@@ -200,7 +205,7 @@ def test_masks_of_one_name_are_told_apart(tmp_path: Path, logs: dict[str, Path])
         masks[topic] = tmp_path / topic.strip("/") / "mask.png"
         masks[topic].parent.mkdir()
         masks[topic].write_bytes(text)
-    (found, *_), errors = known_hashes(logs, TopicChoice(masks=masks), tmp_path / "record", Execution(1))
+    (found, *_), errors = known_hashes(given(logs, TopicChoice(masks=masks)), tmp_path / "record", Execution(1))
     assert not errors
     beside = {name: text for name, text in found.items() if name.startswith("beside")}
     assert {name: hashlib.sha256(masks[name.split()[2]].read_bytes()).hexdigest() for name in beside} == beside

@@ -256,7 +256,8 @@ def _add_workers(verb: argparse.ArgumentParser) -> None:
 
 
 def _add_batch(sub: argparse.ArgumentParser) -> None:
-    option(sub, "logs", place, "LOG", "one drive each", nargs="+")
+    text = "one drive each, folders or prefixes of them, patterns, @LIST.txt, or a manifest: drives.csv, drives.parquet"
+    option(sub, "logs", place, "LOG", text, nargs="+")
     option(sub, "-o --map", place, "MAP", "folder, s3://, gs:// or az:// of the map", required=True)
     _add_workers(sub)
     flag(sub, "--no-join", "do not look for closures between the drives at the end", "join")

@@ -387,8 +387,8 @@ def print_map(found: dict[str, Any]) -> None:
     for drive in found["drives"]:
         counts = (str(drive[name]) for name in ("keyframes", "candidates", "accepted"))
         costs = (f"{value or 0:.1f}" for value in (drive["bytes"] / 1e6, drive["seconds"], drive["peak_memory_mb"]))
-        rows.append((drive["drive"], *counts, *costs))
-    print_table(("drive", "keyframes", "candidates", "accepted", "MB", "seconds", "peak MB"), rows)
+        rows.append((drive["drive"], *counts, *costs, " ".join(map("=".join, drive["tags"].items()))))
+    print_table(("drive", "keyframes", "candidates", "accepted", "MB", "seconds", "peak MB", "tags"), rows)
     for drive, failure in found["failures"].items():
         print_status(f"failed: {drive}: {failure['error']}")
     warn(found["problems"])

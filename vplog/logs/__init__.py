@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from vplog.stages import Log
 
-__all__ = ["EVERY_IMAGE", "TopicChoice", "check", "is_image_file", "open", "open_drive", "open_images"]
+__all__ = ["EVERY_IMAGE", "TopicChoice", "below", "check", "is_image_file", "open", "open_drive", "open_images"]
 
 
 def open(path: Path, topics: TopicChoice | None = None) -> Log:
@@ -28,6 +28,13 @@ def check(path: Path) -> None:
     from vplog.logs.detect import check_log
 
     check_log(path)
+
+
+def below(path: Path) -> list[Path]:
+    """The logs in a folder, or on an object store under a prefix; the path itself where it is one drive."""
+    from vplog.logs.detect import logs_below
+
+    return logs_below(path)
 
 
 def open_drive(paths: Sequence[Path], topics: TopicChoice | None = None) -> Log:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import weakref
 from contextlib import ExitStack
 from itertools import pairwise
@@ -30,7 +31,7 @@ from vplog.logs.formats.sqlite_bag import SqliteBag
 from vplog.logs.messages.records import kind_of
 from vplog.logs.recorded_log import RecordedLog
 from vplog.logs.topic_selection import EVERY_IMAGE
-from vplog.storage.remote_path import RemotePath, located
+from vplog.storage.remote_path import RemotePath, located, names_below
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,6 +46,8 @@ _MAGIC = {mcap_file.MAGIC: "mcap", ros1_bag.MAGIC: "ros1", sqlite_bag.MAGIC: "db
 _READERS = {"mcap": McapFile, "ros1": Ros1Bag, "db3": SqliteBag}
 _KINDS = {"mcap": "mcap", "ros1": "ros1", "db3": "ros2-db3"}
 _DATA_SETS = (kitti, euroc, vslam_lab, tum_rgbd, colmap, utm_images)
+_LOG_NAME = re.compile(r"\.(mcap|bag|db3)(\.zstd?)?$", re.IGNORECASE)
+"""Names of logs among other files: to look into each of a bucket costs a request."""
 _LISTED = 5
 """Files that an error lists."""
 _DEEPEST, _MOST_FILES = 4, 10**6
@@ -84,6 +87,36 @@ def check_log(path: Path) -> None:
                 raise LogError(_no_folder(path, files))
     except OSError as error:
         raise _unreadable(path, error) from None
+
+
+def logs_below(path: Path) -> list[Path]:
+    """The logs in a folder by their names, a few levels deep: bags, folders of bags, data sets. The path itself where
+    it is one drive, or nothing is found there or can be read, as opening it says."""
+    path = located(path)
+    try:
+        if _LOG_NAME.search(path.name) or not path.is_dir() or len(_data_sets(path)) == 1:
+            return [path]
+        found = _logs_below(path, _DEEPEST)
+    except OSError:
+        return [path]
+    return found if found and found != [path / found[0].name] else [path]
+
+
+def _logs_below(folder: Path, levels: int) -> list[Path]:
+    remote = isinstance(folder, RemotePath)
+    inside = names_below(folder) if remote else {one.name: one.is_dir() for one in folder.iterdir()}
+    names = sorted((name for name in inside if not name.startswith(".")), key=image_folder.natural_order)
+    if "metadata.yaml" in names:
+        return [folder]
+    if _RESULTS.keys() & names:  # of vplog's own
+        return []
+    if roots := [] if remote else [root for one in _DATA_SETS for root in one.roots(folder)]:
+        return roots
+    logs = [folder / name for name in names if not inside[name] and _LOG_NAME.search(name)]
+    if len(logs) > 1 and split_parts(logs) is not None:
+        return [folder]
+    below = [folder / name for name in names if inside[name]] if levels else []
+    return [*logs, *(log for one in below for log in _logs_below(one, levels - 1))]
 
 
 def _unreadable(path: Path, error: OSError) -> LogError:
