@@ -352,6 +352,8 @@ def batch(
     retries: int = 2,
     join: bool = True,
     keep_cache: bool = False,
+    dry_run: bool = False,
+    cost_per_cpu_hour: float | None = None,
     progress: Progress = silent,
     on_drive: Callable[[Drive], None] = lambda _: None,
 ) -> dict[str, Any]:
@@ -368,6 +370,8 @@ def batch(
     engine, address: `local` processes, or `ray` with the HOST:PORT of a cluster.
     retries: more attempts at a drive whose process was killed.
     join: whether closures between drives are searched at the end.
+    dry_run: say what would be computed, with bytes, images, CPU hours and, by `cost_per_cpu_hour`, the cost; nothing is
+        written.
     on_drive: called with each drive as it ends.
     """
     from vplog.batch.drive_inputs import drive_inputs
@@ -389,6 +393,10 @@ def batch(
         else:
             chosen = _pipeline(pipeline, settings)
         references = None if library is None else stack.enter_context(local_copy(located(library)))
+        if dry_run:
+            from vplog.batch.dry_run import dry_run as plan
+
+            return plan(inputs, root, chosen, references, parts, Execution(threads, progress), cost_per_cpu_hour)
         options = BatchOptions(jobs, engine, address, retries, processes, join, keep_cache, on_drive)
         return run_batch(inputs, root, chosen, references, parts, Execution(threads, progress), options)
 

@@ -470,6 +470,30 @@ def test_a_manifest_names_tags_which_stay(
         assert "vehicle=v2" in verb("map", "info", root).out
 
 
+def test_a_dry_run_writes_nothing_and_reckons_by_the_drives_of_the_map(
+    whole: Path, logs: list[Path], tmp_path: Path, verb: Callable[..., Said]
+) -> None:
+    new, before = Path(shutil.copyfile(logs[0], tmp_path / "new.mcap")), files(whole)
+    dry = (*logs, new, tmp_path / "gone.bag", "--dry-run", "--cost-per-cpu-hour", 3600, *OPTIONS)
+    found = verb("batch", *dry, "-o", whole, "--json").json
+    assert files(whole) == before
+    states = ["unchanged", "unchanged", "compute", "failed"]
+    assert [one["state"] for one in found["drives"]] == states
+    runs = [read_run_json(whole / f"runs/drive={drive}/run.json") for drive in ("drive", "drive-2")]
+    cpu_s, images = (
+        sum(one[part][name] for one in runs) for part, name in (("totals", "cpu_seconds"), ("counts", "frames"))
+    )
+    assert (found["compute"], found["bytes"], found["images"]) == (1, new.stat().st_size, runs[0]["counts"]["frames"])
+    assert found["cpu_seconds_per_image"] == pytest.approx(cpu_s / images, abs=1e-3)
+    assert found["cost"] == pytest.approx(cpu_s / images * found["images"], abs=0.02)
+    os.utime(logs[0])
+    assert verb("batch", logs[0], "--dry-run", "-o", whole, "--json", *OPTIONS).json["compute"] == 1, (
+        "it may be another"
+    )
+    said = verb("batch", *dry, "-o", tmp_path / "map")
+    assert (said.code, "3 of 4 drives to compute" in said.out, (tmp_path / "map").exists()) == (0, True, False)
+
+
 def test_logs_that_are_refused_leave_no_map(whole: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:
     [library] = (whole / "libraries").iterdir()
     for more in ([], ["--library", library]):

@@ -11,7 +11,7 @@ import pytest
 from tests.maps.bucket import serving
 from vplog.batch.drive_inputs import drive_inputs
 from vplog.errors import LogError, ResultError, SettingsError
-from vplog.storage.remote_path import located, send
+from vplog.storage.remote_path import RemotePath, located, send
 
 NAMES = (
     "a/one.mcap", "a/two.bag", "a/.hidden.mcap", "b/bag/metadata.yaml", "b/bag/bag_0.mcap", "b/run/run.json",
@@ -52,9 +52,9 @@ def test_folders_patterns_and_lists(fleet: Path, tmp_path_factory: pytest.TempPa
 def test_a_prefix_of_a_bucket(fleet: Path) -> None:
     with serving():
         for name in NAMES:
-            send(located(f"s3://bucket/fleet/{name}"), fleet / name)
+            send(RemotePath(f"s3://bucket/fleet/{name}"), fleet / name)
         (fleet / "drives.csv").write_text("log,vehicle\na/one.mcap,v1\ns3://other/x.mcap,v2\n")
-        send(located("s3://bucket/fleet/drives.csv"), fleet / "drives.csv")
+        send(RemotePath("s3://bucket/fleet/drives.csv"), fleet / "drives.csv")
         assert found(located("s3://bucket/fleet/")) == [f"s3://bucket/fleet/{name}" for name in LOGS]
         assert found(located("s3://bucket/fleet/*/two.bag")) == ["s3://bucket/fleet/a/two.bag"]
         assert found(located("s3://bucket/fl*/**/bag")) == ["s3://bucket/fleet/b/bag"]

@@ -99,6 +99,9 @@ def batch(arguments: argparse.Namespace) -> None:
     """Compute many recorded drives into one growing map, each drive in its own process, here or on a Ray cluster."""
     with Progress(arguments) as progress:
         found = call(api.batch, arguments, progress=progress, on_drive=progress.print_drive)
+    if arguments.dry_run:
+        print_result(arguments, found, printing.print_dry_run)
+        return
     drives = plural(len(found["drives"]), "drive")
     wrong = f"{found['failed']} of {drives} failed; `vplog map info {arguments.map}` has the reasons."
     _end(arguments, found, printing.print_batch, wrong)
@@ -260,6 +263,8 @@ def _add_batch(sub: argparse.ArgumentParser) -> None:
     option(sub, "logs", place, "LOG", text, nargs="+")
     option(sub, "-o --map", place, "MAP", "folder, s3://, gs:// or az:// of the map", required=True)
     _add_workers(sub)
+    flag(sub, "--dry-run", "say which drives would be computed, with bytes, CPU hours and cost, and write nothing")
+    option(sub, "--cost-per-cpu-hour", parser.not_negative, "COST", "price of an hour of a core, for --dry-run")
     flag(sub, "--no-join", "do not look for closures between the drives at the end", "join")
     text = "cache results of stages, 0.35 MB a keyframe, so that other settings read no images; local maps only"
     flag(sub, "--keep-cache", text)

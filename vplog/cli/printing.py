@@ -338,6 +338,8 @@ def print_optimised(found: dict[str, Any]) -> None:
     print(f"  {sum(found['seconds'].values()):.2f} s")
 
 
+_SIZES = (("bytes", "d"), ("images", "d"), ("seconds", ".1f"))
+"""Columns of the table of a dry run, with their formats."""
 _BATCH_COSTS = (("seconds", 1), ("peak_memory_mb", 0))
 """Cost columns of the table of a batch, with their decimals."""
 
@@ -366,6 +368,27 @@ def print_batch(found: dict[str, Any]) -> None:
     named = shlex.quote(str(found["map"]))
     look = f"{found['map']}/runs/drive=ID/report.html of each drive"
     print_next(look, f"vplog map info {named}", f"vplog map query {named} LOG")
+
+
+def print_dry_run(found: dict[str, Any]) -> None:
+    rows = [
+        (
+            one["drive"], one["state"], *(f"{one[name]:{form}}" if one["images"] else "" for name, form in _SIZES),
+            " ".join(map("=".join, one["tags"].items())), one["error"],
+        )
+        for one in found["drives"]
+    ]  # fmt: skip
+    print_table(("drive", "would", "bytes", "images", "seconds", "tags", "error"), rows)
+    known = found["cpu_seconds_from"]
+    source = f"as {plural(known, 'drive')} of the map took" if known else "as no drive of the map says otherwise"
+    print_line(
+        f"{found['map']}:",
+        f"{found['compute']} of {plural(len(found['drives']), 'drive')} to compute, {found['bytes'] / 1e9:.3g} GB, "
+        f"{plural(found['images'], 'image')}",
+    )
+    print_line("takes", f"{found['cpu_hours']:.3g} CPU hours, {found['cpu_seconds_per_image']:.3g} s an image {source}")
+    if found["cost"] is not None:
+        print_line("costs", f"{found['cost']:.2f}")
 
 
 def print_map(found: dict[str, Any]) -> None:

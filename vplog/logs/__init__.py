@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from vplog.stages import Log
 
 __all__ = ["EVERY_IMAGE", "TopicChoice", "below", "check", "is_image_file", "open", "open_drive", "open_images"]
+__all__ += ["summary"]
 
 
 def open(path: Path, topics: TopicChoice | None = None) -> Log:
@@ -43,6 +44,13 @@ def open_drive(paths: Sequence[Path], topics: TopicChoice | None = None) -> Log:
     from vplog.logs.detect import open_drive as open_parts
 
     return open_parts(paths, topics or TopicChoice())
+
+
+def summary(path: Path, topics: TopicChoice | None = None) -> tuple[int, float]:
+    """Images of the camera in use and s of the log at `path`, as its index has them. Raises LogError."""
+    from vplog.logs.detect import open_log
+
+    return open_log(path, topics or TopicChoice()).summary()
 
 
 def open_images(files: Sequence[Path], topics: TopicChoice | None = None) -> Log:

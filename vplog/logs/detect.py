@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from vplog.logs.datasets.streams import DataSet
     from vplog.logs.formats.container import Container, Contents
     from vplog.logs.topic_selection import TopicChoice
-    from vplog.stages import Log
 
 _RESULTS = {"run.json": "a run", "map.json": "a map", "library.json": "a library"}
 _MAGIC = {mcap_file.MAGIC: "mcap", ros1_bag.MAGIC: "ros1", sqlite_bag.MAGIC: "db3", b"\x28\xb5\x2f\xfd": "zstd"}
@@ -62,7 +61,7 @@ _KNOWN = (
 )
 
 
-def open_log(path: Path, choice: TopicChoice) -> Log:
+def open_log(path: Path, choice: TopicChoice) -> RecordedLog:
     """The log at `path`. Raises LogError where there is none that vplog reads."""
     path, notes = located(path), Notes()
     try:
@@ -131,7 +130,7 @@ def _check_there(path: Path) -> None:
         raise LogError(f"{path} is neither a file nor a folder. A log is {_KNOWN}.")
 
 
-def _open_file(path: Path, choice: TopicChoice, notes: Notes) -> Log:
+def _open_file(path: Path, choice: TopicChoice, notes: Notes) -> RecordedLog:
     if not _magic(path) and video.is_video(path):
         if isinstance(path, RemotePath):
             raise LogError(f"{path} is a video, and videos are read from local files. Copy it to this machine.")
@@ -140,7 +139,7 @@ def _open_file(path: Path, choice: TopicChoice, notes: Notes) -> Log:
     return _recorded(path, _name(path), _KINDS[kind], container, notes, choice)
 
 
-def _published(path: Path, name: str, found: DataSet, notes: Notes, choice: TopicChoice) -> Log:
+def _published(path: Path, name: str, found: DataSet, notes: Notes, choice: TopicChoice) -> RecordedLog:
     return _recorded(path, name, found.kind, DataSetContainer(found, notes), notes, choice)
 
 
@@ -179,7 +178,7 @@ class _Part(NamedTuple):
     contents: Contents
 
 
-def open_drive(paths: Sequence[Path], choice: TopicChoice) -> Log:
+def open_drive(paths: Sequence[Path], choice: TopicChoice) -> RecordedLog:
     """Files of one drive, given in any order, as one log. Raises LogError where they cannot be."""
     paths = [located(path) for path in paths]
     if len(paths) == 1:
@@ -232,7 +231,7 @@ def _in_order_of_time(parts: list[_Part]) -> list[_Part]:
     return parts
 
 
-def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> Log:
+def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> RecordedLog:
     problem = None
     if (path / "metadata.yaml").is_file():
         try:
@@ -273,7 +272,7 @@ def _data_sets(path: Path) -> list[Path]:
     return []
 
 
-def open_images(files: Sequence[Path], choice: TopicChoice) -> Log:
+def open_images(files: Sequence[Path], choice: TopicChoice) -> RecordedLog:
     """Files of images as one log, each once, in natural order of their names or by the times in them."""
     paths = [located(file) for file in dict.fromkeys(files)]
     for path in paths:
@@ -315,7 +314,7 @@ def _files_below(path: Path) -> list[Path]:
     return sorted(found)
 
 
-def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice, notes: Notes) -> Log:
+def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice, notes: Notes) -> RecordedLog:
     """The logs of a folder without usable metadata."""
     if len(logs) == 1 and _magic(logs[0]) == "ros1":
         return _open_file(logs[0], choice, notes)
@@ -327,7 +326,7 @@ def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice,
     return _open_bag(path, Metadata(parts, [], {}, 0, 0), choice, notes)
 
 
-def _open_bag(folder: Path, metadata: Metadata, choice: TopicChoice, notes: Notes) -> Log:
+def _open_bag(folder: Path, metadata: Metadata, choice: TopicChoice, notes: Notes) -> RecordedLog:
     """A ROS 2 bag of several storage files. An unreadable one is left out as long as another is sound."""
     name = folder.resolve().name
     parts: list[tuple[Container, str]] = []
