@@ -25,11 +25,11 @@ import pytest
 from tests.joined import rewritten
 from vplog.batch import batch
 from vplog.batch.batch import run_batch
-from vplog.batch.engine import BatchOptions, LocalEngine, as_completed
+from vplog.batch.engine import BatchOptions, LocalEngine, as_completed, open_engine
 from vplog.batch.plan import DriveInput, PlannedDrive, absolute_log, given_logs, name_of
-from vplog.batch.worker import Outcome, Task
+from vplog.batch.worker import Drive, Outcome, Task, compute_drive
 from vplog.demo.record import IMAGE
-from vplog.errors import LibraryError, ResultError, SettingsError
+from vplog.errors import LibraryError, LogError, ResultError, SettingsError
 from vplog.execution.process_pool import OwnProcesses, ProcessExpired
 from vplog.logs import TopicChoice
 from vplog.maps.storage import map_store
@@ -280,26 +280,69 @@ class Fated:
 def test_a_drive_is_tried_again_where_that_may_help_and_stops_no_other(tmp_path: Path) -> None:
     died, bad, good = BrokenExecutor("Its worker was killed."), Outcome("No such topic."), Outcome(worker="here")
     engine = Fated({
-        "unlucky": [died, Outcome("Out of memory.", retryable=True), good],
+        "unlucky": [died, Outcome("Out of memory.", "memory"), good],
         "bad": [bad],
         "good": [good],
         "lost": [Outcome(worker="gone"), good],
+        "offline": [Outcome("The server does not answer.", "network"), good],
+        "slow": [Outcome("It took longer.", "time limit"), good],
         "hopeless": [died, died, died],
         "odd": [ValueError("what\nis this")],
     })  # fmt: skip
     topics, pipeline = TopicChoice(), load_pipeline("default")
     tasks = [Task(name, name, tmp_path, tmp_path, pipeline, topics, 1, {}) for name in engine.fates]
-    found = as_completed(cast("LocalEngine", engine), tasks, BatchOptions(2))
+    told: list[Drive] = []
+    found = as_completed(cast("LocalEngine", engine), tasks, BatchOptions(2, on_drive=told.append))
     ended = {task.drive: (outcome.error, attempts) for task, outcome, attempts in found}
     assert ended == {
         "unlucky": ("", 3),
         "bad": ("No such topic.", 1),
         "good": ("", 1),
         "lost": ("", 2),
+        "offline": ("", 2),
+        "slow": ("It took longer.", 1),
         "hopeless": ("Its worker was killed.", 3),
         "odd": ("Internal error: ValueError: what is this.", 1),
     }
-    assert set(engine.begun[:6]) == set(engine.fates), "each has its turn before one is tried again"
+    assert set(engine.begun[:8]) == set(engine.fates), "each has its turn before one is tried again"
+    states = [(one.state, one.attempts, one.fault) for one in told if one.drive == "unlucky"]
+    assert states == [
+        ("started", 1, ""), ("retried", 1, "worker"), ("started", 2, ""), ("retried", 2, "memory"), ("started", 3, ""),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("behind", "fault"), [(OSError("reset"), "network"), (FileNotFoundError(), "input"), (ValueError(), "input")]
+)
+def test_the_network_is_no_fault_of_a_log(
+    behind: Exception, fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unreadable(*_: object) -> None:
+        try:
+            raise behind
+        except type(behind):
+            raise LogError("It cannot be read.") from None
+
+    monkeypatch.setattr("vplog.logs.open", unreadable)
+    for log, expected in (("s3://bucket/a.mcap", fault), ("/a.mcap", "input")):
+        task = Task("a", log, tmp_path, tmp_path, load_pipeline("default"), TopicChoice(), 1, {})
+        assert compute_drive(task).fault == expected
+
+
+@pytest.mark.parametrize(("limit", "fault"), [({"time_s": 1e-4}, "time limit"), ({"memory_mb": 1.0}, "memory limit")])
+def test_a_drive_over_its_limit_ends(
+    limit: dict[str, float], fault: str, whole: Path, logs: list[Path], tmp_path: Path, own_processes: None
+) -> None:
+    [library] = (whole / "libraries").iterdir()
+    pipeline = load_pipeline("default", QUICK)
+    task = Task("a", str(logs[0]), tmp_path / "run", library, pipeline, TopicChoice(), 1, {}, **limit)  # pyrefly: ignore[bad-argument-type]
+    with OwnProcesses(1) as processes:
+        [(_, outcome, attempts)] = as_completed(LocalEngine(processes, 1), [task], BatchOptions())
+    assert (outcome.fault, attempts) == (fault, 1)
+    assert "--drive-" in outcome.error
+    over_ray = BatchOptions(engine="ray", drive_timeout_s=1)
+    with pytest.raises(SettingsError, match="for --engine local"), open_engine(over_ray, 1):
+        pass
 
 
 def test_a_process_that_dies_takes_no_other_along(monkeypatch: pytest.MonkeyPatch, own_processes: None) -> None:

@@ -86,7 +86,9 @@ def run_batch(
         done = dict[str, Drive]()
         for one in plan:
             if one.state != "compute":
-                done[one.drive] = Drive(one.drive, one.record["log"], one.state, error=one.error)
+                done[one.drive] = Drive(
+                    one.drive, one.record["log"], one.state, error=one.error, fault="input" if one.error else ""
+                )  # fmt: skip
             if one.state == "failed":
                 options.on_drive(done[one.drive])
             elif one.state == "unchanged":
@@ -96,6 +98,7 @@ def run_batch(
         execution.progress("drives", len(done), len(plan))
         keep = options.join or options.keep_cache
         like = Task("", "", store.staging, store.library(digest), pipeline, TopicChoice(), each, {}, None, keep)
+        like = replace(like, time_s=options.drive_timeout_s, memory_mb=options.drive_memory_mb)
         tasks = _tasks(store, wanted, like, longest_first=concurrency > 1)
         places = None
         is_alone = len(known.keys() | {one.drive for one in plan}) < 2
@@ -143,7 +146,7 @@ def write_failures(store: Store, done: Mapping[str, Drive]) -> None:
     """Note the failures of this batch in the map, beside those of other drives."""
     changes = dict[str, dict[str, Any] | None]()
     for drive, one in done.items():
-        failed = {"log": one.log, "error": one.error, "attempts": one.attempts}
+        failed = {"log": one.log, "error": one.error, "fault": one.fault, "attempts": one.attempts}
         changes[drive] = failed if one.state == "failed" else None
     store.update_failures(changes)
 
@@ -244,16 +247,13 @@ def _divide_cores(workers: Engine, jobs: int | None, drives: int) -> tuple[int, 
 
 
 def _publish(store: Store, task: Task, outcome: Outcome, attempts: int) -> Drive:
-    error, drive = outcome.error, task.drive
-    if not error:
+    drive = task.drive
+    if not outcome.error:
         try:
             drive = map_store.publish(store, drive, task.folder)
         except ResultError as problem:
-            error = str(problem)
-    if error:
+            outcome = replace(outcome, error=str(problem), fault="io")
+    if outcome.error:
         shutil.rmtree(task.folder, ignore_errors=True)
-    known = Drive.__dataclass_fields__
-    figures: dict[str, Any] = {name: value for name, value in vars(outcome).items() if name in known}
-    figures["error"] = error
-    state = "failed" if error else "computed"
-    return Drive(**figures, drive=drive, log=task.record["log"], state=state, attempts=attempts)
+    state = "failed" if outcome.error else "computed"
+    return replace(Drive.after(task, state, attempts, outcome), drive=drive)

@@ -19,6 +19,8 @@ from vplog.results.tables import reading
 from vplog.storage.parquet_limits import open_table, read_table
 from vplog.storage.remote_path import RemotePath, local_copy, located, objects_below
 
+MANIFESTS = (".csv", ".parquet")
+"""Endings of the names of manifests."""
 _COLUMNS = {option.replace("-", "_"): name for name, option in OPTIONS.items()}
 _COLUMNS |= {"odometry": "odometry", "mask": "masks"}
 """Field of TopicChoice for each column that is called as an option of the command line."""
@@ -43,7 +45,7 @@ def drive_inputs(places: Iterable[Path | DriveInput]) -> list[DriveInput]:
 def _drives_of(place: Path | DriveInput) -> list[DriveInput]:
     if isinstance(place, DriveInput):
         return [place]
-    if place.suffix.lower() in (".csv", ".parquet"):
+    if place.suffix.lower() in MANIFESTS:
         return manifest(place)
     if str(place).startswith("@") and not place.exists():
         file = Path(str(place)[1:])

@@ -254,8 +254,12 @@ def _add_workers(verb: argparse.ArgumentParser) -> None:
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     text = "HOST:PORT of a Ray cluster, or auto (default: one on this machine for the time of the batch)"
     option(sub, "--address", str, "HOST:PORT", text)
-    text = "retries of a drive whose worker was killed or had an I/O error (default: 2)"
+    text = "retries of a drive whose worker was killed, or had an error of network, disk or memory (default: 2)"
     option(sub, "--retries", parser.at_least(0), "N", text, default=2)
+    text = "longest time of a drive, which then fails; local processes only"
+    option(sub, "--drive-timeout", parser.positive, "S", text, dest="drive_timeout_s")
+    text = "largest resident memory of a drive in MB, as --drive-timeout"
+    option(sub, "--drive-memory", parser.positive, "MB", text, dest="drive_memory_mb")
 
 
 def _add_batch(sub: argparse.ArgumentParser) -> None:

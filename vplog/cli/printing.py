@@ -237,6 +237,20 @@ def print_evaluation(found: dict[str, Any]) -> None:
             print_line("", f"{what} (mean of {drift['segments']} segments of {ends} of path)")
 
 
+def print_evaluated_map(found: dict[str, Any]) -> None:
+    def figures(one: dict[str, Any]) -> list[str]:
+        known = [(one[name], form) for name, form in (("ate_m", ".3f"), ("recall", ".3f"), ("false_closures", "d"))]
+        return ["" if value is None else f"{value:{form}}" for value, form in known]
+
+    rows = [
+        (one["drive"], " ".join(map("=".join, one["tags"].items())), one["vplog"] or "", *figures(one), one["error"])
+        for one in found["drives"]
+    ]
+    print_table(("drive", "tags", "vplog", "ATE m", "recall", "false", "error"), rows)
+    groups = [(name, str(one["drives"]), *figures(one)) for name, one in found["groups"].items()]
+    print_table(("mean of", "drives", "ATE m", "recall", "false"), groups)
+
+
 def _truth_notes(found: dict[str, Any]) -> list[str]:
     """Warnings about the truth that bear on the figures."""
     truth, notes = found.get("truth_is"), []

@@ -26,7 +26,7 @@ from vplog.errors import LibraryError, ResultError, SettingsError, VplogError
 from vplog.maps.storage import local, upload
 from vplog.maps.storage.contents import Head, Store, common_library
 from vplog.maps.storage.damage import UnreachableError, complete_record, damaged_table
-from vplog.maps.storage.layout import HASH, TABLES, folder_name, free_name, renamed, set_drive_id
+from vplog.maps.storage.layout import HASH, RUN_TABLES, TABLES, folder_name, free_name, renamed, set_drive_id
 from vplog.maps.storage.remote_map import Mirror
 from vplog.results import run_record
 from vplog.storage.folders import check_regular, regular_files
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from vplog.maps.storage.download_cache import Cache
 
 __all__ = ["TABLES", "Head", "Store", "add_library", "common_library", "folder_name", "publish", "reading", "remove"]
-__all__ += ["annotate", "writing"]
+__all__ += ["RUN_TABLES", "annotate", "writing"]
 
 
 @contextmanager
