@@ -502,8 +502,10 @@ def test_a_manifest_names_tags_which_stay(
 ) -> None:
     root, manifest = shutil.copytree(whole, tmp_path / "map"), tmp_path / "drives.csv"
     manifest.write_text(f"log,vehicle,truth\n{logs[0]},v1,t.tum\n{logs[1]},v2,\n")
+    metrics = tmp_path / "batch.prom"
     for given in ([manifest], logs):
-        done = verb("batch", *given, "-o", root, "--no-join", "--json", *OPTIONS).json
+        done = verb("batch", *given, "-o", root, "--no-join", "--json", "--metrics", metrics, *OPTIONS).json
+        assert f'vplog_batch_drives{{map="{root}",state="unchanged"}} 2\n' in metrics.read_text()
         assert [(one["drive"], one["state"]) for one in done["drives"]] == [
             ("drive", "unchanged"),
             ("drive-2", "unchanged"),

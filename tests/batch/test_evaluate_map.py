@@ -46,6 +46,8 @@ def test_drives_are_evaluated_each_and_by_tag(
     assert (said.code, said.err.count("before has ate_m")) == (1, 1)
     assert "after has" not in said.err
     assert f"{manifest} names no truth of it." in said.out
+    manifest.write_text("log,truth\nx.mcap,gps\n")
+    assert "No drive of" in verb("evaluate", root, "--truth", manifest).error
     run = (root / "runs/drive=before", "--truth", drive.truth, "--fail-on")
     assert verb("evaluate", *run, "ate_m<0").code == 0
     assert "The run has ate_m" in verb("evaluate", *run, limit).err

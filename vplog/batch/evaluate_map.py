@@ -45,6 +45,9 @@ def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None =
                 found = {"error": str(error)}
             drives.append({**row, **figures_of(found), "error": found.get("error", "")})
             store.evict(drive)
+    if all(one["error"] for one in drives):
+        why = f" Of {drives[0]['drive']}: {drives[0]['error']}" if drives else ""
+        raise TruthError(f"No drive of {root} can be evaluated.{why}")
     return {"map": str(root), "drives": drives, "groups": _groups(drives)}
 
 

@@ -102,6 +102,10 @@ def batch(arguments: argparse.Namespace) -> None:
     if arguments.dry_run:
         print_result(arguments, found, printing.print_dry_run)
         return
+    if arguments.metrics is not None:
+        from vplog.batch.metrics import write_metrics
+
+        write_metrics(arguments.metrics, found)
     drives = plural(len(found["drives"]), "drive")
     wrong = f"{found['failed']} of {drives} failed; `vplog map info {arguments.map}` has the reasons."
     _end(arguments, found, printing.print_batch, wrong)
@@ -267,6 +271,8 @@ def _add_batch(sub: argparse.ArgumentParser) -> None:
     option(sub, "logs", place, "LOG", text, nargs="+")
     option(sub, "-o --map", place, "MAP", "folder, s3://, gs:// or az:// of the map", required=True)
     _add_workers(sub)
+    text = "write states, faults and seconds as Prometheus's textfile collector reads them"
+    option(sub, "--metrics", parser.output_file, "FILE.prom", text)
     flag(sub, "--dry-run", "say which drives would be computed, with bytes, CPU hours and cost, and write nothing")
     option(sub, "--cost-per-cpu-hour", parser.not_negative, "COST", "price of an hour of a core, for --dry-run")
     flag(sub, "--no-join", "do not look for closures between the drives at the end", "join")
