@@ -339,6 +339,7 @@ def test_a_drive_over_its_limit_ends(
     with OwnProcesses(1) as processes:
         [(_, outcome, attempts)] = as_completed(LocalEngine(processes, 1), [task], BatchOptions())
     assert (outcome.fault, attempts) == (fault, 1)
+    assert outcome.seconds > 0
     assert "--drive-" in outcome.error
     over_ray = BatchOptions(engine="ray", drive_timeout_s=1)
     with pytest.raises(SettingsError, match="for --engine local"), open_engine(over_ray, 1):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -79,16 +80,18 @@ def as_completed(engine: Engine, tasks: Sequence[Task], options: BatchOptions) -
     """
     jobs = options.jobs or 1 if options.engine == "local" else options.jobs
     waiting = deque((task, 1) for task in tasks)
-    running: dict[Future[Outcome], tuple[Task, int]] = {}
+    running: dict[Future[Outcome], tuple[Task, int, float]] = {}
     while waiting or running:
         # without `jobs` one stands in line behind each, so that no core waits for this loop
         while waiting and len(running) < (jobs or 2 * engine.concurrency(waiting[0][0].threads)):
             task, attempt = waiting.popleft()
             options.on_drive(Drive(task.drive, shown(task.log), "started", attempt))
-            running[engine.start(task)] = task, attempt
+            running[engine.start(task)] = task, attempt, time.monotonic()
         for future in wait(running, return_when=FIRST_COMPLETED).done:
-            task, attempt = running.pop(future)
+            task, attempt, began_s = running.pop(future)
             outcome = _outcome_of(engine, task, future)
+            if not outcome.seconds:  # nobody says how long it lived
+                outcome = replace(outcome, seconds=round(time.monotonic() - began_s, 3))
             if outcome.retryable and attempt <= options.retries:
                 waiting.append((task, attempt + 1))
                 options.on_drive(Drive.after(task, "retried", attempt, outcome))
