@@ -26,7 +26,7 @@ from tests.joined import rewritten
 from vplog.batch import batch
 from vplog.batch.batch import run_batch
 from vplog.batch.engine import BatchOptions, LocalEngine, as_completed, open_engine
-from vplog.batch.plan import DriveInput, PlannedDrive, absolute_log, given_logs, name_of
+from vplog.batch.plan import DriveInput, PlannedDrive, absolute_log, name_of
 from vplog.batch.worker import Drive, Outcome, Task, compute_drive
 from vplog.demo.record import IMAGE
 from vplog.errors import LibraryError, LogError, ResultError, SettingsError
@@ -605,8 +605,7 @@ def test_the_longest_log_is_begun_first(tmp_path: Path) -> None:
     for name, size in (("short", 10), ("long", 30), ("same", 10)):
         at[name].write_bytes(bytes(size))
     like = Task("", "", tmp_path, tmp_path, load_pipeline("default"), TopicChoice(), 1, {})
-    given = given_logs([DriveInput(path) for path in at.values()], None)
-    wanted = [PlannedDrive(log, {"drive": log.name}, "compute") for log in given]
+    wanted = [PlannedDrive(DriveInput(path), {"drive": name}, "compute") for name, path in at.items()]
     with map_store.writing(tmp_path / "map") as store:
         found = batch._tasks(store, wanted, like, longest_first=True)
         assert [task.drive for task in found] == ["long", "short", "same", "gone"]

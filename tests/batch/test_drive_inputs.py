@@ -10,7 +10,9 @@ import pytest
 
 from tests.maps.bucket import serving
 from vplog.batch.drive_inputs import drive_inputs
+from vplog.batch.plan import with_topics
 from vplog.errors import LogError, ResultError, SettingsError
+from vplog.logs import TopicChoice
 from vplog.storage.remote_path import RemotePath, located, send
 
 NAMES = (
@@ -76,9 +78,13 @@ def test_a_manifest_has_topics_truth_and_tags_of_each_drive(tmp_path: Path) -> N
     first, second = drive_inputs([tmp_path / "drives.csv"])
     assert [first, second] == drive_inputs([tmp_path / "drives.parquet"])
     assert (first.log, first.name) == (tmp_path / "a.mcap", "monday")
-    assert first.topics == {"odometry": "/odom", "calibration_file": tmp_path / "c.yaml", "start_s": 1.5}
+    own = {"odometry": "/odom", "calibration_file": tmp_path / "c.yaml", "start_s": 1.5}
+    assert first.topics.model_dump(exclude_unset=True) == own
+    common = TopicChoice(odometry="twist", image="/left")
+    assert [one.topics.odometry for one in with_topics([first, second], common)] == ["/odom", "twist"]
+    assert with_topics([first], common)[0].topics.image == "/left"
     assert first.about == {"tags": {"weather": "rain"}, "truth": str(tmp_path / "t.tum")}
-    assert (second.log, second.name, second.topics) == (Path("/logs/b.mcap"), "", {})
+    assert (second.log, second.name, second.topics) == (Path("/logs/b.mcap"), "", TopicChoice())
     assert second.about == {"tags": {}, "truth": "gps"}
 
 

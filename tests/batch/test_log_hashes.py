@@ -12,7 +12,7 @@ import pytest
 
 from vplog.batch import log_hashes
 from vplog.batch.log_hashes import known_hashes
-from vplog.batch.plan import GivenLog
+from vplog.batch.plan import DriveInput
 from vplog.execution.execution import Execution
 from vplog.logs import TopicChoice
 from vplog.logs.formats.mcap_file import MAGIC
@@ -46,11 +46,13 @@ def logs(tmp_path: Path) -> dict[str, Path]:
 
 
 def asked(logs: dict[str, Path], record: Path, **beside: Path) -> tuple[list[dict[str, str]], dict[str, str]]:
-    return known_hashes(given(logs, TopicChoice.model_validate(beside)), record, Execution(2))
+    answers = known_hashes(given(logs, TopicChoice.model_validate(beside)), record, Execution(2))
+    errors = {name: answer for name, answer in zip(logs, answers, strict=True) if isinstance(answer, str)}
+    return [{} if isinstance(answer, str) else answer for answer in answers], errors
 
 
-def given(logs: dict[str, Path], topics: TopicChoice) -> list[GivenLog]:
-    return [GivenLog(path, name, name, topics, {}) for name, path in logs.items()]
+def given(logs: dict[str, Path], topics: TopicChoice) -> list[DriveInput]:
+    return [DriveInput(path, topics=topics) for path in logs.values()]
 
 
 def log(text: str) -> bytes:
@@ -205,8 +207,8 @@ def test_masks_of_one_name_are_told_apart(tmp_path: Path, logs: dict[str, Path])
         masks[topic] = tmp_path / topic.strip("/") / "mask.png"
         masks[topic].parent.mkdir()
         masks[topic].write_bytes(text)
-    (found, *_), errors = known_hashes(given(logs, TopicChoice(masks=masks)), tmp_path / "record", Execution(1))
-    assert not errors
+    found, *_ = known_hashes(given(logs, TopicChoice(masks=masks)), tmp_path / "record", Execution(1))
+    assert isinstance(found, dict)
     beside = {name: text for name, text in found.items() if name.startswith("beside")}
     assert {name: hashlib.sha256(masks[name.split()[2]].read_bytes()).hexdigest() for name in beside} == beside
     assert len(beside) == 2

@@ -86,7 +86,7 @@ def test_drives_keep_their_topics_and_names(finished: Path, tmp_path: Path, monk
     asked: list[tuple[str, str, str | None]] = []
 
     def run_batch(inputs: list[DriveInput], *_: Any) -> dict[str, Any]:
-        asked.extend((one.name, one.log.parent.name, one.topics["image"]) for one in inputs)
+        asked.extend((one.name, one.log.parent.name, one.topics.image) for one in inputs)
         fate = [{"drive": one.name, "state": "computed", "error": ""} for one in inputs]
         return {"drives": fate, "joined": None, "join_error": ""}
 

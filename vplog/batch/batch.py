@@ -16,7 +16,7 @@ from vplog.batch.drive_inputs import drive_inputs
 from vplog.batch.engine import BatchOptions, LocalEngine, as_completed, open_engine
 from vplog.batch.log_hashes import NAME, known_hashes
 from vplog.batch.map_library import map_library
-from vplog.batch.plan import DriveInput, PlannedDrive, common_record, given_logs, plan_drives
+from vplog.batch.plan import DriveInput, PlannedDrive, common_record, plan_drives, with_topics
 from vplog.batch.worker import Drive, Outcome, Task, made_by
 from vplog.cache.input_hashes import bytes_of
 from vplog.errors import ResultError, SettingsError, VplogError
@@ -70,7 +70,7 @@ def run_batch(
     fit the library or the settings.
     """
     began, options = time.perf_counter(), options or BatchOptions()
-    given = given_logs(drive_inputs(logs), topics)
+    given = with_topics(drive_inputs(logs), topics)
     with (
         map_store.writing(root) as store,
         ThreadPoolExecutor(1) as background,
@@ -80,9 +80,9 @@ def run_batch(
         digest = map_library(store, given, library, pipeline, execution)
         store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
         known = store.drives()
-        inputs, errors = known_hashes(given, store.root / NAME, execution)
+        hashes = known_hashes(given, store.root / NAME, execution)
         common = common_record(pipeline, digest) | versions.result()
-        plan = plan_drives(store, given, common, inputs, errors)
+        plan = plan_drives(store, given, common, hashes)
         done = dict[str, Drive]()
         for one in plan:
             if one.state != "compute":
@@ -92,7 +92,7 @@ def run_batch(
             if one.state == "failed":
                 options.on_drive(done[one.drive])
             elif one.state == "unchanged":
-                map_store.annotate(store, one.drive, {"log": one.record["log"], **one.log.about})
+                map_store.annotate(store, one.drive, {"log": one.record["log"], **one.given.about})
         wanted = [one for one in plan if one.state == "compute"]
         each, concurrency = _divide_cores(workers, options.jobs, len(wanted))
         execution.progress("drives", len(done), len(plan))
@@ -117,7 +117,7 @@ def run_batch(
         joined, join_error = None, ""
         if options.join:
             executor_for = workers.executor_for(execution.threads)
-            urls = {one.drive: one.log.url for one in plan}
+            urls = {one.drive: one.given.url for one in plan}
             joined, join_error = _join(store, pipeline, execution, executor_for, places and places.result, urls)
         if not options.keep_cache and not join_error:  # another join would need it
             _clear_caches(store)
@@ -136,7 +136,7 @@ def run_batch(
         "warnings": [
             *failures_warning,
             *([] if joined else damage_warnings(store)),
-            *_duplicate_recordings(outcomes, inputs),
+            *_duplicate_recordings(outcomes, [one.record["inputs"] for one in plan]),
             *_other_versions([record for drive, record in known.items() if drive not in done], common),
         ],
     }
@@ -212,11 +212,11 @@ def _tasks(store: Store, wanted: Sequence[PlannedDrive], like: Task, longest_fir
 
     With `longest_first` none of the long drives is begun when all others are done.
     """
-    sizes = {one.drive: _log_bytes(one.log.url) for one in wanted}
+    sizes = {one.drive: _log_bytes(one.given.url) for one in wanted}
     order = sorted(wanted, key=lambda one: -sizes[one.drive]) if longest_first else wanted
     return [
         replace(
-            like, drive=one.drive, log=one.log.url, topics=one.log.topics, record=one.record,
+            like, drive=one.drive, log=one.given.url, topics=one.given.topics, record=one.record,
             cache=_cache(store, one.drive), folder=like.folder / f"{os.getpid()}-{number}",
             in_parts=len(wanted) == 1 or 2 * sizes[one.drive] > sum(sizes.values()),
         )

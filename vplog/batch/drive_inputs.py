@@ -68,7 +68,7 @@ def manifest(path: Path) -> list[DriveInput]:
             about["tags"] = {one: row[one] for one in sorted(tags) if row[one]}
         if truth := row.get("truth"):
             about["truth"] = truth if truth in ("gps", "auto") else absolute_log(_beside(path, truth))
-        found.append(DriveInput(_beside(path, row["log"]), name, topics, about))
+        found.append(DriveInput(_beside(path, row["log"]), name, TopicChoice(**topics), about))
     return found
 
 

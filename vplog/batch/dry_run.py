@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog import logs
-from vplog.batch.plan import common_record, given_logs, plan_drives
+from vplog.batch.plan import common_record, plan_drives, with_topics
 from vplog.batch.worker import made_by
 from vplog.cache.input_hashes import files_of
 from vplog.errors import ResultError, VplogError
@@ -22,13 +22,13 @@ from vplog.storage.remote_path import RemotePath
 from vplog.storage.urls import shown
 
 if TYPE_CHECKING:
-    from vplog.batch.plan import DriveInput, GivenLog, PlannedDrive
+    from vplog.batch.plan import DriveInput, PlannedDrive
     from vplog.execution.execution import Execution
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
 
-_CPU_S_PER_IMAGE = 0.5
-"""s of a core for each image where the map has no drive that says it: KITTI 00 at 5 Hz takes that."""
+_CPU_S_PER_IMAGE = 0.35
+"""s of a core for each image where the map has no drive that says it: KITTI 00 at 5 Hz takes 0.33 (850 images)."""
 
 
 def dry_run(
@@ -40,15 +40,13 @@ def dry_run(
     A log whose place, length and times are those of a drive of the map counts as read. CPU hours are those of the map's
     drives for as many images; `cpu_seconds_from` is how many drives say so. Raises VplogError.
     """
-    given = given_logs(inputs, topics)
+    given = with_topics(inputs, topics)
     with map_store.reading(root) as store, ThreadPoolExecutor(execution.threads) as pool:
         digest = store.recovered_head().library if store.exists else None
         digest = digest or (None if library is None else read_library_record(library)["hash"])
         known = {one["log"]: drive for drive, one in store.drives().items()}
-        looked = list(pool.map(partial(_inputs, store, known), given))
-        errors = {log.url: one for log, one in zip(given, looked, strict=True) if isinstance(one, str)}
-        hashes = [{} if isinstance(one, str) else one for one in looked]
-        plan = plan_drives(store, given, common_record(pipeline, digest) | made_by(), hashes, errors)
+        hashes = list(pool.map(partial(_hashes, store, known), given))
+        plan = plan_drives(store, given, common_record(pipeline, digest) | made_by(), hashes)
         each, measured = _cpu_s_per_image(store)
         drives = []
         for one in pool.map(_sizes, plan):
@@ -71,20 +69,20 @@ def dry_run(
     }
 
 
-def _inputs(store: Store, drives: dict[str, str], log: GivenLog) -> dict[str, str] | str:
+def _hashes(store: Store, drives: dict[str, str], given: DriveInput) -> dict[str, str] | str:
     """Hashes of the files of a log, where it is as it was when its drive was computed; why it is no log."""
     try:
-        logs.check(log.path)
-        if drive := drives.get(shown(log.url)):
+        logs.check(given.log)
+        if drive := drives.get(shown(given.url)):
             known = run_record.read_run_json(store.file(drive, "run.json")).get("log_stat")
-            if known is None or known == stat_of(files_of(log.path)):
+            if known is None or known == stat_of(files_of(given.log)):
                 return store.record(drive)["inputs"]
     except ResultError:  # it is damaged, and computed again
         pass
     except VplogError as error:
         return str(error)
     except OSError as error:
-        return f"Cannot read {log.path}: {error.strerror or error}."
+        return f"Cannot read {given.log}: {error.strerror or error}."
     return {}
 
 
@@ -92,8 +90,8 @@ def _sizes(one: PlannedDrive) -> dict[str, Any]:
     images, seconds, error, size = 0, 0.0, one.error, 0
     if one.state == "compute":
         try:
-            images, seconds = logs.summary(one.log.path, one.log.topics)
-            size = _bytes(one.log.path)
+            images, seconds = logs.summary(one.given.log, one.given.topics)
+            size = _bytes(one.given.log)
         except (VplogError, OSError) as problem:
             error = str(problem)
     about = {"bytes": size, "images": images, "seconds": round(seconds, 1), "error": error}

@@ -18,7 +18,7 @@ from vplog.results.run_record import read_run_json, write_run_json
 from vplog.storage.remote_path import RemotePath
 
 if TYPE_CHECKING:
-    from vplog.batch.plan import GivenLog
+    from vplog.batch.plan import DriveInput
     from vplog.execution.execution import Execution
 
 NAME = ".inputs.json"
@@ -35,9 +35,9 @@ _PROGRESS_EVERY_S = 0.2
 Hashes = dict[str, str]
 
 
-def known_hashes(logs: Sequence[GivenLog], record: Path, execution: Execution) -> tuple[list[Hashes], dict[str, str]]:
-    """sha256 of the files of each log and of those that its topics name beside it, by name, in order; by URL one line
-    where they cannot be read, or are no log.
+def known_hashes(logs: Sequence[DriveInput], record: Path, execution: Execution) -> list[Hashes | str]:
+    """sha256 of the files of each log and of those that its topics name beside it, by name, in order; one line where
+    they cannot be read, or are no log.
 
     A file whose length and times are those of the record, a file that is made and updated here, is not read. A record
     that cannot be read is made again, one that cannot be written is done without. Ctrl-C ends it within a block;
@@ -68,8 +68,8 @@ def known_hashes(logs: Sequence[GivenLog], record: Path, execution: Execution) -
             current[name] = {"look": stat, "hashes": hashes}
         return hashes
 
-    def of_log(log: GivenLog, number: int) -> Hashes | str:
-        path, beside = log.path, log.topics.files
+    def of_log(given: DriveInput, number: int) -> Hashes | str:
+        path, beside = given.log, given.topics.files
         try:
             found = [one(path, number, True), *(one(file, number, False) for file in beside.values())]
         except LogError as error:
@@ -99,8 +99,7 @@ def known_hashes(logs: Sequence[GivenLog], record: Path, execution: Execution) -
         every = {name: about for name, about in sorted({**known, **current}.items()) if os.path.exists(name)}  # noqa: PTH110 (never raises)
         with suppress(ResultError):
             write_run_json(record, every)
-    errors = {log.url: answer for log, answer in zip(logs, answers, strict=True) if isinstance(answer, str)}
-    return [{} if isinstance(answer, str) else answer for answer in answers], errors
+    return answers
 
 
 def _read(record: Path) -> dict[str, dict[str, Any]]:

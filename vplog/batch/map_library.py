@@ -16,7 +16,7 @@ from vplog.run.reference_library import check_library, library_of_logs
 from vplog.storage.scratch import copy_folder
 
 if TYPE_CHECKING:
-    from vplog.batch.plan import GivenLog
+    from vplog.batch.plan import DriveInput
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
     from vplog.stages import Log
@@ -26,7 +26,7 @@ _TRIED = 8
 
 
 def map_library(
-    store: Store, drives: Sequence[GivenLog], given: Path | None, pipeline: Pipeline, execution: Execution
+    store: Store, drives: Sequence[DriveInput], given: Path | None, pipeline: Pipeline, execution: Execution
 ) -> str:
     """The hash of the map's library, which is put into the map where it has none yet. Where none of the logs can be
     read, nothing is made.
@@ -66,13 +66,13 @@ def map_library(
     return digest
 
 
-def _decodable(drives: Sequence[GivenLog], most: int) -> list[Log]:
+def _decodable(drives: Sequence[DriveInput], most: int) -> list[Log]:
     """The first logs that have a frame that decodes, `most` of them. Errors of the others are raised by their own runs.
     Raises the error of the first where there is none."""
     sound, first = [], None
     for drive in drives:
         try:
-            log = logs.open(drive.path, drive.topics)
+            log = logs.open(drive.log, drive.topics)
             stamps = log.stamps()
             for encoded in log.frames(stamps[evenly(len(stamps), _TRIED)]) if len(stamps) else ():
                 try:
@@ -85,7 +85,7 @@ def _decodable(drives: Sequence[GivenLog], most: int) -> list[Log]:
         except VplogError as error:
             first = first or error
         except OSError as error:
-            first = first or LogError(f"Cannot read {drive.path}: {error.strerror or error}.")
+            first = first or LogError(f"Cannot read {drive.log}: {error.strerror or error}.")
         if len(sound) == most:
             break
     if not sound:

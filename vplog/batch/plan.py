@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,30 +28,22 @@ class DriveInput:
     log: Path
     name: str = ""
     """ID in the map; empty takes the name of the file or folder."""
-    topics: Mapping[str, Any] = field(default_factory=dict)
-    """Fields of TopicChoice that are its own."""
+    topics: TopicChoice = field(default_factory=TopicChoice)
+    """Those that are set count in place of those of the batch."""
     about: Mapping[str, Any] = field(default_factory=dict)
     """Fields of drive.json that results do not depend on: `tags`, texts by name, and `truth`, a file or a kind."""
 
-
-@dataclass(frozen=True)
-class GivenLog:
-    """A log of a batch, and its topics."""
-
-    path: Path
-    url: str
-    """Absolute path, links not resolved, or the URL with its query."""
-    name: str
-    topics: TopicChoice
-    about: Mapping[str, Any]
-    """As of DriveInput."""
+    @property
+    def url(self) -> str:
+        """Absolute path of the log, links not resolved, or its URL with the query."""
+        return absolute_log(self.log)
 
 
 @dataclass(frozen=True)
 class PlannedDrive:
     """A drive of a batch."""
 
-    log: GivenLog
+    given: DriveInput
     record: dict[str, Any]
     """drive.json: what it is made from."""
     state: str
@@ -64,16 +56,13 @@ class PlannedDrive:
         return self.record["drive"]
 
 
-def given_logs(inputs: Sequence[DriveInput], topics: TopicChoice | None) -> list[GivenLog]:
-    """The logs of these drives, each with its own topics in place of those of all. Raises SettingsError where one is
+def with_topics(inputs: Sequence[DriveInput], topics: TopicChoice | None) -> list[DriveInput]:
+    """These drives with the topics that are theirs or else those of the batch. Raises SettingsError where a log is
     given twice."""
-    found = [
-        GivenLog(
-            one.log, absolute_log(one.log), one.name or name_of(one.log),
-            (topics or TopicChoice()).model_copy(update=dict(one.topics)), one.about,
-        )
-        for one in inputs
-    ]  # fmt: skip
+    common, found = topics or TopicChoice(), list[DriveInput]()
+    for one in inputs:
+        own = {name: getattr(one.topics, name) for name in one.topics.model_fields_set}
+        found.append(replace(one, topics=common.model_copy(update=own)))
     if twice := [url for url, count in Counter(one.url for one in found).items() if count > 1]:
         raise SettingsError(f"{shown(twice[0])} is given twice. Give each log once.")
     return found
@@ -86,26 +75,26 @@ def common_record(pipeline: Pipeline, library: str | None) -> dict[str, Any]:
 
 
 def plan_drives(
-    store: Store, given: Sequence[GivenLog], common: Mapping[str, Any], inputs: Sequence[dict[str, str]],
-    errors: Mapping[str, str],
-) -> list[PlannedDrive]:  # fmt: skip
-    """The drives of these logs, in order. `inputs` are the hashes of their files, `errors` say by URL why there are
-    none."""
+    store: Store, inputs: Sequence[DriveInput], common: Mapping[str, Any], hashes: Sequence[dict[str, str] | str]
+) -> list[PlannedDrive]:
+    """The drives of these inputs, in order. `hashes` are those of their files, or why there are none."""
     known, plan = store.drives(), list[PlannedDrive]()
-    reserved = {**_failed(store), **known}
-    names = layout.drive_names([one.name for one in given], [shown(one.url) for one in given], reserved, list(inputs))
-    for drive, log, content in zip(names, given, inputs, strict=True):
-        topics = log.topics.model_dump(mode="json", exclude={"odometry_file", "calibration_file", "masks"})
+    contents, urls = [{} if isinstance(one, str) else one for one in hashes], [shown(one.url) for one in inputs]
+    given_names = [one.name or name_of(one.log) for one in inputs]
+    names = layout.drive_names(given_names, urls, {**_failed(store), **known}, contents)
+    for given, drive, url, content, found in zip(inputs, names, urls, contents, hashes, strict=True):
+        topics = given.topics.model_dump(mode="json", exclude={"odometry_file", "calibration_file", "masks"})
         record = {"drive": drive, "inputs": content, "topics": topics, **common}
         about = {name: value for name, value in known.get(drive, {}).items() if name in layout.ABOUT}
-        record |= {**about, "key": key_of(record), "log": shown(log.url), **log.about}
-        if error := errors.get(log.url, ""):
+        record |= {**about, "key": key_of(record), "log": url, **given.about}
+        error = found if isinstance(found, str) else ""
+        if error:
             state = "failed"
         elif drive in known and layout.made_alike(known[drive], record) and not _is_damaged(store, drive):
             state = "unchanged"
         else:
             state = "compute"
-        plan.append(PlannedDrive(log, record, state, error))
+        plan.append(PlannedDrive(given, record, state, error))
     return plan
 
 

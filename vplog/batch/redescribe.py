@@ -68,7 +68,7 @@ def redescribe_map(
         else:
             choice = logs.TopicChoice.read(topics[drive] or {}, f"{root}: {drive}/run.json")
             about = {name: drives[drive][name] for name in ABOUT[1:] if name in drives[drive]}
-            inputs[drive] = DriveInput(path, drive, dict(choice), about)
+            inputs[drive] = DriveInput(path, drive, choice, about)
     with _made(library, Pipeline.read(head.settings, f"{root}/map.json"), execution) as (folder, pipeline):
         if read_library_record(folder)["hash"] == head.library:
             raise SettingsError(f"{root} is described with {library} already. Give another library.")
