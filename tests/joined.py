@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 
     from vplog.demo.record import Drive
 
-QUICK = ("features.max_features=600", "library.size=12", "pictures.closures=0", "pictures.megapixels=0")
+QUICK = (
+    "features.max_features=400", "features.max_megapixels=0.05", "library.size=12", "places.neighbours=8",
+    "verify.calibration.pairs=0", "pictures.closures=0", "pictures.megapixels=0",
+)  # fmt: skip
 LOGS = {"before": "before.mcap", "after": "after.mcap", "drive": "elsewhere/drive.mcap"}
 """File of each drive, beside the folder of the joint run."""
 

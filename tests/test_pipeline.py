@@ -40,7 +40,10 @@ if TYPE_CHECKING:
 TABLES = ("keyframes", "descriptors", "closures", "edges", "trajectory")
 FILES = (*(f"{name}.parquet" for name in TABLES), "trajectory.tum", "graph.g2o", "result.mcap")
 LIBRARY = ("library/library.json", "library/references.parquet", "library/features.parquet")
-QUICK = ("features.max_features=400", "propose.per_query=2", "library.size=5")
+QUICK = (
+    "features.max_features=250", "features.max_megapixels=0.04", "features.min_features=0", "propose.per_query=2",
+    "library.size=5", "places.neighbours=8", "verify.calibration.pairs=0",
+)  # fmt: skip
 """Settings for runs of which only the course matters."""
 CLOSE = (*QUICK, "propose.gap_keyframes=15", "propose.gap_steps=15")
 """With closures on the tiny drive too."""

@@ -32,11 +32,20 @@ _A_FILE = "`vplog config` prints a pipeline file."
 def _describe(schema: dict[str, Any], settings: type[BaseModel]) -> None:
     """Adds the sentences below the fields to their JSON schema; pydantic would read every source at each start."""
     for one in settings.__mro__[-3::-1]:  # from Settings on
-        with suppress(OSError):  # without a source, as in a shell, there are none
-            for field, below in pairwise(ast.walk(ast.parse(dedent(getsource(one))))):
-                match field, below:
-                    case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(sentence))):
-                        schema["properties"].get(name, {})["description"] = cleandoc(sentence)
+        for name, sentence in _sentences(one).items():
+            schema["properties"].get(name, {})["description"] = sentence
+
+
+@cache
+def _sentences(settings: type[BaseModel]) -> dict[str, str]:
+    """What stands below each field in the source, as cleaned text; without a source, as in a shell, nothing."""
+    found = {}
+    with suppress(OSError):
+        for field, below in pairwise(ast.walk(ast.parse(dedent(getsource(settings))))):
+            match field, below:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(sentence))):
+                    found[name] = cleandoc(sentence)
+    return found
 
 
 class Settings(BaseModel):

@@ -35,8 +35,9 @@ if TYPE_CHECKING:
     Change = Callable[[str, int, bytes], bytes | None]
 
 QUICK = (
-    "--set", "features.max_features=300", "--set", "propose.per_query=2", "--set", "library.size=4",
-    "--set", "propose.gap_keyframes=15", "--set", "propose.gap_steps=15",
+    "--set", "features.max_features=250", "--set", "features.max_megapixels=0.04", "--set", "features.min_features=0",
+    "--set", "propose.per_query=2", "--set", "library.size=4", "--set", "places.neighbours=8",
+    "--set", "propose.gap_keyframes=15", "--set", "propose.gap_steps=15", "--set", "verify.calibration.pairs=0",
 )  # fmt: skip
 """For runs of which only the course matters, with closures on the tiny drive."""
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -108,7 +109,7 @@ def test_version(verb: Verb) -> None:
         ("run", "a.mcap", "-o", "out", "--fast"),
         ("run", "a.mcap", "-o", "out", "--threads", "0"),
         ("run", "a.mcap", "-o", "out", "--threads", "many"),
-        ("evaluate", "out"),
+        ("evaluate",),
         ("info", "a.mcap", "b.mcap"),
         ("map",),
         ("explain", "out", "--closure", "K"),

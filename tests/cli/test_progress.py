@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     Verb = Callable[..., Said]
 
-QUICK = ("features.max_features=400", "propose.per_query=2", "library.size=5")
+QUICK = ("features.max_features=200", "features.max_megapixels=0.03", "library.size=5", "places.neighbours=8")
 
 
 def told(path: Path) -> list[dict[str, Any]]:

@@ -64,17 +64,18 @@ def test_true_closures_of_heavy_tails_are_kept_and_false_ones_left_out() -> None
     assert not (solution.weight[drive.false] > 0.5).any()
 
 
-@pytest.mark.parametrize("heavy", [True, False])
-def test_closures_within_what_is_claimed_come_back_where_noise_has_heavy_tails(heavy: bool) -> None:
-    """Cauchy's, as that of a lidar's scan matching; not those off by eight times what is claimed."""
+@pytest.mark.parametrize(("errs", "returned"), [("cauchy", True), ("few as claimed", True), ("beyond", False)])
+def test_closures_within_what_is_claimed_come_back_where_it_is_likelier(errs: str, returned: bool) -> None:
+    """Noise of a tenth of the claim but for some: Cauchy's, as a lidar's scan matching has; a few as large as claimed;
+    not those off by eight times what is claimed."""
     drive = ring(160, loops=150, noise=0.1)
     loops, random = np.flatnonzero(is_loop(drive.graph)), np.random.default_rng(0)
     residual = 0.1 * CLOSURE_SIGMA * random.normal(size=(150, 6))
     large = np.full(150, 1.0)
-    if heavy:
+    if errs == "cauchy":
         large = 1.0 / np.abs(random.normal(size=150)).clip(0.07)
     else:
-        large[::15] = 80.0
+        large[:: 50 if errs == "few as claimed" else 15] = 10.0 if errs == "few as claimed" else 80.0
     measured = drive.graph.a_from_b.copy()
     measured[loops] = se3.between(drive.true[drive.graph.a[loops]], drive.true[drive.graph.b[loops]])
     measured[loops] @= se3.exp(residual * large[:, None])
@@ -83,8 +84,8 @@ def test_closures_within_what_is_claimed_come_back_where_noise_has_heavy_tails(h
     weight[loops] = large < 4.0
     best = hypotheses._refit(factors, weight, drive.true, Sigmas(0.1, 0.1, 0.1, 0.1))
     found = hypotheses._readmitted(factors, best, GncSettings(), None)
-    assert [one.weight[loops].sum() for one in found] == ([150] if heavy else [])
-    assert best.weight[loops].sum() < 141
+    assert [one.weight[loops].sum() for one in found] == ([150] if returned else [])
+    assert best.weight[loops].sum() < 150
 
 
 def test_tails_are_told_from_noise_and_from_residuals_below_it() -> None:

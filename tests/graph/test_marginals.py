@@ -7,7 +7,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from scipy import stats
+from scipy.special import chdtri
 
 from tests.graph.drive import ring
 from tests.graph.gtsam_graph import as_values, weighted
@@ -39,7 +39,7 @@ def test_mean_nees_over_many_worlds_is_within_its_interval(shared: tuple[float, 
         first_from = [se3.between(one[:1], one[row : row + 1]) for one in (poses, drive.true)]
         covariance = pose_covariances(objective, poses, scales)[row : row + 1]
         total += float(se3.mahalanobis2(se3.log(se3.between(*first_from)), covariance)[0])
-    low, high = stats.chi2.interval(0.99, 6 * WORLDS) / np.array(6 * WORLDS)
+    low, high = chdtri(6 * WORLDS, [0.995, 0.005]) / (6 * WORLDS)
     assert low < total / (6 * WORLDS) < high
 
 

@@ -31,15 +31,9 @@ RIG = SMALL.model_copy(
     update={"laps": 1.05, "frame_rate_hz": 2.0, "width": 320, "height": 180, "rear_camera": True, "turn_back_m": 34.0}
 )
 QUICK = (
-    "--set",
-    "propose.per_query=2",
-    "--set",
-    "features.max_features=700",
-    "--set",
-    "pictures.closures=2",
-    "--set",
-    "propose.gap_steps=8",
-)
+    "--set", "propose.per_query=2", "--set", "features.max_features=500", "--set", "pictures.closures=2",
+    "--set", "propose.gap_steps=8", "--set", "places.neighbours=8", "--set", "verify.calibration.pairs=0",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 QUICK = (
     "--set", "pictures.closures=0", "--set", "pictures.megapixels=0", "--set", "features.max_features=600",
+    "--set", "features.max_megapixels=0.06", "--set", "places.neighbours=8", "--set", "verify.calibration.pairs=0",
     "--set", "propose.per_query=3", "--threads", "2",
 )  # fmt: skip
 HORIZON = 0.6

@@ -27,12 +27,10 @@ if TYPE_CHECKING:
     from vplog.demo.record import Drive
 
 QUICK = (
-    "features.max_features=500",
-    "library.size=8",
-    "propose.per_query=1",
-    "pictures.closures=0",
+    "features.max_features=200", "features.max_megapixels=0.03", "features.min_features=0", "library.size=6",
+    "places.kind=thumbnail", "propose.per_query=1", "verify.calibration.pairs=0", "pictures.closures=0",
     "pictures.megapixels=0",
-)
+)  # fmt: skip
 VISUAL = logs.TopicChoice(odometry="visual")
 
 

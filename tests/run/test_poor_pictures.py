@@ -14,7 +14,10 @@ from vplog.verbs.evaluate_run import evaluate
 if TYPE_CHECKING:
     from pathlib import Path
 
-QUICK = ("propose.per_query=2", "pictures.closures=0", "pictures.megapixels=0")
+QUICK = (
+    "features.max_features=600", "places.neighbours=8", "propose.per_query=2", "verify.calibration.pairs=0",
+    "pictures.closures=0", "pictures.megapixels=0",
+)  # fmt: skip
 
 
 def test_a_small_camera_recognises_its_revisits(tmp_path: Path) -> None:

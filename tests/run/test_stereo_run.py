@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 BASELINE_M = 0.3
-QUICK = ("features.max_features=800", "propose.per_query=2", "pictures.closures=0", "pictures.megapixels=0")
+QUICK = (
+    "features.max_features=300", "features.max_megapixels=0.05", "places.neighbours=8", "propose.per_query=2",
+    "verify.calibration.pairs=0", "pictures.closures=0", "pictures.megapixels=0",
+)  # fmt: skip
 
 
 def test_metres_come_from_the_pair(tmp_path: Path) -> None:

@@ -29,8 +29,9 @@ if TYPE_CHECKING:
 QUICK = [
     f"--set={one}"
     for one in (
-        "features.max_features=300", "library.size=5", "propose.per_query=2", "propose.gap_keyframes=15",
-        "propose.gap_steps=15",
+        "features.max_features=250", "features.max_megapixels=0.04", "features.min_features=0", "library.size=5",
+        "places.neighbours=8", "propose.per_query=2", "propose.gap_keyframes=15", "propose.gap_steps=15",
+        "verify.calibration.pairs=0",
     )
 ]  # fmt: skip
 """With closures on the tiny drive."""

@@ -33,8 +33,9 @@ if TYPE_CHECKING:
     Verb = Callable[..., Said]
 
 QUICK = (
-    "features.max_features=400", "propose.per_query=2", "library.size=5", "propose.gap_keyframes=15",
-    "propose.gap_steps=15",
+    "features.max_features=250", "features.max_megapixels=0.04", "features.min_features=0", "propose.per_query=2",
+    "library.size=5", "propose.gap_keyframes=15", "propose.gap_steps=15",
+    "verify.calibration.pairs=0",
 )  # fmt: skip
 
 

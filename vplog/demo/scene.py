@@ -79,7 +79,7 @@ def make_scene(settings: DemoSettings) -> Scene:
     mount = pose(so3_exp(np.array([0, _MOUNT_PITCH_RAD, 0])) @ level, np.array(_MOUNT_M))
     camera = Camera("camera", matrix, "plumb_bob", np.zeros(5), settings.width, settings.height, mount)
     stamp_ns = route.frame_stamps(settings)
-    return Scene(settings, build_world(settings), camera, stamp_ns, route.world_from_body(settings, stamp_ns))
+    return Scene(settings, build_world(settings.street()), camera, stamp_ns, route.world_from_body(settings, stamp_ns))
 
 
 def rear_mount(camera: Camera) -> Floats:

@@ -59,6 +59,11 @@ class DemoSettings(Settings):
             raise ValueError("corner_radius_m must be less than half of block_length_m and block_width_m")
         return self
 
+    def street(self) -> Self:
+        """Without what the street does not depend on."""
+        own = {"seed", "block_length_m", "block_width_m", "corner_radius_m"}
+        return type(self)(**self.model_dump(include=own))
+
 
 SMALL = DemoSettings(
     laps=1.4,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import string
 from collections.abc import Iterator
+from functools import lru_cache
 from itertools import pairwise, product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -189,6 +190,7 @@ def _boxes(foot: Floats, heading: Floats, size: Floats, side: Ints, end: Ints) -
     return Quads(corner, right, down, np.stack([side, end, side, end, end], axis=1).ravel())
 
 
+@lru_cache(2)  # a second
 def build_world(settings: DemoSettings) -> World:
     """Houses along both sides of the street around the block, and the ground. Everything follows from the seed."""
     rng = np.random.default_rng([settings.seed, 1])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.stats import rankdata
 
 from vplog.data import Bools, Floats
 from vplog.evaluate.retrieval import Ranks, Reliability, reliability
@@ -49,7 +48,9 @@ def auroc(scores: Floats, positive: Bools) -> float | None:
     count, others = int(positive.sum()), int((~positive).sum())
     if not count or not others:
         return None
-    above = rankdata(scores)[positive].sum() - count * (count + 1) / 2
+    _, group, size = np.unique(scores, return_inverse=True, return_counts=True)
+    mean_rank = np.cumsum(size) - (size - 1) / 2  # of equals; scipy.stats takes a second to load
+    above = mean_rank[group][positive].sum() - count * (count + 1) / 2
     return float(above / (count * others))
 
 

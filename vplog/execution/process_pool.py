@@ -85,7 +85,7 @@ class OwnProcesses:
         resource_tracker.ensure_running()
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            self._pool = ProcessPool(self._count, 1, _load, context=_Spawn())
+            self._pool = ProcessPool(self._count, 1, _load, [_WORK], _Spawn())
             self._pool.active  # noqa: B018 (starts it)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)  # where a Ctrl-C that waited is raised
@@ -108,7 +108,7 @@ class OwnProcesses:
             self._pool = None
 
 
-def _load() -> None:
+def _load(module: str) -> None:
     """Import the code of a drive, and watch for the end of the batch: a worker must not go on beside the next one."""
     parent = multiprocessing.parent_process()
 
@@ -118,4 +118,4 @@ def _load() -> None:
             os.kill(os.getpid(), signal.SIGKILL)
 
     threading.Thread(target=watch, daemon=True).start()
-    importlib.import_module(_WORK)
+    importlib.import_module(module)

@@ -163,9 +163,11 @@ def log_tails(chi2: Floats, d: int) -> float:
     return float(np.logaddexp.reduce(gain)) - math.log(len(gain))
 
 
-def log_student(factors: Factors, weight: Floats, poses: Floats) -> float:
+def log_student(factors: Factors, weight: Floats, poses: Floats, multiple: Floats) -> float:
     """Log of how much likelier the residuals of the closures of positive weight are where their noise is Student's t in
     place of normal.
+
+    `multiple` (E,) is by what the factors have the sigma of single closures multiplied already; NaN where that is open.
 
     Each is compared with the prediction of all others, so those of closures that nothing checks tell nothing. t is a
     normal distribution whose variance is drawn for each closure (Lange, Little and Taylor, Robust statistical modeling
@@ -174,13 +176,20 @@ def log_student(factors: Factors, weight: Floats, poses: Floats) -> float:
     loops = np.flatnonzero(~factors.graph.odometry & (weight > 0))
     closures = tension(factors, weight, poses, loops)
     gain = np.empty((len(loops), len(_MULTIPLES)))
-    for column, multiple in enumerate(_MULTIPLES.tolist()):
-        less = 1.0 - multiple**2
+    for column, times in enumerate(_MULTIPLES.tolist()):
+        less = 1.0 - times**2
         ratio = 1.0 - closures.redundancy * less  # of the variances of a residual's prediction error
         gain[:, column] = -0.5 * (np.log(ratio) + closures.whitened**2 * less / ratio).sum(1)
+    known = np.isfinite(multiple[loops])
+    gain[known] = np.where(_nearest_multiple(multiple[loops[known]])[:, None] == _MULTIPLES, 0.0, -np.inf)
     most = gain.max(1, keepdims=True)
     density = np.log(np.maximum(np.exp(gain - most) @ _STUDENT.T, 1e-300)).sum(0) + most.sum()
     return float(np.logaddexp.reduce(density)) - math.log(len(density))
+
+
+def _nearest_multiple(multiple: Floats) -> Floats:
+    """(K,) the nearest of `_MULTIPLES` to each."""
+    return _MULTIPLES[np.abs(np.log(multiple)[:, None] - np.log(_MULTIPLES)).argmin(1)]
 
 
 def log_room(graph: PoseGraph, places: Floats) -> float:

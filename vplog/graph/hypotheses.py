@@ -73,12 +73,11 @@ class Hypothesis:
     sigmas: Sigmas
     log_evidence: float
 
-    def by_heavy_tails(self, claimed: Factors) -> float:
-        """By how much the evidence grows where the noise of closures is Student's t."""
-        factors = _times(claimed, self.sigmas)
+    def by_heavy_tails(self, factors: Factors, multiple: Floats) -> float:
+        """By how much the evidence grows where the noise of closures is Student's t; see `log_student`."""
         of_loops = (residual_sigma(factors.graph, self.poses) ** 2)[~factors.graph.odometry & (self.weight > 0)]
         log_normal = log_tails(of_loops, degrees_of_freedom(factors.graph))
-        return log_student(factors, self.weight, self.poses) - log_normal
+        return log_student(factors, self.weight, self.poses, multiple) - log_normal
 
 
 def best_hypothesis(
@@ -119,23 +118,39 @@ def best_hypothesis(
 
 def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: Cost | None) -> list[Hypothesis]:
     """The hypothesis with the closures that it predicts within the noise that the log claims, where noise of heavy
-    tails makes that far likelier: estimated from those that fit best, noise is too small for the others."""
+    tails makes that likelier: estimated from those that fit best, noise is too small for the others. No margin is asked
+    for, since none of them pulls far.
 
-    def value(one: Hypothesis) -> float:
-        other = 0.0 if cost is None else cost(_times(claimed, one.sigmas), one.weight, one.poses)
-        return one.log_evidence + one.by_heavy_tails(claimed) - other
+    The poses of greatest density are near those where they err as the others do, or those where they err as claimed.
+    """
+
+    def value(one: Hypothesis, factors: Factors, multiple: Floats) -> float:
+        other = 0.0 if cost is None else cost(factors, one.weight, one.poses)
+        return one.log_evidence + one.by_heavy_tails(factors, multiple) - other
 
     rejected = np.flatnonzero(best.weight == 0)
     if not len(rejected) or not isinstance(optimiser, GncSettings):
         return []
     poses = descend(claimed, best.weight, best.poses, _STEPS, _TOLERANCE).world_from_body
     apart, _ = distance(claimed, best.weight, poses, rejected)
-    weight = np.array(best.weight)
-    weight[rejected[apart <= chi2_quantile(optimiser.inlier_probability, degrees_of_freedom(claimed.graph))]] = 1.0
-    if (weight == best.weight).all():
+    within = rejected[apart <= chi2_quantile(optimiser.inlier_probability, degrees_of_freedom(claimed.graph))]
+    if not len(within):
         return []
-    more = _refit(claimed, weight, best.poses, best.sigmas)
-    return [more] if value(more) > value(best) + _VERY_STRONG else []
+    weight = np.array(best.weight)
+    weight[within] = 1.0
+    more, at, unknown = (
+        _refit(claimed, weight, best.poses, best.sigmas),
+        AtSigmas.of(claimed, best.sigmas),
+        weight * np.nan,
+    )
+    information, multiple = at.factors.graph.information.copy(), unknown.copy()
+    information[within], multiple[within] = claimed.graph.information[within], 1.0 / best.sigmas.of_closures
+    wide = replace(at, factors=replace(at.factors, graph=replace(at.factors.graph, information=information)))
+    values = (
+        value(more, _times(claimed, more.sigmas), unknown),
+        value(wide.hypothesis(weight, best.poses), wide.factors, multiple),
+    )
+    return [more] if max(values) > value(best, at.factors, unknown) else []
 
 
 def _recognised(

@@ -47,8 +47,6 @@ class Tension:
     """(K, d) information times residual: how hard the closure pulls at b."""
     log_spread: Floats
     """(K,) half the log determinant of the covariance of the rest's prediction and the closure's noise together."""
-    freedom: Floats
-    """(K,) largest noise of the rest's prediction of the closure as a multiple of its own, in variance."""
 
 
 def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Tension:
@@ -73,7 +71,6 @@ def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Ten
         log_spread=-0.5 * (np.linalg.slogdet(information)[1] + np.log(rest).sum(1)),
         covariance=covariance,
         force=(information @ error[:, axes, None])[:, :, 0],
-        freedom=(1.0 / rest - 1.0).max(1),
     )
 
 

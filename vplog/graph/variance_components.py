@@ -53,6 +53,11 @@ class Sigmas(NamedTuple):
     closure_rotation: float = 1.0
     closure_translation: float = 1.0
 
+    @property
+    def of_closures(self) -> float:
+        """That of closures along a mean axis."""
+        return math.sqrt(self.closure_rotation * self.closure_translation)
+
     def log_prior(self) -> float:
         """Log of the prior density but for a constant: normal in the logarithm of each variance."""
         return -sum((2.0 * math.log(sigma) / _SPREAD) ** 2 for sigma in self) / 2.0

@@ -374,9 +374,11 @@ def test_a_store_that_decides_nothing_is_only_read(root: Any, monkeypatch: pytes
 
 WRITERS = """
 import json, os, signal, sys
+import pyarrow
 from tests.maps.runs import put
 from vplog.maps.storage import map_store, objects
 from vplog.storage.remote_path import located
+pyarrow.array([])  # loads pandas, which takes half a second in each fork otherwise
 root, plans = located(sys.argv[1]), json.loads(sys.argv[2])
 
 def write(number, dies_at):

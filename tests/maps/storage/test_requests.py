@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-DRIVES = (10, 300)
+DRIVES = (10, 100)
 
 
 @pytest.fixture(scope="module")
