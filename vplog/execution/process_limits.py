@@ -12,8 +12,8 @@ from vplog.execution.timing import peak_memory_mb
 
 OVER_TIME = -signal.SIGALRM
 """Exit status of a process that took longer: that of a timer of the system, which ends compiled code, too."""
-OVER_MEMORY = 76
-"""Exit status of a process that took more memory."""
+OVER_MEMORY = -signal.SIGUSR2
+"""Exit status of a process that took more memory: a signal that ends it and nobody else sends."""
 _CHECK_S = 0.25
 
 
@@ -26,7 +26,7 @@ def process_limits(time_s: float | None, memory_mb: float | None) -> Iterator[No
     def watch() -> None:
         while not ended.wait(_CHECK_S):
             if memory_mb is not None and peak_memory_mb() > memory_mb:
-                os._exit(OVER_MEMORY)
+                os.kill(os.getpid(), signal.SIGUSR2)
 
     if memory_mb is not None:
         threading.Thread(target=watch, daemon=True).start()
