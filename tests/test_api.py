@@ -12,7 +12,7 @@ import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -22,9 +22,13 @@ import vplog
 from tests.batch.test_batch import QUICK
 from tests.maps.bucket import serving
 from vplog import errors
+from vplog.batch.worker import Drive
 from vplog.execution.process_pool import OwnProcesses
 from vplog.results.run_record import read_run_json
 from vplog.storage.remote_path import local_output, located
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 TOP = Path(vplog.__file__).parents[1]
 EXAMPLES = TOP / "examples"
@@ -240,5 +244,74 @@ def test_examples(
     assert said in capsys.readouterr().out
 
 
+class Scheduler:
+    """Stands for Airflow and for Dagster: calls what is decorated, and keeps what it answers."""
+
+    def __init__(self) -> None:
+        self.answers: dict[str, Any] = {}
+        self.log = self
+
+    def __getattr__(self, name: str) -> Any:
+        """A class of Dagster: the values that it is made of."""
+        return lambda **values: values
+
+    def info(self, _: str) -> None: ...
+
+    def asset(self, function: Callable[..., Any]) -> None:
+        self.answers[function.__name__] = function(*[self] * len(inspect.signature(function).parameters))
+
+    def task(self, function: Any = None, **_: Any) -> Any:
+        if function is None:
+            return self.task
+        return lambda: self.answers.update({function.__name__: function()}) or self
+
+    def __rshift__(self, _: object) -> None: ...
+
+    def dag(self, **_: Any) -> Any:
+        return lambda function: function
+
+    def asset_check(self, **_: Any) -> Any:
+        return self.asset
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "answers"),
+    [
+        ("airflow_dag.py", "airflow.sdk", {"compute": 1, "check": 0.5}),
+        (
+            "dagster_assets.py",
+            "dagster",
+            {
+                "fleet_map": {"metadata": {"drives": 1, "failed": 0}},
+                "accuracy": {"passed": True, "metadata": {"ATE in m": "0.5"}},
+            },
+        ),
+    ],
+)
+def test_examples_for_schedulers(
+    name: str, module: str, answers: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the schedulers; what they call takes these arguments and answers so."""
+    batch, evaluate = inspect.signature(vplog.batch), inspect.signature(vplog.evaluate)
+
+    def computed(*arguments: Any, **more: Any) -> dict[str, Any]:
+        on_drive = batch.bind(*arguments, **more).arguments.get("on_drive", lambda _: None)
+        on_drive(Drive("a", "a.mcap", "computed"))
+        return {"drives": [{"drive": "a", "state": "computed", "error": ""}], "failed": 0}
+
+    def evaluated(*arguments: Any, **more: Any) -> dict[str, Any]:
+        evaluate.bind(*arguments, **more)
+        return {"groups": {"all": {"ate_m": 0.5}}}
+
+    scheduler: Any = Scheduler()
+    monkeypatch.setattr(vplog, "batch", computed)
+    monkeypatch.setattr(vplog, "evaluate", evaluated)
+    monkeypatch.setitem(sys.modules, module.partition(".")[0], scheduler)
+    monkeypatch.setitem(sys.modules, module, scheduler)
+    runpy.run_path(str(EXAMPLES / name))
+    assert scheduler.answers == answers
+
+
 def test_every_example_is_run() -> None:
-    assert {path.name for path in EXAMPLES.glob("*.py")} == {*EXAMPLE_CALLS, "batch_and_query.py"}
+    others = {"batch_and_query.py", "airflow_dag.py", "dagster_assets.py"}
+    assert {path.name for path in EXAMPLES.glob("*.py")} == {*EXAMPLE_CALLS, *others}

@@ -253,7 +253,7 @@ def localize(
 
 def evaluate(
     run: RunFolder | Place,
-    truth: Place,
+    truth: Place = "auto",
     *,
     distance_m: float | None = None,
     heading_deg: float | None = None,
@@ -261,9 +261,11 @@ def evaluate(
     truth_offset_s: float | None = None,
     topics: Topics | None = None,
 ) -> dict[str, Any]:
-    """ATE, RPE and drift of a run before and after, and which of its closures are right.
+    """ATE, RPE and drift of a run before and after, and which of its closures are right; or of a map `drives`, a record
+    of figures for each, and `groups`, their means by tag and version.
 
-    truth: a TUM file of poses, `gps`, the log's own fixes, or `auto`, the ground truth that comes with the log.
+    truth: a TUM file of poses, `gps`, the log's own fixes, or `auto`, the ground truth that comes with the log. Of a
+        map also a manifest with a column `truth`; `auto` is first what the manifest of `batch` named.
     distance_m, heading_deg: bounds of one place; 6 m and 45 degrees unless given.
     align: alignment of the ATE, `se3`, `sim3` or `origin`; unless given `se3`, or `sim3` of a run without metres.
     truth_offset_s: added to the truth's stamps.
@@ -274,7 +276,12 @@ def evaluate(
 
     given = {"distance_m": distance_m, "heading_deg": heading_deg, "align": align, "truth_offset_s": truth_offset_s}
     options: Any = {name: value for name, value in given.items() if value is not None}
-    with local_copy(run.folder if isinstance(run, RunFolder) else located(run)) as folder:
+    place = run.folder if isinstance(run, RunFolder) else located(run)
+    if (place / "map.json").exists():
+        from vplog.batch.evaluate_map import evaluate_map
+
+        return evaluate_map(place, os.fspath(truth), TruthOptions(**options))
+    with local_copy(place) as folder:
         return evaluate_run(folder, os.fspath(truth), _topics(topics), TruthOptions(**options))
 
 
@@ -350,8 +357,12 @@ def batch(
     engine: str = "local",
     address: str | None = None,
     retries: int = 2,
+    drive_timeout_s: float | None = None,
+    drive_memory_mb: float | None = None,
     join: bool = True,
     keep_cache: bool = False,
+    dry_run: bool = False,
+    cost_per_cpu_hour: float | None = None,
     progress: Progress = silent,
     on_drive: Callable[[Drive], None] = lambda _: None,
 ) -> dict[str, Any]:
@@ -361,22 +372,28 @@ def batch(
     nothing: `failed` of the result counts them, `drives` has the state and the error of each, and `join_error` says why
     drives that are in the map could not be joined.
 
+    logs: logs, folders and prefixes of a store with logs below them, patterns with `*`, `@LIST.txt` with one of these a
+        line, or manifests, `drives.csv` or `drives.parquet`, with a row for each drive.
     pipeline: None for the settings of the map, or the default for a new one.
     jobs: drives at once, each with so many `threads`.
     engine, address: `local` processes, or `ray` with the HOST:PORT of a cluster.
-    retries: more attempts at a drive whose process was killed.
+    retries: more attempts at a drive whose process was killed, or that could not be read, written or held.
+    drive_timeout_s, drive_memory_mb: limits of an attempt at a drive, which then fails; of local processes alone.
     join: whether closures between drives are searched at the end.
-    on_drive: called with each drive as it ends.
+    dry_run: say what would be computed, with bytes, images, CPU hours and, by `cost_per_cpu_hour`, the cost; nothing is
+        written.
+    on_drive: called with each drive as it starts, is to be tried again, and ends.
     """
+    from vplog.batch.drive_inputs import drive_inputs
     from vplog.storage.remote_path import local_copy, located
 
-    paths, parts, threads = _paths(list(logs)), _topics(topics), threads or available()
-    if parts is not None and parts.odometry_file is not None and len(paths) > 1:
+    inputs, parts, threads = drive_inputs(_paths(list(logs))), _topics(topics), threads or available()
+    if parts is not None and parts.odometry_file is not None and len(inputs) > 1:
         raise SettingsError(
-            f"--odometry-file {parts.odometry_file} is of one drive, and {len(paths)} logs are given. "
-            "Give each log by itself with its own file; each command adds a drive to the map."
+            f"--odometry-file {parts.odometry_file} is of one drive, and {len(inputs)} logs are given. "
+            "Give each drive its own in the column odometry_file of a manifest, drives.csv."
         )
-    with limited(threads), drive_processes(engine, jobs, len(paths)) as processes, ExitStack() as stack:
+    with limited(threads), drive_processes(engine, jobs, len(inputs)) as processes, ExitStack() as stack:
         from vplog.batch.batch import run_batch, settings_for
         from vplog.batch.engine import BatchOptions
 
@@ -386,8 +403,14 @@ def batch(
         else:
             chosen = _pipeline(pipeline, settings)
         references = None if library is None else stack.enter_context(local_copy(located(library)))
-        options = BatchOptions(jobs, engine, address, retries, processes, join, keep_cache, on_drive)
-        return run_batch(paths, root, chosen, references, parts, Execution(threads, progress), options)
+        if dry_run:
+            from vplog.batch.dry_run import dry_run as plan
+
+            return plan(inputs, root, chosen, references, parts, Execution(threads, progress), cost_per_cpu_hour)
+        options = BatchOptions(
+            jobs, engine, address, retries, drive_timeout_s, drive_memory_mb, processes, join, keep_cache, on_drive
+        )
+        return run_batch(inputs, root, chosen, references, parts, Execution(threads, progress), options)
 
 
 @contextmanager

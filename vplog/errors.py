@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -45,13 +45,16 @@ class NewerError(ResultError):
 
 def was_interrupted(error: BaseException | None) -> bool:
     """Whether Ctrl-C is behind an error: compiled code and imports that it stops raise others in its place."""
+    return any(isinstance(one, KeyboardInterrupt) for one in causes(error))
+
+
+def causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An error and those behind it, which `raise ... from None` hides from a traceback alone."""
     visited: set[int] = set()
     while error is not None and id(error) not in visited:
-        if isinstance(error, KeyboardInterrupt):
-            return True
+        yield error
         visited.add(id(error))
         error = error.__cause__ or error.__context__
-    return False
 
 
 def plural(count: int, noun: str) -> str:

@@ -25,10 +25,11 @@ import pytest
 from tests.joined import rewritten
 from vplog.batch import batch
 from vplog.batch.batch import run_batch
-from vplog.batch.engine import BatchOptions, LocalEngine, as_completed
-from vplog.batch.worker import Outcome, Task
+from vplog.batch.engine import BatchOptions, LocalEngine, as_completed, open_engine
+from vplog.batch.plan import DriveInput, PlannedDrive, absolute_log, name_of
+from vplog.batch.worker import Drive, Outcome, Task, compute_drive
 from vplog.demo.record import IMAGE
-from vplog.errors import LibraryError, ResultError, SettingsError
+from vplog.errors import LibraryError, LogError, ResultError, SettingsError
 from vplog.execution import process_pool
 from vplog.execution.process_pool import OwnProcesses, ProcessExpired
 from vplog.logs import TopicChoice
@@ -280,26 +281,70 @@ class Fated:
 def test_a_drive_is_tried_again_where_that_may_help_and_stops_no_other(tmp_path: Path) -> None:
     died, bad, good = BrokenExecutor("Its worker was killed."), Outcome("No such topic."), Outcome(worker="here")
     engine = Fated({
-        "unlucky": [died, Outcome("Out of memory.", retryable=True), good],
+        "unlucky": [died, Outcome("Out of memory.", "memory"), good],
         "bad": [bad],
         "good": [good],
         "lost": [Outcome(worker="gone"), good],
+        "offline": [Outcome("The server does not answer.", "network"), good],
+        "slow": [Outcome("It took longer.", "time limit"), good],
         "hopeless": [died, died, died],
         "odd": [ValueError("what\nis this")],
     })  # fmt: skip
     topics, pipeline = TopicChoice(), load_pipeline("default")
     tasks = [Task(name, name, tmp_path, tmp_path, pipeline, topics, 1, {}) for name in engine.fates]
-    found = as_completed(cast("LocalEngine", engine), tasks, BatchOptions(2))
+    told: list[Drive] = []
+    found = as_completed(cast("LocalEngine", engine), tasks, BatchOptions(2, on_drive=told.append))
     ended = {task.drive: (outcome.error, attempts) for task, outcome, attempts in found}
     assert ended == {
         "unlucky": ("", 3),
         "bad": ("No such topic.", 1),
         "good": ("", 1),
         "lost": ("", 2),
+        "offline": ("", 2),
+        "slow": ("It took longer.", 1),
         "hopeless": ("Its worker was killed.", 3),
         "odd": ("Internal error: ValueError: what is this.", 1),
     }
-    assert set(engine.begun[:6]) == set(engine.fates), "each has its turn before one is tried again"
+    assert set(engine.begun[:8]) == set(engine.fates), "each has its turn before one is tried again"
+    states = [(one.state, one.attempts, one.fault) for one in told if one.drive == "unlucky"]
+    assert states == [
+        ("started", 1, ""), ("retried", 1, "worker"), ("started", 2, ""), ("retried", 2, "memory"), ("started", 3, ""),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("behind", "fault"), [(OSError("reset"), "network"), (FileNotFoundError(), "input"), (ValueError(), "input")]
+)
+def test_the_network_is_no_fault_of_a_log(
+    behind: Exception, fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unreadable(*_: object) -> None:
+        try:
+            raise behind
+        except type(behind):
+            raise LogError("It cannot be read.") from None
+
+    monkeypatch.setattr("vplog.logs.open", unreadable)
+    for log, expected in (("s3://bucket/a.mcap", fault), ("/a.mcap", "input")):
+        task = Task("a", log, tmp_path, tmp_path, load_pipeline("default"), TopicChoice(), 1, {})
+        assert compute_drive(task).fault == expected
+
+
+@pytest.mark.parametrize(("limit", "fault"), [({"time_s": 1e-4}, "time limit"), ({"memory_mb": 1.0}, "memory limit")])
+def test_a_drive_over_its_limit_ends(
+    limit: dict[str, float], fault: str, whole: Path, logs: list[Path], tmp_path: Path, own_processes: None
+) -> None:
+    [library] = (whole / "libraries").iterdir()
+    pipeline = load_pipeline("default", QUICK)
+    task = Task("a", str(logs[0]), tmp_path / "run", library, pipeline, TopicChoice(), 1, {}, **limit)  # pyrefly: ignore[bad-argument-type]
+    with OwnProcesses(1) as processes:
+        [(_, outcome, attempts)] = as_completed(LocalEngine(processes, 1), [task], BatchOptions())
+    assert (outcome.fault, attempts) == (fault, 1)
+    assert outcome.seconds > 0
+    assert "--drive-" in outcome.error
+    over_ray = BatchOptions(engine="ray", drive_timeout_s=1)
+    with pytest.raises(SettingsError, match="for --engine local"), open_engine(over_ray, 1):
+        pass
 
 
 def test_a_process_that_dies_takes_no_other_along(monkeypatch: pytest.MonkeyPatch, own_processes: None) -> None:
@@ -458,9 +503,56 @@ def test_what_was_found_stays_known_after_ctrl_c(
     assert list(read_run_json(root / "failures.json")) == ["bad"]
 
 
+def test_a_manifest_names_tags_which_stay(
+    whole: Path, logs: list[Path], tmp_path: Path, verb: Callable[..., Said]
+) -> None:
+    root, manifest = shutil.copytree(whole, tmp_path / "map"), tmp_path / "drives.csv"
+    manifest.write_text(f"log,vehicle,truth\n{logs[0]},v1,t.tum\n{logs[1]},v2,\n")
+    metrics = tmp_path / "batch.prom"
+    for given in ([manifest], logs):
+        done = verb("batch", *given, "-o", root, "--no-join", "--json", "--metrics", metrics, *OPTIONS).json
+        assert f'vplog_batch_drives{{map="{root}",state="unchanged"}} 2\n' in metrics.read_text()
+        assert [(one["drive"], one["state"]) for one in done["drives"]] == [
+            ("drive", "unchanged"),
+            ("drive-2", "unchanged"),
+        ]
+        record = read_run_json(root / "runs/drive=drive/drive.json")
+        assert (record["tags"], record["truth"]) == ({"vehicle": "v1"}, str(tmp_path / "t.tum"))
+        assert "vehicle=v2" in verb("map", "info", root).out
+
+
+def test_a_dry_run_writes_nothing_and_reckons_by_the_drives_of_the_map(
+    whole: Path, logs: list[Path], tmp_path: Path, verb: Callable[..., Said]
+) -> None:
+    new, before = Path(shutil.copyfile(logs[0], tmp_path / "new.mcap")), files(whole)
+    dry = (*logs, new, tmp_path / "gone.bag", "--dry-run", "--cost-per-cpu-hour", 3600, *OPTIONS)
+    found = verb("batch", *dry, "-o", whole, "--json").json
+    assert files(whole) == before
+    states = ["unchanged", "unchanged", "compute", "failed"]
+    assert [one["state"] for one in found["drives"]] == states
+    runs = [read_run_json(whole / f"runs/drive={drive}/run.json") for drive in ("drive", "drive-2")]
+    cpu_s, images = sum(one["totals"]["cpu_seconds"] for one in runs), sum(one["counts"]["frames"] for one in runs)
+    assert (found["compute"], found["bytes"], found["images"]) == (1, new.stat().st_size, runs[0]["counts"]["frames"])
+    assert found["cpu_seconds_per_image"] == pytest.approx(cpu_s / images, abs=1e-3)
+    assert found["cost"] == pytest.approx(cpu_s / images * found["images"], abs=0.02)
+    root = Path(shutil.copytree(whole, tmp_path / "copy"))
+    with map_store.writing(root) as store:
+        map_store.annotate(store, "drive", {"log": str(new)})
+    assert verb("batch", new, "--dry-run", "-o", root, "--json", *OPTIONS).json["compute"] == 1, "of another time"
+    said = verb("batch", *dry, "-o", tmp_path / "map")
+    assert (said.code, "3 of 4 drives to compute" in said.out, (tmp_path / "map").exists()) == (0, True, False)
+
+
+def test_logs_that_are_refused_leave_no_map(whole: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:
+    [library] = (whole / "libraries").iterdir()
+    for more in ([], ["--library", library]):
+        assert "gone.bag" in verb("batch", tmp_path / "gone.bag", "-o", tmp_path / "map", *more, *OPTIONS).error
+        assert not (tmp_path / "map").exists()
+
+
 def test_one_odometry_file_is_of_one_drive(logs: list[Path], tmp_path: Path, verb: Callable[..., Said]) -> None:
     said = verb("batch", *logs, "-o", tmp_path / "map", "--odometry-file", tmp_path / "poses.tum")
-    assert "2 logs are given. Give each log by itself" in said.error
+    assert "2 logs are given. Give each drive its own" in said.error
 
 
 @pytest.mark.parametrize(("bad", "closed", "code"), [(False, "| true", 0), (True, "2>&1 | true", 1)])
@@ -484,12 +576,12 @@ def test_the_exit_status_is_that_of_the_batch(
 def test_a_drive_is_called_as_its_folder_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "monday").mkdir()
     monkeypatch.chdir(tmp_path / "monday")
-    found = (batch._name(Path()), batch._name(Path("../monday")), batch._absolute_log(Path("../monday")))
+    found = (name_of(Path()), name_of(Path("../monday")), absolute_log(Path("../monday")))
     assert found == ("monday", "monday", str(tmp_path / "monday"))
     (tmp_path / "far" / "below").mkdir(parents=True)
     (tmp_path / "link").symlink_to("far/below")
-    assert batch._absolute_log(Path("../link/../a.mcap")) == str(tmp_path / "far" / "a.mcap"), "as the system reads it"
-    assert (batch._absolute_log(Path("../link")), batch._name(Path("../link"))) == (str(tmp_path / "link"), "link")
+    assert absolute_log(Path("../link/../a.mcap")) == str(tmp_path / "far" / "a.mcap"), "as the system reads it"
+    assert (absolute_log(Path("../link")), name_of(Path("../link"))) == (str(tmp_path / "link"), "link")
 
 
 def test_the_name_of_a_drive_that_failed_is_its_own(tmp_path: Path) -> None:
@@ -517,14 +609,13 @@ def test_the_longest_log_is_begun_first(tmp_path: Path) -> None:
     at = {name: tmp_path / name for name in ("short", "gone", "long", "same")}
     for name, size in (("short", 10), ("long", 30), ("same", 10)):
         at[name].write_bytes(bytes(size))
-    logs = {name: str(path) for name, path in at.items()}
     like = Task("", "", tmp_path, tmp_path, load_pipeline("default"), TopicChoice(), 1, {})
-    wanted: list[dict[str, Any]] = [{"drive": name} for name in at]
+    wanted = [PlannedDrive(DriveInput(path), {"drive": name}, "compute") for name, path in at.items()]
     with map_store.writing(tmp_path / "map") as store:
-        found = batch._tasks(store, wanted, like, logs, longest_first=True)
+        found = batch._tasks(store, wanted, like, longest_first=True)
         assert [task.drive for task in found] == ["long", "short", "same", "gone"]
         assert [task.in_parts for task in found] == [True, False, False, False], "longer than all others together"
-        assert [task.in_parts for task in batch._tasks(store, wanted[:2], like, logs, True)] == [True, False]
+        assert [task.in_parts for task in batch._tasks(store, wanted[:2], like, True)] == [True, False]
         at["same"].write_bytes(bytes(20))
-        assert not any(task.in_parts for task in batch._tasks(store, wanted, like, logs, True))
-        assert batch._tasks(store, wanted[1:2], like, logs, True)[0].in_parts, "it has all machines for itself"
+        assert not any(task.in_parts for task in batch._tasks(store, wanted, like, True))
+        assert batch._tasks(store, wanted[1:2], like, True)[0].in_parts, "it has all machines for itself"

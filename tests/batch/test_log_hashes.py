@@ -12,6 +12,7 @@ import pytest
 
 from vplog.batch import log_hashes
 from vplog.batch.log_hashes import known_hashes
+from vplog.batch.plan import DriveInput
 from vplog.execution.execution import Execution
 from vplog.logs import TopicChoice
 from vplog.logs.formats.mcap_file import MAGIC
@@ -45,7 +46,13 @@ def logs(tmp_path: Path) -> dict[str, Path]:
 
 
 def asked(logs: dict[str, Path], record: Path, **beside: Path) -> tuple[list[dict[str, str]], dict[str, str]]:
-    return known_hashes(logs, TopicChoice.model_validate(beside), record, Execution(2))
+    answers = known_hashes(given(logs, TopicChoice.model_validate(beside)), record, Execution(2))
+    errors = {name: answer for name, answer in zip(logs, answers, strict=True) if isinstance(answer, str)}
+    return [{} if isinstance(answer, str) else answer for answer in answers], errors
+
+
+def given(logs: dict[str, Path], topics: TopicChoice) -> list[DriveInput]:
+    return [DriveInput(path, topics=topics) for path in logs.values()]
 
 
 def log(text: str) -> bytes:
@@ -189,7 +196,7 @@ def test_reading_tells_how_far_it_is_and_ends_at_once(tmp_path: Path, monkeypatc
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        known_hashes({"large": large}, TopicChoice(), tmp_path / ".inputs.json", Execution(2, interrupt))
+        known_hashes(given({"large": large}, TopicChoice()), tmp_path / ".inputs.json", Execution(2, interrupt))
     assert told[-1][0] == "check (MB)"
     assert 0 < told[-1][1] < told[-1][2] == 10**7
 
@@ -200,8 +207,8 @@ def test_masks_of_one_name_are_told_apart(tmp_path: Path, logs: dict[str, Path])
         masks[topic] = tmp_path / topic.strip("/") / "mask.png"
         masks[topic].parent.mkdir()
         masks[topic].write_bytes(text)
-    (found, *_), errors = known_hashes(logs, TopicChoice(masks=masks), tmp_path / "record", Execution(1))
-    assert not errors
+    found, *_ = known_hashes(given(logs, TopicChoice(masks=masks)), tmp_path / "record", Execution(1))
+    assert isinstance(found, dict)
     beside = {name: text for name, text in found.items() if name.startswith("beside")}
     assert {name: hashlib.sha256(masks[name.split()[2]].read_bytes()).hexdigest() for name in beside} == beside
     assert len(beside) == 2

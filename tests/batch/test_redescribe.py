@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from tests.maps.bucket import serving
 from vplog.batch import redescribe
-from vplog.batch.engine import BatchOptions
 from vplog.batch.redescribe import redescribe_map
 from vplog.maps.storage import map_store
 from vplog.pipeline import load_pipeline
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     import pytest
     from conftest import Said
 
+    from vplog.batch.plan import DriveInput
     from vplog.demo.record import Drive
 
 QUICK = (
@@ -75,7 +75,7 @@ def test_a_map_in_a_bucket_is_described_anew(finished: Path, drive: Drive, verb:
 
 
 def test_drives_keep_their_topics_and_names(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One batch for each choice of topics, each with the drives in order of their numbers."""
+    """In one batch, in order of their numbers."""
     logs = {drive: tmp_path / drive / "walk.mcap" for drive in ("walk", "walk-2", "walk-10", "ride")}
     for log in logs.values():
         log.parent.mkdir()
@@ -83,14 +83,11 @@ def test_drives_keep_their_topics_and_names(finished: Path, tmp_path: Path, monk
     left = {"image": "/left"}
     make_map(tmp_path / "map", finished, {drive: (str(log), left if drive == "walk-2" else {})
                                           for drive, log in logs.items()})  # fmt: skip
-    asked: list[tuple[list[str], str | None, str]] = []
+    asked: list[tuple[str, str, str | None]] = []
 
-    def run_batch(
-        paths: list[Path], root: Path, pipeline: Any, library: Path, topics: Any, _: Any, options: BatchOptions
-    ) -> dict[str, Any]:
-        assert options == BatchOptions(join=bool(asked)), "joined once, when all are there"
-        asked.append(([path.parent.name for path in paths], topics.image, pipeline.places.kind))
-        fate = [{"drive": path.parent.name, "state": "computed", "error": ""} for path in paths]
+    def run_batch(inputs: list[DriveInput], *_: Any) -> dict[str, Any]:
+        asked.extend((one.name, one.log.parent.name, one.topics.image) for one in inputs)
+        fate = [{"drive": one.name, "state": "computed", "error": ""} for one in inputs]
         return {"drives": fate, "joined": None, "join_error": ""}
 
     monkeypatch.setattr(redescribe, "run_batch", run_batch)
@@ -99,7 +96,9 @@ def test_drives_keep_their_topics_and_names(finished: Path, tmp_path: Path, monk
     record = json.loads((other / "library.json").read_text())
     run_record.write_run_json(other / "library.json", {**record, "hash": "f" * 64})
     told = redescribe_map(tmp_path / "map", other, tmp_path / "new")
-    assert asked == [(["ride", "walk", "walk-10"], None, "bobb"), (["walk-2"], "/left", "bobb")]
+    assert asked == [
+        (name, name, "/left" if name == "walk-2" else None) for name in ("ride", "walk", "walk-2", "walk-10")
+    ]
     assert told["failed"] == 0
     assert told["library"] == "f" * 64
 

@@ -109,7 +109,7 @@ def test_version(verb: Verb) -> None:
         ("run", "a.mcap", "-o", "out", "--fast"),
         ("run", "a.mcap", "-o", "out", "--threads", "0"),
         ("run", "a.mcap", "-o", "out", "--threads", "many"),
-        ("evaluate", "out"),
+        ("evaluate",),
         ("info", "a.mcap", "b.mcap"),
         ("map",),
         ("explain", "out", "--closure", "K"),

@@ -108,9 +108,14 @@ def test_the_time_to_the_end_is_learned_from_the_latest_run_beside(tmp_path: Pat
 
 
 def test_a_drive_of_a_batch_has_its_event_and_its_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    Progress(namespace(tmp_path / "e")).print_drive(Drive("a", "a.mcap", "failed", seconds=2.0, error="Damaged."))
-    assert told(tmp_path / "e")[0] | {"time_s": 0} == {
-        "event": "drive_finished", "time_s": 0, "drive": "a", "state": "failed", "seconds": 2.0, "error": "Damaged."
+    shown = Progress(namespace(tmp_path / "e"))
+    shown.print_drive(Drive("a", "a.mcap", "started", 1))
+    shown.print_drive(Drive("a", "a.mcap", "failed", 1, 2.0, error="Damaged.", fault="input"))
+    first, second = (one | {"time_s": 0} for one in told(tmp_path / "e"))
+    assert first == {"event": "drive_started", "time_s": 0, "drive": "a", "log": "a.mcap", "attempt": 1}
+    assert second == first | {
+        "event": "drive_finished", "state": "failed", "seconds": 2.0, "peak_memory_mb": 0.0, "error": "Damaged.",
+        "fault": "input",
     }  # fmt: skip
     assert capsys.readouterr().err == "vplog: a: failed, 2.0 s: Damaged.\n"
 

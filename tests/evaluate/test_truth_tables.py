@@ -247,5 +247,5 @@ def test_a_file_that_is_far_too_large_is_not_read(tmp_path: Path, monkeypatch: p
     path.write_text("query,match\n" + "1,2\n" * 2)
     assert len(truth_tables.read_table(path)[1]) == 2
     path.write_text("query,match\n" + "1,2\n" * 3)
-    with pytest.raises(TruthError, match="is larger than 0 MB, so it is no table of pairs"):
+    with pytest.raises(TruthError, match="is larger than 0 MB, so it is no such table"):
         truth_tables.read_table(path)

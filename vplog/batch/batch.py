@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -13,27 +12,27 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vplog import logs
+from vplog.batch.drive_inputs import drive_inputs
 from vplog.batch.engine import BatchOptions, LocalEngine, as_completed, open_engine
 from vplog.batch.log_hashes import NAME, known_hashes
 from vplog.batch.map_library import map_library
+from vplog.batch.plan import DriveInput, PlannedDrive, common_record, plan_drives, with_topics
 from vplog.batch.worker import Drive, Outcome, Task, made_by
 from vplog.cache.input_hashes import bytes_of
 from vplog.errors import ResultError, SettingsError, VplogError
 from vplog.execution.execution import Execution
+from vplog.logs import TopicChoice
 from vplog.maps.import_places import PLACES_ONLY
 from vplog.maps.joining.join import join as join_drives
 from vplog.maps.joining.join import load_places
-from vplog.maps.storage import layout, map_store
+from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings
 from vplog.maps.storage.layout import folder_name
 from vplog.pipeline import Pipeline, load_pipeline, pipeline_from
 from vplog.storage.remote_path import RemotePath, located
-from vplog.storage.urls import shown
 
 if TYPE_CHECKING:
     from vplog.batch.engine import Engine
-    from vplog.logs import TopicChoice
     from vplog.maps.storage.map_store import Store
 
 _FREE_BYTES = 10**10
@@ -58,10 +57,11 @@ def settings_for(root: Path, name: str | None = None, assignments: Sequence[str]
 
 
 def run_batch(
-    paths: Sequence[Path], root: Path, pipeline: Pipeline, library: Path | None = None,
+    logs: Sequence[Path | DriveInput], root: Path, pipeline: Pipeline, library: Path | None = None,
     topics: TopicChoice | None = None, execution: Execution = Execution(), options: BatchOptions | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Compute into the map in `root` what of the drives of these logs is missing or made from something else.
+    """Compute into the map in `root` what of the drives of these logs is missing or made from something else. `topics`
+    are those of all drives that have none of their own.
 
     On this machine every job has all threads; over Ray they are the cores of a cluster of this machine. Without
     `library` the map's own is used, or one is built from the first logs. A drive whose worker dies is tried again; one
@@ -69,43 +69,40 @@ def run_batch(
     the answer says why (vplog/maps/joining). Raises VplogError where the map as a whole cannot be written or does not
     fit the library or the settings.
     """
-    topics, options = topics or logs.TopicChoice(), options or BatchOptions()
-    began, given = time.perf_counter(), [_absolute_log(path) for path in paths]
-    if twice := [log for log, count in Counter(given).items() if count > 1]:
-        raise SettingsError(f"{shown(twice[0])} is given twice. Give each log once.")
+    began, options = time.perf_counter(), options or BatchOptions()
+    given = with_topics(drive_inputs(logs), topics)
     with (
         map_store.writing(root) as store,
         ThreadPoolExecutor(1) as background,
         open_engine(options, execution.threads, store.staging) as workers,
     ):
         versions = background.submit(made_by)
-        digest = map_library(store, paths, library, pipeline, topics, execution)
+        digest = map_library(store, given, library, pipeline, execution)
         store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
         known = store.drives()
-        inputs, errors = known_hashes(dict(zip(given, paths, strict=True)), topics, store.root / NAME, execution)
-        reserved = {**_failed(store), **known}
-        drives = layout.drive_names([_name(path) for path in paths], list(map(shown, given)), reserved, inputs)
-        common = _common_record(pipeline, topics, digest) | versions.result()
-        done, wanted = dict[str, Drive](), list[dict[str, Any]]()
-        urls = dict(zip(drives, given, strict=True))
-        for drive, content in zip(drives, inputs, strict=True):
-            record, log = {"drive": drive, "inputs": content, **common}, shown(urls[drive])
-            record |= {"key": layout.key_of(record), "log": log}
-            if why := errors.get(urls[drive]):
-                done[drive] = Drive(drive, log, "failed", error=why)
-                options.on_drive(done[drive])
-            elif drive in known and layout.made_alike(known[drive], record) and not _is_damaged(store, drive):
-                done[drive] = Drive(drive, log, "unchanged")
-                map_store.relocate(store, drive, log)
-            else:
-                wanted.append(record)
+        hashes = known_hashes(given, store.root / NAME, execution)
+        common = common_record(pipeline, digest) | versions.result()
+        plan = plan_drives(store, given, common, hashes)
+        done = dict[str, Drive]()
+        for one in plan:
+            if one.state != "compute":
+                done[one.drive] = Drive(
+                    one.drive, one.record["log"], one.state, error=one.error, fault="input" if one.error else ""
+                )  # fmt: skip
+            if one.state == "failed":
+                options.on_drive(done[one.drive])
+            elif one.state == "unchanged":
+                map_store.annotate(store, one.drive, {"log": one.record["log"], **one.given.about})
+        wanted = [one for one in plan if one.state == "compute"]
         each, concurrency = _divide_cores(workers, options.jobs, len(wanted))
-        execution.progress("drives", len(done), len(paths))
+        execution.progress("drives", len(done), len(plan))
         keep = options.join or options.keep_cache
-        like = Task("", "", store.staging, store.library(digest), pipeline, topics, each, {}, None, keep)
-        tasks = _tasks(store, wanted, like, urls, longest_first=concurrency > 1)
+        like = Task("", "", store.staging, store.library(digest), pipeline, TopicChoice(), each, {}, None, keep)
+        like = replace(like, time_s=options.drive_timeout_s, memory_mb=options.drive_memory_mb)
+        tasks = _tasks(store, wanted, like, longest_first=concurrency > 1)
         places = None
-        if options.join and tasks and len(known.keys() | set(drives)) > 1:  # while this process would only wait
+        is_alone = len(known.keys() | {one.drive for one in plan}) < 2
+        if options.join and tasks and not is_alone:  # while this process would only wait
             places = background.submit(load_places, like.library, pipeline, execution)
         try:
             for ended in as_completed(workers, tasks, options):
@@ -114,16 +111,17 @@ def run_batch(
                     # else it stays for another attempt or the join
                     shutil.rmtree(_cache(store, found.drive), ignore_errors=True)
                 options.on_drive(found)
-                execution.progress("drives", len(done), len(paths))
+                execution.progress("drives", len(done), len(plan))
         finally:  # of a batch that was interrupted, too
             failures_warning = _write_failures(store, done)
         joined, join_error = None, ""
         if options.join:
             executor_for = workers.executor_for(execution.threads)
+            urls = {one.drive: one.given.url for one in plan}
             joined, join_error = _join(store, pipeline, execution, executor_for, places and places.result, urls)
         if not options.keep_cache and not join_error:  # another join would need it
             _clear_caches(store)
-    outcomes = [done[drive] for drive in drives]
+    outcomes = [done[one.drive] for one in plan]
     return {
         "map": str(root),
         "library": digest,
@@ -138,32 +136,17 @@ def run_batch(
         "warnings": [
             *failures_warning,
             *([] if joined else damage_warnings(store)),
-            *_duplicate_recordings(outcomes, inputs),
+            *_duplicate_recordings(outcomes, [one.record["inputs"] for one in plan]),
             *_other_versions([record for drive, record in known.items() if drive not in done], common),
         ],
     }
-
-
-def _failed(store: Store) -> dict[str, dict[str, Any]]:
-    """Records of failed and damaged drives, whose IDs stay reserved while the map lists them."""
-    found = {drive: {"log": failure.get("log"), "inputs": None} for drive, failure in store.failures().items()}
-    for drive in store.damaged:
-        with suppress(ResultError):
-            found[drive] = store.record(drive)
-    return found
-
-
-def _is_damaged(store: Store, drive: str) -> bool:
-    if wrong := store.damaged_files(drive):
-        store.damaged[drive] = wrong[0]
-    return bool(wrong)
 
 
 def write_failures(store: Store, done: Mapping[str, Drive]) -> None:
     """Note the failures of this batch in the map, beside those of other drives."""
     changes = dict[str, dict[str, Any] | None]()
     for drive, one in done.items():
-        failed = {"log": one.log, "error": one.error, "attempts": one.attempts}
+        failed = {"log": one.log, "error": one.error, "fault": one.fault, "attempts": one.attempts}
         changes[drive] = failed if one.state == "failed" else None
     store.update_failures(changes)
 
@@ -224,22 +207,20 @@ def _join(store: Store, *how: Any) -> tuple[dict[str, Any] | None, str]:
         return None, str(error)
 
 
-def _tasks(
-    store: Store, wanted: Sequence[dict[str, Any]], like: Task, urls: Mapping[str, str], longest_first: bool
-) -> list[Task]:
-    """A task for each drive that is to be computed, by its drive.json.
+def _tasks(store: Store, wanted: Sequence[PlannedDrive], like: Task, longest_first: bool) -> list[Task]:
+    """A task for each drive that is to be computed.
 
     With `longest_first` none of the long drives is begun when all others are done.
     """
-    sizes = {record["drive"]: _log_bytes(urls[record["drive"]]) for record in wanted}
-    order = sorted(wanted, key=lambda record: -sizes[record["drive"]]) if longest_first else wanted
+    sizes = {one.drive: _log_bytes(one.given.url) for one in wanted}
+    order = sorted(wanted, key=lambda one: -sizes[one.drive]) if longest_first else wanted
     return [
         replace(
-            like, drive=record["drive"], log=urls[record["drive"]], record=record, cache=_cache(store, record["drive"]),
-            folder=like.folder / f"{os.getpid()}-{number}",
-            in_parts=len(wanted) == 1 or 2 * sizes[record["drive"]] > sum(sizes.values()),
+            like, drive=one.drive, log=one.given.url, topics=one.given.topics, record=one.record,
+            cache=_cache(store, one.drive), folder=like.folder / f"{os.getpid()}-{number}",
+            in_parts=len(wanted) == 1 or 2 * sizes[one.drive] > sum(sizes.values()),
         )
-        for number, record in enumerate(order)
+        for number, one in enumerate(order)
     ]  # fmt: skip
 
 
@@ -265,45 +246,14 @@ def _divide_cores(workers: Engine, jobs: int | None, drives: int) -> tuple[int, 
     return each, jobs or workers.concurrency(each)
 
 
-def _absolute_log(path: Path) -> str:
-    """Absolute path of a log as it was named, links not resolved, or its URL with the query."""
-    if isinstance(path, RemotePath):
-        return path.url
-    if path.name in ("", ".."):
-        return str(path.resolve())
-    # `..` is of the folder that a link leads to
-    return str((path.parent.resolve() if ".." in path.parts else path.parent.absolute()) / path.name)
-
-
-def _name(path: Path) -> str:
-    """The name of a log: its file without the ending, or its folder."""
-    with suppress(OSError):  # its own run raises it
-        if path.is_dir():
-            return path.name if path.name not in ("", "..") else path.resolve().name
-    return Path(path.stem).stem if path.suffix in (".zst", ".zstd") else path.stem
-
-
-def _common_record(pipeline: Pipeline, topics: TopicChoice, library: str) -> dict[str, Any]:
-    """Fields of drive.json that are the same for each drive of a batch. Every setting counts, as every table names them
-    all; the place of a log does not: a map may move with its logs."""
-    return {
-        "topics": topics.model_dump(mode="json", exclude={"odometry_file", "calibration_file", "masks"}),
-        "settings": layout.key_of(pipeline.model_dump(mode="json")),
-        "library": library,
-    }
-
-
 def _publish(store: Store, task: Task, outcome: Outcome, attempts: int) -> Drive:
-    error, drive = outcome.error, task.drive
-    if not error:
+    drive = task.drive
+    if not outcome.error:
         try:
             drive = map_store.publish(store, drive, task.folder)
         except ResultError as problem:
-            error = str(problem)
-    if error:
+            outcome = replace(outcome, error=str(problem), fault="io")
+    if outcome.error:
         shutil.rmtree(task.folder, ignore_errors=True)
-    known = Drive.__dataclass_fields__
-    figures: dict[str, Any] = {name: value for name, value in vars(outcome).items() if name in known}
-    figures["error"] = error
-    state = "failed" if error else "computed"
-    return Drive(**figures, drive=drive, log=task.record["log"], state=state, attempts=attempts)
+    state = "failed" if outcome.error else "computed"
+    return replace(Drive.after(task, state, attempts, outcome), drive=drive)

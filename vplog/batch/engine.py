@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from vplog.batch.worker import Drive, Outcome, Task, compute_drive
 from vplog.errors import SettingsError, VplogError
+from vplog.execution.process_limits import OVER_MEMORY, OVER_TIME
 from vplog.execution.process_pool import OwnProcesses, ProcessExpired
+from vplog.storage.urls import shown
 
 if TYPE_CHECKING:
     from vplog.batch.ray_engine import RayEngine
@@ -35,6 +38,10 @@ class BatchOptions:
     address: str | None = None
     """HOST:PORT of a Ray cluster; None: one of this machine for the time of the batch."""
     retries: int = RETRIES
+    drive_timeout_s: float | None = None
+    """Longest time of an attempt at a drive; it fails, and is not tried again. Of local processes alone."""
+    drive_memory_mb: float | None = None
+    """Largest resident memory of a drive's process, in MB (10^6 bytes), as `drive_timeout_s`."""
     processes: OwnProcesses | None = None
     """Pool of processes on this machine that the caller has started; else one of `jobs` + 1."""
     join: bool = True
@@ -42,7 +49,7 @@ class BatchOptions:
     keep_cache: bool = False
     """Whether results of stages stay in MAP/.cache, so that other settings do not need the images again."""
     on_drive: Callable[[Drive], None] = lambda _: None
-    """Called with each drive as it ends."""
+    """Called with each drive as it starts, is to be tried again, and ends."""
 
 
 @contextmanager
@@ -52,6 +59,8 @@ def open_engine(options: BatchOptions, threads: int, folder: Path | None = None)
     if options.engine not in ENGINES:
         raise SettingsError(f"No engine {options.engine!r}. Engines: {', '.join(ENGINES)}.")
     if options.engine == "ray":
+        if (options.drive_timeout_s, options.drive_memory_mb) != (None, None):
+            raise SettingsError("--drive-timeout and --drive-memory are for --engine local. Leave them out.")
         from vplog.batch.ray_engine import ray_engine
 
         with ray_engine(options.address, threads, folder) as engine:
@@ -71,17 +80,21 @@ def as_completed(engine: Engine, tasks: Sequence[Task], options: BatchOptions) -
     """
     jobs = options.jobs or 1 if options.engine == "local" else options.jobs
     waiting = deque((task, 1) for task in tasks)
-    running: dict[Future[Outcome], tuple[Task, int]] = {}
+    running: dict[Future[Outcome], tuple[Task, int, float]] = {}
     while waiting or running:
         # without `jobs` one stands in line behind each, so that no core waits for this loop
         while waiting and len(running) < (jobs or 2 * engine.concurrency(waiting[0][0].threads)):
             task, attempt = waiting.popleft()
-            running[engine.start(task)] = task, attempt
+            options.on_drive(Drive(task.drive, shown(task.log), "started", attempt))
+            running[engine.start(task)] = task, attempt, time.monotonic()
         for future in wait(running, return_when=FIRST_COMPLETED).done:
-            task, attempt = running.pop(future)
+            task, attempt, began_s = running.pop(future)
             outcome = _outcome_of(engine, task, future)
+            if not outcome.seconds:  # nobody says how long it lived
+                outcome = replace(outcome, seconds=round(time.monotonic() - began_s, 3))
             if outcome.retryable and attempt <= options.retries:
                 waiting.append((task, attempt + 1))
+                options.on_drive(Drive.after(task, "retried", attempt, outcome))
             else:
                 yield task, outcome, attempt
 
@@ -92,16 +105,20 @@ def _outcome_of(engine: Engine, task: Task, future: Future[Outcome]) -> Outcome:
         outcome = future.result()
         if not outcome.error:
             engine.fetch(task, outcome)
-    except ProcessExpired:
-        return Outcome(_KILLED, retryable=True)
+    except ProcessExpired as error:
+        if error.exitcode == OVER_TIME:
+            return Outcome(f"It took longer than {task.time_s:g} s, the --drive-timeout.", "time limit")
+        if error.exitcode == OVER_MEMORY:
+            return Outcome(f"It took more than {task.memory_mb:g} MB, the --drive-memory.", "memory limit")
+        return Outcome(_KILLED, "worker")
     except BrokenExecutor as error:
-        return Outcome(str(error), retryable=True)
+        return Outcome(str(error), "worker")
     except OSError as error:  # no process more, or no room for what a machine brings
-        return Outcome(f"Cannot begin or fetch the drive: {error.strerror or error}.", retryable=True)
+        return Outcome(f"Cannot begin or fetch the drive: {error.strerror or error}.", "io")
     except VplogError as error:
-        return Outcome(str(error))
+        return Outcome(str(error), "input")
     except Exception as error:  # what a worker cannot even begin with
-        return Outcome(f"Internal error: {type(error).__name__}: {' '.join(str(error).split())[:200]}.")
+        return Outcome(f"Internal error: {type(error).__name__}: {' '.join(str(error).split())[:200]}.", "internal")
     return outcome
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
 from contextlib import suppress
 from pathlib import Path
@@ -18,8 +18,8 @@ from vplog.results.run_record import read_run_json, write_run_json
 from vplog.storage.remote_path import RemotePath
 
 if TYPE_CHECKING:
+    from vplog.batch.plan import DriveInput
     from vplog.execution.execution import Execution
-    from vplog.logs import TopicChoice
 
 NAME = ".inputs.json"
 """Name of the record in the map: hidden, as it concerns the logs on this machine, not the map."""
@@ -35,22 +35,19 @@ _PROGRESS_EVERY_S = 0.2
 Hashes = dict[str, str]
 
 
-def known_hashes(
-    logs: Mapping[str, Path], topics: TopicChoice, record: Path, execution: Execution
-) -> tuple[list[Hashes], dict[str, str]]:
-    """sha256 of the files of each log and of those beside it, by name, in order; by log one line where they cannot be
-    read, or are no log.
+def known_hashes(logs: Sequence[DriveInput], record: Path, execution: Execution) -> list[Hashes | str]:
+    """sha256 of the files of each log and of those that its topics name beside it, by name, in order; one line where
+    they cannot be read, or are no log.
 
     A file whose length and times are those of the record, a file that is made and updated here, is not read. A record
     that cannot be read is made again, one that cannot be written is done without. Ctrl-C ends it within a block;
     progress is in MB read.
     """
-    beside = topics.files
     known = _read(record)
     current: dict[str, dict[str, Any]] = {}
     done, total, stop = [0] * len(logs), [0] * len(logs), Event()
 
-    def one(path: Path, number: int) -> Hashes:
+    def one(path: Path, number: int, is_log: bool) -> Hashes:
         if isinstance(path, RemotePath):
             return hash_inputs(path)
         name, stat = str(path.absolute()), stat_signature(path)
@@ -63,7 +60,7 @@ def known_hashes(
             if stop.is_set():
                 raise CancelledError
 
-        if path not in beside.values():
+        if is_log:
             all_logs.check(path)  # a folder of other things may hold anything
         began, total[number] = time.time(), total[number] + bytes_of(path)
         hashes = hash_inputs(path, read)
@@ -71,9 +68,10 @@ def known_hashes(
             current[name] = {"look": stat, "hashes": hashes}
         return hashes
 
-    def of_log(path: Path, number: int) -> Hashes | str:
+    def of_log(given: DriveInput, number: int) -> Hashes | str:
+        path, beside = given.log, given.topics.files
         try:
-            found = [one(file, number) for file in (path, *beside.values())]
+            found = [one(path, number, True), *(one(file, number, False) for file in beside.values())]
         except LogError as error:
             return str(error)
         except OSError as error:
@@ -86,7 +84,7 @@ def known_hashes(
         }
 
     with ThreadPoolExecutor(execution.threads) as pool:
-        waiting = [pool.submit(of_log, path, number) for number, path in enumerate(logs.values())]
+        waiting = [pool.submit(of_log, log, number) for number, log in enumerate(logs)]
         try:
             while wait(waiting, _PROGRESS_EVERY_S).not_done:
                 execution.progress("check (MB)", sum(done) // 10**6, sum(total) // 10**6)
@@ -94,15 +92,14 @@ def known_hashes(
             stop.set()
             pool.shutdown(cancel_futures=True)
             raise
-        answers = dict(zip(logs, (one.result() for one in waiting), strict=True))
+        answers = [one.result() for one in waiting]
         if sum(done):
             execution.progress("check (MB)", sum(done) // 10**6, sum(done) // 10**6)
     if any(known.get(name) != about for name, about in current.items()):
         every = {name: about for name, about in sorted({**known, **current}.items()) if os.path.exists(name)}  # noqa: PTH110 (never raises)
         with suppress(ResultError):
             write_run_json(record, every)
-    errors = {log: answer for log, answer in answers.items() if isinstance(answer, str)}
-    return [{} if isinstance(answer, str) else answer for answer in answers.values()], errors
+    return answers
 
 
 def _read(record: Path) -> dict[str, dict[str, Any]]:

@@ -12,23 +12,24 @@ from vplog.execution.execution import Execution
 from vplog.maps.storage import map_store
 from vplog.places.library_files import read_library_record
 from vplog.places.reference_choice import PAPER_SIZE, evenly
-from vplog.run.reference_library import build_library, check_library
+from vplog.run.reference_library import check_library, library_of_logs
 from vplog.storage.scratch import copy_folder
 
 if TYPE_CHECKING:
-    from vplog.logs import TopicChoice
+    from vplog.batch.plan import DriveInput
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
+    from vplog.stages import Log
 
 _TRIED = 8
 """Frames of a log, over the whole drive, that are decoded before it is relied on: one that does is enough."""
 
 
 def map_library(
-    store: Store, paths: Sequence[Path], given: Path | None, pipeline: Pipeline, topics: TopicChoice,
-    execution: Execution,
-) -> str:  # fmt: skip
-    """The hash of the map's library, which is put into the map where it has none yet.
+    store: Store, drives: Sequence[DriveInput], given: Path | None, pipeline: Pipeline, execution: Execution
+) -> str:
+    """The hash of the map's library, which is put into the map where it has none yet. Where none of the logs can be
+    read, nothing is made.
 
     Raises LibraryError where another one is given, or where the settings describe places otherwise, and SettingsError
     where they have decisions.
@@ -50,10 +51,11 @@ def map_library(
                 f"{known[:12]}: they cannot be compared. Leave --library out, or make another map."
             )
         if known is None:
+            _decodable(drives, 1)
             digest = pipeline.places.load(given, Execution(execution.threads)).hash  # checked against its record
             copy_folder(given, made, f"the library {given} into {store}")
     elif known is None:
-        digest = build_library(_decodable(paths, topics), made, pipeline, topics, execution).hash
+        digest = library_of_logs(_decodable(drives, PAPER_SIZE), made, pipeline, execution).hash
     else:
         check_library(store.library(known), pipeline)
         digest = known
@@ -64,13 +66,13 @@ def map_library(
     return digest
 
 
-def _decodable(paths: Sequence[Path], topics: TopicChoice) -> list[Path]:
-    """The first logs that have a frame that decodes, as many as a library has references. Errors of the others are
-    raised by their own runs. Raises the error of the first where there is none."""
+def _decodable(drives: Sequence[DriveInput], most: int) -> list[Log]:
+    """The first logs that have a frame that decodes, `most` of them. Errors of the others are raised by their own runs.
+    Raises the error of the first where there is none."""
     sound, first = [], None
-    for path in paths:
+    for drive in drives:
         try:
-            log = logs.open(path, topics)
+            log = logs.open(drive.log, drive.topics)
             stamps = log.stamps()
             for encoded in log.frames(stamps[evenly(len(stamps), _TRIED)]) if len(stamps) else ():
                 try:
@@ -78,13 +80,13 @@ def _decodable(paths: Sequence[Path], topics: TopicChoice) -> list[Path]:
                 except VplogError as error:
                     first = first or error
                 else:
-                    sound.append(path)
+                    sound.append(log)
                     break
         except VplogError as error:
             first = first or error
         except OSError as error:
-            first = first or LogError(f"Cannot read {path}: {error.strerror or error}.")
-        if len(sound) == PAPER_SIZE:
+            first = first or LogError(f"Cannot read {drive.log}: {error.strerror or error}.")
+        if len(sound) == most:
             break
     if not sound:
         raise first or LibraryError("None of the logs has a frame, so there is nothing to build a library from.")

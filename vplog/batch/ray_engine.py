@@ -268,7 +268,7 @@ def compute_remote_drive(task: Task, library: dict[str, Bytes], parts: list[tupl
 
     where = node_name()
     if any(task.record[name] != value for name, value in made_by().items()):
-        return RemoteOutcome(_OTHER.format(where), worker=where)
+        return RemoteOutcome(_OTHER.format(where), "input", worker=where)
     try:
         with scratch("run") as folder:
             place, made = unpacked(library, f"library-{task.record['library']}"), folder / "run"
@@ -286,10 +286,10 @@ def compute_remote_drive(task: Task, library: dict[str, Bytes], parts: list[tupl
             stages = _put_files(cache) if task.keep_cache and task.cache is None else ()
             return RemoteOutcome(**ended, files=_put_files(made), cache=stages)
     except VplogError as error:
-        return RemoteOutcome(str(error), worker=where)
+        return RemoteOutcome(str(error), "input", worker=where)
     except OSError as error:
         why = f"Cannot write {error.filename or 'a file'} on {where}: {error.strerror}."
-        return RemoteOutcome(why, retryable=True, worker=where)
+        return RemoteOutcome(why, "io", worker=where)
 
 
 def _put_files(folder: Path) -> Files:

@@ -6,13 +6,13 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog import logs
 from vplog.batch.batch import run_batch, write_failures
-from vplog.batch.engine import BatchOptions
+from vplog.batch.plan import DriveInput
 from vplog.batch.worker import Drive
 from vplog.errors import LogError, SettingsError
 from vplog.execution.execution import Execution
@@ -21,16 +21,17 @@ from vplog.maps.merge import natural_order
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import skip_damaged
 from vplog.maps.storage.damage import reading_drive
+from vplog.maps.storage.layout import ABOUT
 from vplog.pipeline import Pipeline
 from vplog.places.library_files import read_library_record
 from vplog.results import run_record
 from vplog.run.provenance import stored_log
 from vplog.run.reference_library import build_library
-from vplog.storage.json_records import canonical_json
-from vplog.storage.remote_path import local_copy, located
+from vplog.storage.remote_path import local_copy
 from vplog.storage.scratch import scratch
 
 if TYPE_CHECKING:
+    from vplog.batch.engine import BatchOptions
     from vplog.maps.storage.map_store import Store
 
 
@@ -51,7 +52,7 @@ def redescribe_map(
         damaged = {drive: Drive(drive, "", "failed", error=why) for drive, why in store.damaged.items()}
         _bring_caches(store.root, target)
     outcomes, missing, joined, join_error = [], damaged, None, ""
-    groups: dict[str, list[str]] = {}
+    inputs = dict[str, DriveInput]()
     for drive in natural_order(drives):
         log = drives[drive]["log"]
         try:
@@ -59,26 +60,25 @@ def redescribe_map(
                 raise LogError(
                     f"The map has places of it, and no log. Add its log to the map first: vplog batch LOG -o {root}"
                 )
-            stored_log(
+            path = stored_log(
                 log, "Its log", f"Put it back, and give the same command again, or add it: vplog batch LOG -o {target}"
             )
         except LogError as error:
             missing[drive] = Drive(drive, log, "failed", error=str(error))
         else:
-            groups.setdefault(canonical_json(topics[drive] or {}), []).append(drive)
+            choice = logs.TopicChoice.read(topics[drive] or {}, f"{root}: {drive}/run.json")
+            about = {name: drives[drive][name] for name in ABOUT[1:] if name in drives[drive]}
+            inputs[drive] = DriveInput(path, drive, choice, about)
     with _made(library, Pipeline.read(head.settings, f"{root}/map.json"), execution) as (folder, pipeline):
         if read_library_record(folder)["hash"] == head.library:
             raise SettingsError(f"{root} is described with {library} already. Give another library.")
-        for number, group in enumerate(groups.values()):
-            choice = logs.TopicChoice.read(topics[group[0]] or {}, f"{root}: {group[0]}/run.json")
-            paths = [located(drives[drive]["log"]) for drive in group]
-            last = replace(options or BatchOptions(), join=number + 1 == len(groups))
-            found = run_batch(paths, target, pipeline, folder, choice, execution, last)
+        if inputs:
+            found = run_batch(list(inputs.values()), target, pipeline, folder, None, execution, options)
             joined, join_error = found["joined"], found["join_error"]
-            outcomes += [{**one, "was": drive} for drive, one in zip(group, found["drives"], strict=True)]
+            outcomes += [{**one, "was": drive} for drive, one in zip(inputs, found["drives"], strict=True)]
         digest = read_library_record(folder)["hash"]
     outcomes += [{**asdict(lost), "was": drive} for drive, lost in missing.items()]
-    if missing and groups:  # else there is no map yet
+    if missing and inputs:  # else there is no map yet
         with map_store.writing(target) as store:
             write_failures(store, {drive: lost for drive, lost in missing.items() if drive not in store.drives()})
     return {

@@ -6,7 +6,7 @@ import os
 import platform
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,9 +15,10 @@ import numpy as np
 from vplog import logs
 from vplog.cache.input_hashes import hash_inputs
 from vplog.data import Keyframes
-from vplog.errors import VplogError
+from vplog.errors import VplogError, causes
 from vplog.execution.cores import limited
 from vplog.execution.execution import Execution
+from vplog.execution.process_limits import process_limits
 from vplog.execution.timing import peak_memory_mb
 from vplog.maps.import_places import write_places_run
 from vplog.maps.search.query import describe_log
@@ -29,6 +30,7 @@ from vplog.run import provenance
 from vplog.run.odometry import check_metric, is_metric
 from vplog.run.run_folder import CacheOptions
 from vplog.storage.remote_path import located
+from vplog.storage.urls import shown
 
 if TYPE_CHECKING:
     from vplog.logs import TopicChoice
@@ -54,6 +56,10 @@ class Task:
     """Stage cache of the drive, for another attempt; None for no cache."""
     keep_cache: bool = False
     """Whether it stays of a drive that is finished, too."""
+    time_s: float | None = None
+    """Longest time of an attempt; None for any."""
+    memory_mb: float | None = None
+    """Largest resident memory of an attempt, in MB (10^6 bytes); None for any."""
     in_parts: bool = False
     """Whether its frames are extracted on all machines at once: it is longer than all other drives together."""
 
@@ -64,8 +70,10 @@ class Outcome:
 
     error: str = ""
     """One line; none where all went well."""
-    retryable: bool = False
-    """Whether the cause of the error may be gone at another attempt."""
+    fault: str = ""
+    """Kind of the error: `input`, what is given cannot be used; `network`, `io` or `memory`, a machine could not read,
+    write or hold it; `worker`, its process or machine is gone; `time limit`, `memory limit`; `internal`, a fault of
+    vplog's own."""
     seconds: float = 0.0
     worker: str = ""
     """Machine and process; none of a worker that died."""
@@ -75,6 +83,11 @@ class Outcome:
     accepted: int = 0
     warnings: tuple[str, ...] = ()
 
+    @property
+    def retryable(self) -> bool:
+        """Whether the cause of the error may be gone at another attempt."""
+        return self.fault in ("network", "io", "memory", "worker")
+
 
 @dataclass(frozen=True)
 class Drive:
@@ -83,16 +96,23 @@ class Drive:
     drive: str
     log: str
     state: str
-    """`computed`, `unchanged` or `failed`."""
+    """`computed`, `unchanged` or `failed`; while it is computed `started`, or `retried` where it will be again."""
     attempts: int = 0
     """0 where nothing was to be done, or could be."""
     seconds: float = 0.0
     worker: str = ""
     peak_memory_mb: float = 0.0
     error: str = ""
+    fault: str = ""
     keyframes: int = 0
     accepted: int = 0
     warnings: Sequence[str] = ()
+
+    @classmethod
+    def after(cls, task: Task, state: str, attempts: int, outcome: Outcome) -> Drive:
+        """The drive of a task with this outcome of an attempt."""
+        names = (one.name for one in fields(cls)[4:])
+        return cls(task.drive, shown(task.log), state, attempts, **{name: getattr(outcome, name) for name in names})
 
 
 def made_by() -> dict[str, Any]:
@@ -102,14 +122,14 @@ def made_by() -> dict[str, Any]:
 
 def compute_drive(task: Task) -> Outcome:
     """Make the run folder of a drive, drive.json last; why not, in one line, where that fails."""
-    began, error, retryable, peak, found = time.perf_counter(), "", False, 0.0, dict[str, Any]()
+    began, error, fault, peak, found = time.perf_counter(), "", "", 0.0, dict[str, Any]()
     try:
         log = located(task.log)
-        with limited(task.threads):
+        with limited(task.threads), process_limits(task.time_s, task.memory_mb):
             record, own_name, drive = _compute(task, log)
         peak = record.get("totals", {}).get("peak_memory_mb", 0.0)
         if any(task.record["inputs"].get(name) != text for name, text in record["inputs"].items()):
-            error = f"{task.record['log']} changed while it was read. Run again when it is complete."
+            error, fault = f"{task.record['log']} changed while it was read. Run again when it is complete.", "input"
         else:
             if own_name != task.drive:
                 layout.set_drive_id(task.folder / "keyframes.parquet", task.drive)
@@ -118,17 +138,24 @@ def compute_drive(task: Task) -> Outcome:
             found = {"keyframes": counts["keyframes"], "accepted": counts["verdicts"].get("accepted", 0)}
             found["warnings"] = tuple(record["warnings"])
     except VplogError as problem:
-        error = str(problem)
+        error, fault = str(problem), "network" if _is_of_network(task.log, problem) else "input"
     except MemoryError:
-        error, retryable = "Out of memory. Use fewer --jobs, or a machine with more.", True
+        error, fault = "Out of memory. Use fewer --jobs, or a machine with more.", "memory"
     except OSError as problem:
         # another attempt may be on another machine, and finds what this one had done
-        error, retryable = f"Cannot read or write {problem.filename or 'a file'}: {problem.strerror or problem}.", True
+        error, fault = f"Cannot read or write {problem.filename or 'a file'}: {problem.strerror or problem}.", "io"
     except Exception as problem:  # a fault of ours in one drive must not stop the others
         text = " ".join(str(problem).split())[:200]
         error = f"Internal error: {type(problem).__name__}: {text}. `vplog run LOG --debug` shows where."
+        fault = "internal"
     seconds, worker = round(time.perf_counter() - began, 3), f"{platform.node()}:{os.getpid()}"
-    return Outcome(error, retryable, seconds, worker, max(peak, round(peak_memory_mb(), 1)), **found)
+    return Outcome(error, fault, seconds, worker, max(peak, round(peak_memory_mb(), 1)), **found)
+
+
+def _is_of_network(url: str, error: VplogError) -> bool:
+    """Whether an error of reading a remote log is that of its server, and not that it has no such file."""
+    kinds = [type(one) for one in causes(error) if isinstance(one, OSError)] if "://" in url else []
+    return any(not issubclass(kind, FileNotFoundError | PermissionError) for kind in kinds)
 
 
 def _compute(task: Task, path: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:

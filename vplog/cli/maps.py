@@ -100,6 +100,13 @@ def batch(arguments: argparse.Namespace) -> None:
     """Compute many recorded drives into one growing map, each drive in its own process, here or on a Ray cluster."""
     with Progress(arguments) as progress:
         found = call(api.batch, arguments, progress=progress, on_drive=progress.print_drive)
+    if arguments.dry_run:
+        print_result(arguments, found, printing.print_dry_run)
+        return
+    if arguments.metrics is not None:
+        from vplog.batch.metrics import write_metrics
+
+        write_metrics(arguments.metrics, found)
     drives = plural(len(found["drives"]), "drive")
     wrong = f"{found['failed']} of {drives} failed; `vplog map info {arguments.map}` has the reasons."
     _end(arguments, found, printing.print_batch, wrong)
@@ -313,14 +320,23 @@ def _add_workers(verb: argparse.ArgumentParser) -> None:
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     text = "HOST:PORT of a Ray cluster, or auto (default: one on this machine for the time of the batch)"
     option(sub, "--address", str, "HOST:PORT", text)
-    text = "retries of a drive whose worker was killed or had an I/O error (default: 2)"
+    text = "retries of a drive whose worker was killed, or had an error of network, disk or memory (default: 2)"
     option(sub, "--retries", parser.at_least(0), "N", text, default=2)
+    text = "longest time of a drive, which then fails; local processes only"
+    option(sub, "--drive-timeout", parser.positive, "S", text, dest="drive_timeout_s")
+    text = "largest resident memory of a drive in MB, as --drive-timeout"
+    option(sub, "--drive-memory", parser.positive, "MB", text, dest="drive_memory_mb")
 
 
 def _add_batch(sub: argparse.ArgumentParser) -> None:
-    option(sub, "logs", place, "LOG", "one drive each", nargs="+")
+    text = "one drive each, folders or prefixes of them, patterns, @LIST.txt, or a manifest: drives.csv, drives.parquet"
+    option(sub, "logs", place, "LOG", text, nargs="+")
     option(sub, "-o --map", place, "MAP", "folder, s3://, gs:// or az:// of the map", required=True)
     _add_workers(sub)
+    text = "write states, faults and seconds as Prometheus's textfile collector reads them"
+    option(sub, "--metrics", parser.output_file, "FILE.prom", text)
+    flag(sub, "--dry-run", "say which drives would be computed, with bytes, CPU hours and cost, and write nothing")
+    option(sub, "--cost-per-cpu-hour", parser.not_negative, "COST", "price of an hour of a core, for --dry-run")
     flag(sub, "--no-join", "do not look for closures between the drives at the end", "join")
     text = "cache results of stages, 0.35 MB a keyframe, so that other settings read no images; local maps only"
     flag(sub, "--keep-cache", text)

@@ -237,6 +237,20 @@ def print_evaluation(found: dict[str, Any]) -> None:
             print_line("", f"{what} (mean of {drift['segments']} segments of {ends} of path)")
 
 
+def print_evaluated_map(found: dict[str, Any]) -> None:
+    def figures(one: dict[str, Any]) -> list[str]:
+        known = [(one[name], form) for name, form in (("ate_m", ".3f"), ("recall", ".3f"), ("false_closures", "d"))]
+        return ["" if value is None else f"{value:{form}}" for value, form in known]
+
+    rows = [
+        (one["drive"], " ".join(map("=".join, one["tags"].items())), one["vplog"] or "", *figures(one), one["error"])
+        for one in found["drives"]
+    ]
+    print_table(("drive", "tags", "vplog", "ATE m", "recall", "false", "error"), rows)
+    groups = [(name, str(one["drives"]), *figures(one)) for name, one in found["groups"].items()]
+    print_table(("mean of", "drives", "ATE m", "recall", "false"), groups)
+
+
 def _truth_notes(found: dict[str, Any]) -> list[str]:
     """Warnings about the truth that bear on the figures."""
     truth, notes = found.get("truth_is"), []
@@ -338,6 +352,8 @@ def print_optimised(found: dict[str, Any]) -> None:
     print(f"  {sum(found['seconds'].values()):.2f} s")
 
 
+_SIZES = (("bytes", "d"), ("images", "d"), ("seconds", ".1f"))
+"""Columns of the table of a dry run, with their formats."""
 _BATCH_COSTS = (("seconds", 1), ("peak_memory_mb", 0))
 """Cost columns of the table of a batch, with their decimals."""
 
@@ -368,6 +384,27 @@ def print_batch(found: dict[str, Any]) -> None:
     print_next(look, f"vplog map info {named}", f"vplog map query {named} LOG")
 
 
+def print_dry_run(found: dict[str, Any]) -> None:
+    rows = [
+        (
+            one["drive"], one["state"], *(f"{one[name]:{form}}" if one["images"] else "" for name, form in _SIZES),
+            " ".join(map("=".join, one["tags"].items())), one["error"],
+        )
+        for one in found["drives"]
+    ]  # fmt: skip
+    print_table(("drive", "would", "bytes", "images", "seconds", "tags", "error"), rows)
+    known = found["cpu_seconds_from"]
+    source = f"as {plural(known, 'drive')} of the map took" if known else "as no drive of the map says otherwise"
+    print_line(
+        f"{found['map']}:",
+        f"{found['compute']} of {plural(len(found['drives']), 'drive')} to compute, {found['bytes'] / 1e9:.3g} GB, "
+        f"{plural(found['images'], 'image')}",
+    )
+    print_line("takes", f"{found['cpu_hours']:.3g} CPU hours, {found['cpu_seconds_per_image']:.3g} s an image {source}")
+    if found["cost"] is not None:
+        print_line("costs", f"{found['cost']:.2f}")
+
+
 def print_map(found: dict[str, Any]) -> None:
     known = found["library"]
     each = "" if found["bytes_per_place"] is None else f", {found['bytes_per_place']:g} bytes a place"
@@ -387,8 +424,8 @@ def print_map(found: dict[str, Any]) -> None:
     for drive in found["drives"]:
         counts = (str(drive[name]) for name in ("keyframes", "candidates", "accepted"))
         costs = (f"{value or 0:.1f}" for value in (drive["bytes"] / 1e6, drive["seconds"], drive["peak_memory_mb"]))
-        rows.append((drive["drive"], *counts, *costs))
-    print_table(("drive", "keyframes", "candidates", "accepted", "MB", "seconds", "peak MB"), rows)
+        rows.append((drive["drive"], *counts, *costs, " ".join(map("=".join, drive["tags"].items()))))
+    print_table(("drive", "keyframes", "candidates", "accepted", "MB", "seconds", "peak MB", "tags"), rows)
     for drive, failure in found["failures"].items():
         print_status(f"failed: {drive}: {failure['error']}")
     warn(found["problems"])

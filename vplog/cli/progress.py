@@ -220,9 +220,15 @@ class Progress:
         )
 
     def print_drive(self, drive: Drive) -> None:
-        """An event for each drive of a batch; where there are no bars a line, as in the log of a job of the night."""
-        about = {"state": drive.state, "seconds": drive.seconds, "error": without_secrets(drive.error) or None}
-        self._events.write("drive_finished", drive=drive.drive, **about)
+        """An event for each change of a drive of a batch; where there are no bars a line as it ends or is tried again,
+        as in the log of a job of the night."""
+        about: dict[str, Any] = {"drive": drive.drive, "log": drive.log, "attempt": drive.attempts}
+        if drive.state == "started":
+            self._events.write("drive_started", **about)
+            return
+        about |= {"state": drive.state, "seconds": drive.seconds, "peak_memory_mb": drive.peak_memory_mb}
+        about |= {"error": without_secrets(drive.error) or None, "fault": drive.fault or None}
+        self._events.write("drive_retried" if drive.state == "retried" else "drive_finished", **about)
         if self._line_by_line:
             print_status(
                 f"{drive.drive}: {drive.state}, {drive.seconds:.1f} s{f': {drive.error}' if drive.error else ''}"

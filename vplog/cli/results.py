@@ -40,10 +40,16 @@ _BINARY = ("geoparquet", "rrd")
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
-    """Evaluate a run, of one or several drives, against ground truth."""
+    """Evaluate a run, of one or several drives, or the drives of a map against ground truth."""
+    from vplog.verbs.evaluate_run import FIGURES, broken_limits
+    from vplog.verbs.limits import read_limits
+
+    limits = read_limits(arguments.fail_on, FIGURES, "limit of a figure and a number: 'ate_m>1', 'recall<0.5'")
     with one_stage(arguments, "evaluate"):
-        found = call(api.evaluate, arguments)
-    print_result(arguments, found, printing.print_evaluation)
+        found = call(api.evaluate, arguments, run=arguments.place)
+    print_result(arguments, found, printing.print_evaluated_map if "groups" in found else printing.print_evaluation)
+    if sentences := broken_limits(found, limits):
+        raise ResultError(" ".join(sentences))
 
 
 def explain(arguments: argparse.Namespace) -> None:
@@ -181,8 +187,11 @@ def add_results(
     add: Callable[..., argparse.ArgumentParser], topics: argparse.ArgumentParser, threads: argparse.ArgumentParser
 ) -> None:
     sub = add("evaluate", evaluate, topics)
-    option(sub, "run", place, "RUN")
-    option(sub, "--truth", str, "FILE.tum|gps|auto", _TRUTH, required=True)
+    option(sub, "place", place, "RUN|MAP")
+    text = f"{_TRUTH} (default: auto); of a map also a manifest with a column truth"
+    option(sub, "--truth", str, "FILE.tum|gps|auto", text, default="auto")
+    text = "exit status 1 where a drive fails this, as 'ate_m>1' or 'recall<0.5'; repeatable"
+    option(sub, "--fail-on", str, "LIMIT", text, action="append", default=[])
     _add_truth_options(sub)
     _add_explain(add("explain", explain))
     sub = add("ask", ask)

@@ -49,15 +49,15 @@ def read_table(path: Path) -> tuple[list[str], list[tuple[str, str, str]]]:
 def read_lines(
     path: Path, headers: Sequence[list[str]], form: str = _CSV, error: type[VplogError] = TruthError
 ) -> Iterator[tuple[str, list[str]]]:
-    """The place in the file and the cells of each line of a CSV that is not blank: its header, one of these, and others
-    as long. `form` ends each message.
+    """The place in the file and the cells of each line of a CSV that is not blank: its header, one of these unless
+    there are none, and others as long. `form` ends each message.
 
     Raises `error` with the first line that does not fit, or where the file cannot be read.
     """
     number, width = 0, 0
     try:
         if path.stat().st_size > _FILE_BYTES:
-            raise error(f"{path} is larger than {_FILE_BYTES // 2**20} MB, so it is no table of pairs. {form}")
+            raise error(f"{path} is larger than {_FILE_BYTES // 2**20} MB, so it is no such table. {form}")
         with path.open(encoding="utf-8-sig", newline="") as lines:
             while line := lines.readline(_LINE_LIMIT):
                 number += 1
@@ -66,7 +66,7 @@ def read_lines(
                 if not line.strip():
                     continue
                 cells = [cell.strip() for cell in next(csv.reader([line]))]
-                if not width and cells not in headers:
+                if not width and headers and cells not in headers:
                     raise error(f"{path}:{number} is not the header. {form}")
                 if width and len(cells) != width:
                     raise error(f"{path}:{number} does not hold {width} fields. {form}")

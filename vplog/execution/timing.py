@@ -36,7 +36,10 @@ class StageTimer:
 
     def totals(self) -> dict[str, float]:
         return {
-            "seconds": round(sum(stage["seconds"] for stage in self.stages.values()), 3),
+            **{
+                name: round(sum(stage[name] for stage in self.stages.values()), 3)
+                for name in ("seconds", "cpu_seconds")
+            },
             "peak_memory_mb": max((stage["peak_memory_mb"] for stage in self.stages.values()), default=0.0),
         }
 

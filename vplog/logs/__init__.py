@@ -12,7 +12,8 @@ if TYPE_CHECKING:
 
     from vplog.stages import Log
 
-__all__ = ["EVERY_IMAGE", "TopicChoice", "check", "is_image_file", "open", "open_drive", "open_images"]
+__all__ = ["EVERY_IMAGE", "TopicChoice", "below", "check", "is_image_file", "open", "open_drive", "open_images"]
+__all__ += ["summary"]
 
 
 def open(path: Path, topics: TopicChoice | None = None) -> Log:
@@ -30,12 +31,26 @@ def check(path: Path) -> None:
     check_log(path)
 
 
+def below(path: Path) -> list[Path]:
+    """The logs in a folder, or on an object store under a prefix; the path itself where it is one drive."""
+    from vplog.logs.detect import logs_below
+
+    return logs_below(path)
+
+
 def open_drive(paths: Sequence[Path], topics: TopicChoice | None = None) -> Log:
     """One drive recorded in several files, in any order. Raises LogError where they overlap in time, lie far apart,
     differ in kind or have no topic in common."""
     from vplog.logs.detect import open_drive as open_parts
 
     return open_parts(paths, topics or TopicChoice())
+
+
+def summary(path: Path, topics: TopicChoice | None = None) -> tuple[int, float]:
+    """Images of the camera in use and s of the log at `path`, as its index has them. Raises LogError."""
+    from vplog.logs.detect import open_log
+
+    return open_log(path, topics or TopicChoice()).summary()
 
 
 def open_images(files: Sequence[Path], topics: TopicChoice | None = None) -> Log:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import weakref
 from contextlib import ExitStack
 from itertools import pairwise
@@ -30,7 +31,7 @@ from vplog.logs.formats.sqlite_bag import SqliteBag
 from vplog.logs.messages.records import kind_of
 from vplog.logs.recorded_log import RecordedLog
 from vplog.logs.topic_selection import EVERY_IMAGE
-from vplog.storage.remote_path import RemotePath, located
+from vplog.storage.remote_path import RemotePath, located, names_below
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,13 +39,14 @@ if TYPE_CHECKING:
     from vplog.logs.datasets.streams import DataSet
     from vplog.logs.formats.container import Container, Contents
     from vplog.logs.topic_selection import TopicChoice
-    from vplog.stages import Log
 
 _RESULTS = {"run.json": "a run", "map.json": "a map", "library.json": "a library"}
 _MAGIC = {mcap_file.MAGIC: "mcap", ros1_bag.MAGIC: "ros1", sqlite_bag.MAGIC: "db3", b"\x28\xb5\x2f\xfd": "zstd"}
 _READERS = {"mcap": McapFile, "ros1": Ros1Bag, "db3": SqliteBag}
 _KINDS = {"mcap": "mcap", "ros1": "ros1", "db3": "ros2-db3"}
 _DATA_SETS = (kitti, euroc, vslam_lab, tum_rgbd, colmap, utm_images)
+_LOG_NAME = re.compile(r"\.(mcap|bag|db3)(\.zstd?)?$", re.IGNORECASE)
+"""Names of logs among other files: to look into each of a bucket costs a request."""
 _LISTED = 5
 """Files that an error lists."""
 _DEEPEST, _MOST_FILES = 4, 10**6
@@ -59,7 +61,7 @@ _KNOWN = (
 )
 
 
-def open_log(path: Path, choice: TopicChoice) -> Log:
+def open_log(path: Path, choice: TopicChoice) -> RecordedLog:
     """The log at `path`. Raises LogError where there is none that vplog reads."""
     path, notes = located(path), Notes()
     try:
@@ -86,6 +88,36 @@ def check_log(path: Path) -> None:
         raise _unreadable(path, error) from None
 
 
+def logs_below(path: Path) -> list[Path]:
+    """The logs in a folder by their names, a few levels deep: bags, folders of bags, data sets. The path itself where
+    it is one drive, or nothing is found there or can be read, as opening it says."""
+    path = located(path)
+    try:
+        if _LOG_NAME.search(path.name) or not path.is_dir() or len(_data_sets(path)) == 1:
+            return [path]
+        found = _logs_below(path, _DEEPEST)
+    except OSError:
+        return [path]
+    return found if found and found != [path / found[0].name] else [path]
+
+
+def _logs_below(folder: Path, levels: int) -> list[Path]:
+    remote = isinstance(folder, RemotePath)
+    inside = names_below(folder) if remote else {one.name: one.is_dir() for one in folder.iterdir()}
+    names = sorted((name for name in inside if not name.startswith(".")), key=image_folder.natural_order)
+    if "metadata.yaml" in names:
+        return [folder]
+    if _RESULTS.keys() & names:  # of vplog's own
+        return []
+    if roots := [] if remote else [root for one in _DATA_SETS for root in one.roots(folder)]:
+        return roots
+    logs = [folder / name for name in names if not inside[name] and _LOG_NAME.search(name)]
+    if len(logs) > 1 and split_parts(logs) is not None:
+        return [folder]
+    below = [folder / name for name in names if inside[name]] if levels else []
+    return [*logs, *(log for one in below for log in _logs_below(one, levels - 1))]
+
+
 def _unreadable(path: Path, error: OSError) -> LogError:
     reason = error.strerror or " ".join(str(error).split())[:300].rstrip(".")
     return LogError(f"Cannot read {path}: {reason}. Check the path and its permissions.")
@@ -98,7 +130,7 @@ def _check_there(path: Path) -> None:
         raise LogError(f"{path} is neither a file nor a folder. A log is {_KNOWN}.")
 
 
-def _open_file(path: Path, choice: TopicChoice, notes: Notes) -> Log:
+def _open_file(path: Path, choice: TopicChoice, notes: Notes) -> RecordedLog:
     if not _magic(path) and video.is_video(path):
         if isinstance(path, RemotePath):
             raise LogError(f"{path} is a video, and videos are read from local files. Copy it to this machine.")
@@ -107,7 +139,7 @@ def _open_file(path: Path, choice: TopicChoice, notes: Notes) -> Log:
     return _recorded(path, _name(path), _KINDS[kind], container, notes, choice)
 
 
-def _published(path: Path, name: str, found: DataSet, notes: Notes, choice: TopicChoice) -> Log:
+def _published(path: Path, name: str, found: DataSet, notes: Notes, choice: TopicChoice) -> RecordedLog:
     return _recorded(path, name, found.kind, DataSetContainer(found, notes), notes, choice)
 
 
@@ -146,7 +178,7 @@ class _Part(NamedTuple):
     contents: Contents
 
 
-def open_drive(paths: Sequence[Path], choice: TopicChoice) -> Log:
+def open_drive(paths: Sequence[Path], choice: TopicChoice) -> RecordedLog:
     """Files of one drive, given in any order, as one log. Raises LogError where they cannot be."""
     paths = [located(path) for path in paths]
     if len(paths) == 1:
@@ -199,7 +231,7 @@ def _in_order_of_time(parts: list[_Part]) -> list[_Part]:
     return parts
 
 
-def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> Log:
+def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> RecordedLog:
     problem = None
     if (path / "metadata.yaml").is_file():
         try:
@@ -240,7 +272,7 @@ def _data_sets(path: Path) -> list[Path]:
     return []
 
 
-def open_images(files: Sequence[Path], choice: TopicChoice) -> Log:
+def open_images(files: Sequence[Path], choice: TopicChoice) -> RecordedLog:
     """Files of images as one log, each once, in natural order of their names or by the times in them."""
     paths = [located(file) for file in dict.fromkeys(files)]
     for path in paths:
@@ -282,7 +314,7 @@ def _files_below(path: Path) -> list[Path]:
     return sorted(found)
 
 
-def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice, notes: Notes) -> Log:
+def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice, notes: Notes) -> RecordedLog:
     """The logs of a folder without usable metadata."""
     if len(logs) == 1 and _magic(logs[0]) == "ros1":
         return _open_file(logs[0], choice, notes)
@@ -294,7 +326,7 @@ def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice,
     return _open_bag(path, Metadata(parts, [], {}, 0, 0), choice, notes)
 
 
-def _open_bag(folder: Path, metadata: Metadata, choice: TopicChoice, notes: Notes) -> Log:
+def _open_bag(folder: Path, metadata: Metadata, choice: TopicChoice, notes: Notes) -> RecordedLog:
     """A ROS 2 bag of several storage files. An unreadable one is left out as long as another is sound."""
     name = folder.resolve().name
     parts: list[tuple[Container, str]] = []

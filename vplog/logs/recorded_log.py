@@ -63,6 +63,11 @@ class RecordedLog:
         """Losses counted so far; complete once the log was read."""
         return self.account.losses
 
+    def summary(self) -> tuple[int, float]:
+        """Images of the camera and s, as the index of the container has them: no message is read."""
+        contents, image = self._contents, self._selection.image
+        return 0 if image is None else contents.counts[image], (contents.end_ns - contents.start_ns) / 1e9
+
     def info(self) -> LogInfo:
         """Reads the chosen topics once, so that the warnings are complete."""
         content = self._content

@@ -43,6 +43,13 @@ EVERY_IMAGE = "*"
 SOURCES = ("twist", "gps", "truth", "visual", "lidar")
 """Odometry that no topic is chosen for: velocities added up, positions of fixes, the ground truth of a data set, and
 that of the images and of a lidar, which a run computes."""
+OPTIONS = {
+    "image": "image-topic", "depth": "depth-topic", "right": "right-topic", "camera_info": "camera-info-topic",
+    "odometry": "odometry-topic", "gps": "gps-topic", "odometry_file": "odometry-file",
+    "calibration_file": "calibration", "imu": "imu-topic", "start_s": "start", "stop_s": "stop",
+    "mask": "mask-topic", "wheelbase_m": "wheelbase-m", "track_m": "track-m", "wheel_radius_m": "wheel-radius-m",
+}  # fmt: skip
+"""Option of the command line for each field of TopicChoice."""
 _NO_LIDAR = re.compile(r"depth|camera|stereo|radar|map|cluster|obstacle|segment|ground|filtered", re.IGNORECASE)
 """Words in the names of clouds of other sensors, and of what was computed from a lidar's."""
 

@@ -100,6 +100,7 @@ def _drive(store: Store, drive: str, about: dict[str, Any]) -> dict[str, Any]:
         return {
             "drive": drive,
             "log": about["log"],
+            "tags": about.get("tags", {}),
             "keyframes": store.rows("keyframes", drive),
             "places": store.rows("descriptors", drive),
             "candidates": store.rows("closures", drive),

@@ -141,6 +141,19 @@ def build_library(
     *,
     force: bool = True,
 ) -> PlaceState:
+    """`library_of_logs` of the logs at these paths, opened with the same topics."""
+    return library_of_logs([logs.open(path, topics) for path in paths], out, pipeline, execution, warn, force=force)
+
+
+def library_of_logs(
+    opened: Sequence[Log],
+    out: Path,
+    pipeline: Describing,
+    execution: Execution = Execution(),
+    warn: Callable[[str], object] = lambda _: None,
+    *,
+    force: bool = True,
+) -> PlaceState:
     """A library of frames of the logs: an equal share of each, or by coverage those that explain the frames of all.
 
     `warn` gets what the logs warn of, once they are read. A library that `out` holds stays until the new one is whole;
@@ -148,7 +161,6 @@ def build_library(
     Raises VplogError where that cannot be.
     """
     references: list[Reference] = []
-    opened = [logs.open(path, topics) for path in paths]
     by_coverage = pipeline.library.choose == "coverage"
     with staged(out, lambda: _library_in(out, None if force else opened)) as made:
         wanted = _stamps_by_coverage(opened, pipeline, execution) if by_coverage else _shares(opened, pipeline)

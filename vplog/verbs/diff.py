@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog.data import USED
-from vplog.errors import ResultError, SettingsError, nearest
+from vplog.errors import ResultError, SettingsError
 from vplog.geometry import se3
 from vplog.results import run_record, tables
 from vplog.results.html import mapping
 from vplog.results.report.page import Changes
 from vplog.run.report import write_report
 from vplog.storage.json_records import differences
-from vplog.verbs.evaluate_run import TruthOptions, evaluate
+from vplog.verbs import evaluate_run
+from vplog.verbs.evaluate_run import TruthOptions, evaluate, figures_of
+from vplog.verbs.limits import Limit, read_limits
 from vplog.verbs.report import judge
 
 if TYPE_CHECKING:
@@ -25,21 +26,12 @@ if TYPE_CHECKING:
     from vplog import logs
     from vplog.data import Floats
 
-_LIMIT = re.compile(r"([a-z_]+)([<>]=?)([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d{1,2})?)(%?)")
-_SCORES = {
-    "ate_m": ("ate_after", "rmse_m"),
-    "rpe_m": ("rpe_after", "translation_rmse_m"),
-    "drift_m": ("drift_after", "translation_m"),
-    "precision": ("closures", "precision"),
-    "recall": ("closures", "recall"),
-    "average_precision": ("closures", "average_precision"),
-}
-"""Figures against a truth, and where `evaluate` has them."""
 _OF_RECORD = {
     "candidates": ("counts", "candidates"),
     "seconds": ("totals", "seconds"),
     "memory_mb": ("totals", "peak_memory_mb"),
 }
+_SCORES = evaluate_run.FIGURES
 FIGURES = (*_SCORES, "accepted", "gained", "lost", "moved_m", "moved_deg", *_OF_RECORD)
 _LIMITED = (*FIGURES, "drives", "joins", "joint_frames")
 """Names of the figures that limits are of, those of maps among them."""
@@ -75,9 +67,7 @@ def diff(
     figures |= {name: (0, change) for name, change in changes.items()}
     if truth is not None:
         scores = [evaluate(folder, truth, topics, options) for folder in folders]
-        figures |= {
-            name: [mapping(one.get(part)).get(field) for one in scores] for name, (part, field) in _SCORES.items()
-        }
+        figures |= {name: [figures_of(one)[name] for one in scores] for name in _SCORES}
     return {
         "baseline": str(baseline),
         "run": str(run),
@@ -116,33 +106,25 @@ def write_page(
     write_report(run, record, path, judged, changes=Changes(found, at, [changes.get(pair) for pair in pairs]))
 
 
-def check_limits(limits: Sequence[str]) -> None:
-    """Raises SettingsError for the first limit that is none: a figure, < <= > or >=, and a number or percentage."""
-    for limit in limits:
-        found = _LIMIT.fullmatch(limit.replace(" ", ""))
-        if found is None or found[1] not in _LIMITED:
-            near = "" if found is None else nearest(found[1], _LIMITED)
-            raise SettingsError(
-                f"--fail-on {limit!r} is no limit of a change.{near} Write a figure, < <= > or >=, and a number, or a "
-                f"percentage of the baseline: 'recall<-0.01', 'seconds>20%'. Figures: {', '.join(_LIMITED)}."
-            )
+def check_limits(limits: Sequence[str]) -> list[Limit]:
+    """The limits of changes. Raises SettingsError for the first that is none."""
+    what = "limit of a change, a number or a percentage of the baseline: 'recall<-0.01', 'seconds>20%'"
+    return read_limits(limits, _LIMITED, what, percent=True)
 
 
 def exceeded(found: dict[str, Any], limits: Sequence[str]) -> list[str]:
     """A sentence for each limit that the changes of a diff fail. Raises SettingsError for one that cannot be judged."""
-    check_limits(limits)
     sentences = []
-    for limit in limits:
-        name, operator, number, percent = _LIMIT.fullmatch(limit.replace(" ", "")).groups()  # pyrefly: ignore[missing-attribute]
-        before, after, change = found["figures"].get(name, (None, None, None))
-        if change is None or (percent and not before):
-            why = " Give --truth." if name in _SCORES and name not in found["figures"] else ""
-            raise SettingsError(f"--fail-on {limit!r}: the change of {name} is not known ({before} to {after}).{why}")
-        value = 100.0 * change / abs(before) if percent else change
-        bound = float(number)
-        fails = {"<": value < bound, "<=": value <= bound, ">": value > bound, ">=": value >= bound}[operator]
-        if fails:
-            sentences.append(f"{name} changed by {value:+.4g}{percent}, from {before:.6g} to {after:.6g} ({limit}).")
+    for limit in check_limits(limits):
+        before, after, change = found["figures"].get(limit.name, (None, None, None))
+        if change is None or (limit.percent and not before):
+            why = " Give --truth." if limit.name in _SCORES and limit.name not in found["figures"] else ""
+            text = f"the change of {limit.name} is not known ({before} to {after})"
+            raise SettingsError(f"--fail-on {limit.text!r}: {text}.{why}")
+        value = 100.0 * change / abs(before) if limit.percent else change
+        if limit.fails(value):
+            moved = f"{value:+.4g}{limit.percent}, from {before:.6g} to {after:.6g}"
+            sentences.append(f"{limit.name} changed by {moved} ({limit.text}).")
     return sentences
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog.data import Closures, Floats, Gps, Keyframes, Trajectory
-from vplog.errors import ResultError, TruthError
+from vplog.errors import ResultError, SettingsError, TruthError
 from vplog.evaluate import closures, trajectory
 from vplog.evaluate.body_truth import BodyTruth, body_truth
 from vplog.evaluate.closure_pose import pose_bounds
@@ -22,9 +22,23 @@ from vplog.storage.folders import is_below
 from vplog.storage.urls import shown
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from vplog import logs
+    from vplog.verbs.limits import Limit
 
 
+_FIGURES = {
+    "ate_m": ("ate_after", "rmse_m"),
+    "rpe_m": ("rpe_after", "translation_rmse_m"),
+    "drift_m": ("drift_after", "translation_m"),
+    "precision": ("closures", "precision"),
+    "recall": ("closures", "recall"),
+    "average_precision": ("closures", "average_precision"),
+    "false_closures": ("closures", "accepted_false"),
+}
+FIGURES = tuple(_FIGURES)
+"""Names of the figures of a run against the truth."""
 _PUT_BACK = "Put it back there, or give a truth file: --truth FILE.tum."
 
 
@@ -76,6 +90,26 @@ def evaluate(
     if isinstance(known, Trajectory) or truth not in ("gps", "auto"):
         return evaluate_poses(folder, record, truth, options, known if isinstance(known, Trajectory) else None).record
     return {"truth": truth, **_against_gps(folder, record, topics, options, known)}
+
+
+def figures_of(found: dict[str, Any]) -> dict[str, Any]:
+    """The figures of what `evaluate` found of one drive, by name; None where there is none."""
+    return {name: (found.get(part) or {}).get(field) for name, (part, field) in _FIGURES.items()}
+
+
+def broken_limits(found: dict[str, Any], limits: Sequence[Limit]) -> list[str]:
+    """A sentence for each limit that a drive fails of a run, a joint run or a map. Raises SettingsError for a limit of
+    a figure that no drive has."""
+    rows = found["drives"] if "drives" in found else [one for each in found.get("maps", ()) for one in each["drives"]]
+    rows = [{**figures_of(one), **one} for one in rows or [found]]
+    sentences = []
+    for limit in limits:
+        known = [(one.get("drive", "The run"), one[limit.name]) for one in rows if one[limit.name] is not None]
+        if not known:
+            raise SettingsError(f"--fail-on {limit.text!r}: {limit.name} is not known. Give a TUM file with --truth.")
+        failed = [(who, value) for who, value in known if limit.fails(value)]
+        sentences += [f"{who} has {limit.name} {value:.6g} ({limit.text})." for who, value in failed]
+    return sentences
 
 
 def log_truth(record: dict[str, Any], topics: logs.TopicChoice | None, options: TruthOptions) -> Trajectory | Gps:

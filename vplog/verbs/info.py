@@ -20,6 +20,7 @@ from vplog.logs.clocks import GAP_NS, GAP_PERIODS
 from vplog.logs.image_folder import PERIOD_NS
 from vplog.logs.odometry_sources import PROPERTIES, evidence_text
 from vplog.logs.stamps import rate_hz
+from vplog.logs.topic_selection import OPTIONS
 from vplog.results.html import render
 from vplog.results.previews import jpeg
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
@@ -44,13 +45,6 @@ _MOST_TRIED = 4
 """Other topics that are tried where those chosen do not work: each reads the log again."""
 _MOST_GAPS = 20
 """Gaps that are listed, the longest."""
-_OPTIONS = {
-    "image": "image-topic", "depth": "depth-topic", "right": "right-topic", "camera_info": "camera-info-topic",
-    "odometry": "odometry-topic", "gps": "gps-topic", "odometry_file": "odometry-file",
-    "calibration_file": "calibration", "imu": "imu-topic", "start_s": "start", "stop_s": "stop",
-    "mask": "mask-topic", "wheelbase_m": "wheelbase-m", "track_m": "track-m", "wheel_radius_m": "wheel-radius-m",
-}  # fmt: skip
-"""Option of the command line for each field of TopicChoice."""
 _CAMERA = ("name", "width", "height", "matrix", "distortion_model", "distortion", "body_from_camera", "baseline_m")
 _PART_WORDS = {
     "image": "camera",
@@ -174,8 +168,8 @@ def _use(used: bool, possible: bool) -> str:
 
 def command(path: Path, topics: TopicChoice) -> str:
     """The command that runs on this log with these topics."""
-    chosen = {name: value for name, value in topics if name in _OPTIONS and value is not None}
-    options = [f"--{_OPTIONS[name]} {shlex.quote(str(value))}" for name, value in chosen.items()]
+    chosen = {name: value for name, value in topics if name in OPTIONS and value is not None}
+    options = [f"--{OPTIONS[name]} {shlex.quote(str(value))}" for name, value in chosen.items()]
     options += [f"--mask {shlex.quote(f'{name}={path}' if name else str(path))}" for name, path in topics.masks.items()]
     log = "LOG" if address(path) != str(path) else shlex.quote(str(path))  # a URL with its query is shown nowhere
     return " ".join(["vplog run", log, "-o OUT", *options])

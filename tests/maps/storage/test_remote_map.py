@@ -261,7 +261,7 @@ def test_writers_do_not_exclude_each_other(root: Any) -> None:
     with map_store.writing(root) as a, map_store.writing(root) as b:
         put(a, "three", 3)
         put(b, "four", 4)
-        map_store.relocate(a, "two", "elsewhere.mcap")
+        map_store.annotate(a, "two", {"log": "elsewhere.mcap"})
         b.update_failures({"bad": {"log": "bad.mcap", "error": "b"}})
         a.update_failures({"worse": {"log": "worse.mcap", "error": "a"}})
         map_store.remove(b, ["one"])
@@ -281,7 +281,7 @@ def test_what_two_writers_do_to_one_drive(root: Any) -> None:
         with pytest.raises(ResultError, match="Another writer has replaced one in"):
             put(b, "one", 3)
         with pytest.raises(ResultError, match="replaced one in"):
-            map_store.relocate(b, "one", "elsewhere.mcap")
+            map_store.annotate(b, "one", {"log": "elsewhere.mcap"})
         put(a, "new", 4)
         put(b, "new", 4)
         assert entry(root, "new") == a.mirror.drives["new"], "made from the same"  # pyrefly: ignore[missing-attribute]

@@ -33,7 +33,9 @@ PICTURES = "pictures"
 DESCRIBED_WITH = "described_with"
 """Field in drive.json of a drive whose places were made with a larger library than the map has since it was condensed:
 the hash of that one, by which its key and its joins are known."""
-_NOT_IN_KEY = ("key", "log", "earth", "format", "files", PICTURES, DESCRIBED_WITH)
+ABOUT = ("log", "tags", "truth")
+"""Fields in drive.json of what is known of a drive: where its log is, texts by name, and its ground truth."""
+_NOT_IN_KEY = (*ABOUT, "key", "earth", "format", "files", PICTURES, DESCRIBED_WITH)
 """Fields of drive.json that its key does not depend on."""
 _MOST_NAME = 200
 """Characters of a drive's name in a file's; what stands around them takes up to thirty more."""

@@ -20,13 +20,13 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vplog.errors import LibraryError, ResultError, SettingsError, VplogError
 from vplog.maps.storage import local, upload
 from vplog.maps.storage.contents import Head, Store, common_library
 from vplog.maps.storage.damage import UnreachableError, complete_record, damaged_table
-from vplog.maps.storage.layout import HASH, TABLES, folder_name, free_name, renamed, set_drive_id
+from vplog.maps.storage.layout import HASH, RUN_TABLES, TABLES, folder_name, free_name, renamed, set_drive_id
 from vplog.maps.storage.remote_map import Mirror
 from vplog.results import run_record
 from vplog.storage.folders import check_regular, regular_files
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from vplog.maps.storage.download_cache import Cache
 
 __all__ = ["TABLES", "Head", "Store", "add_library", "common_library", "folder_name", "publish", "reading", "remove"]
-__all__ += ["relocate", "writing"]
+__all__ += ["RUN_TABLES", "annotate", "writing"]
 
 
 @contextmanager
@@ -119,17 +119,17 @@ def publish(store: Store, drive: str, made: Path) -> str:
         return publish(store, free, made)
 
 
-def relocate(store: Store, drive: str, log: str) -> None:
-    """Note where the log of a drive is now, if it was moved; nothing else of the drive depends on it. Raises
-    ResultError."""
+def annotate(store: Store, drive: str, about: dict[str, Any]) -> None:
+    """Note fields of drive.json that nothing else of the drive depends on (`layout.ABOUT`), if they are others now.
+    Raises ResultError."""
     record = store.record(drive)
-    if record["log"] == log:
+    if {**record, **about} == record:
         return
     if store.mirror is None:
         path = store.root / "runs" / folder_name(drive) / "drive.json"
-        run_record.write_run_json(path, {**record, "log": log})
+        run_record.write_run_json(path, {**record, **about})
     else:
-        upload.relocate(store.mirror, drive, log)
+        upload.annotate(store.mirror, drive, about)
 
 
 def remove(store: Store, drives: Sequence[str]) -> None:

@@ -156,15 +156,15 @@ def _remove_quietly(place: RemotePath) -> None:
         objects.remove(place)
 
 
-def relocate(mirror: Mirror, drive: str, log: str) -> None:
-    """Note another place of the drive's log. Raises ResultError."""
+def annotate(mirror: Mirror, drive: str, about: dict[str, Any]) -> None:
+    """Change fields of drive.json that nothing else depends on. Raises ResultError."""
 
     def change(snapshot: Snapshot) -> None:
         _check_untouched(mirror, snapshot, drive)
         if entry := snapshot["drives"].get(drive):
-            snapshot["drives"][drive] = {**entry, "record": {**entry["record"], "log": log}}
+            snapshot["drives"][drive] = {**entry, "record": {**entry["record"], **about}}
 
-    mirror.commit(f"log of {drive}", change)
+    mirror.commit(f"{', '.join(about)} of {drive}", change)
     mirror.drives[drive] = mirror.manifest.now["drives"].get(drive, mirror.drives[drive])
 
 

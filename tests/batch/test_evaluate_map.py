@@ -1,0 +1,55 @@
+"""Drives of a map against their truth."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+import vplog
+from vplog.maps.storage import map_store
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from conftest import Said
+
+    from vplog.demo.record import Drive
+
+
+def test_drives_are_evaluated_each_and_by_tag(
+    halves: Path, drive: Drive, tmp_path: Path, verb: Callable[..., Said]
+) -> None:
+    root, manifest = Path(shutil.copytree(halves, tmp_path / "map")), tmp_path / "drives.csv"
+    tags = {"before": {"light": "day"}, "after": {"light": "night", "vehicle": "v1"}}
+    with map_store.writing(root) as store:
+        for name, own in tags.items():
+            map_store.annotate(store, name, {"tags": own, "truth": str(drive.truth)})
+    found = verb("evaluate", root, "--json").json
+    alone = {name: vplog.evaluate(root / f"runs/drive={name}", drive.truth) for name in tags}
+    figures = {
+        one["drive"]: (one["tags"], one["ate_m"], one["false_closures"], one["error"]) for one in found["drives"]
+    }
+    assert figures == {
+        name: (tags[name], one["ate_after"]["rmse_m"], one["closures"]["accepted_false"], "")
+        for name, one in alone.items()
+    }
+    groups, ates = found["groups"], [one["ate_after"]["rmse_m"] for one in alone.values()]
+    assert groups["light=night"] == {**groups["vehicle=v1"], "ate_m": alone["after"]["ate_after"]["rmse_m"]}
+    assert groups["all"]["ate_m"] == groups[f"vplog {vplog.__version__}"]["ate_m"] == pytest.approx(sum(ates) / 2)
+
+    manifest.write_text(f"log,name,truth\nx.mcap,before,{drive.truth}\ny.mcap,,gps\n")
+    limit = f"ate_m>{alone['before']['ate_after']['rmse_m'] / 2}"
+    said = verb("evaluate", root, "--truth", manifest, "--fail-on", limit, "--fail-on", "false_closures>99")
+    assert (said.code, said.err.count("before has ate_m")) == (1, 1)
+    assert "after has" not in said.err
+    assert f"{manifest} names no truth of it." in said.out
+    manifest.write_text("log,truth\nx.mcap,gps\n")
+    assert "No drive of" in verb("evaluate", root, "--truth", manifest).error
+    run = (root / "runs/drive=before", "--truth", drive.truth, "--fail-on")
+    assert verb("evaluate", *run, "ate_m<0").code == 0
+    assert "The run has ate_m" in verb("evaluate", *run, limit).err
+    assert "Did you mean ate_m?" in verb("evaluate", *run, "ate_n<0").error
+    assert "is no limit" in verb("evaluate", *run, "ate_m<5%").error
