@@ -437,6 +437,7 @@ class Map:
         address: str | None = None,
         cache: Path | None = None,
         cache_gb: float | None = None,
+        as_of: str | None = None,
         threads: int | None = None,
         progress: Progress = silent,
     ) -> Answers:
@@ -446,6 +447,7 @@ class Map:
         out: a Parquet file for the answers.
         engine, address: who searches, as in `batch`.
         cache, cache_gb: folder and size of the cache of a map by URL.
+        as_of: version or time (ISO 8601, UTC) of a map on an object store, None is the newest.
         """
         from vplog.batch.engine import BatchOptions, open_engine
         from vplog.maps.search.query import MapQuery, query_map
@@ -455,7 +457,7 @@ class Map:
         threads = threads or available()
         downloads = cache_in(cache, cache_gb) if isinstance(self.place, RemotePath) else None
         with limited(threads), open_engine(BatchOptions(engine=engine, address=address), threads) as workers:
-            query = MapQuery(top, sequence, None if out is None else located(out), workers.executor, downloads)
+            query = MapQuery(top, sequence, None if out is None else located(out), workers.executor, downloads, as_of)
             found = query_map(self.place, located(log), _topics(topics), query, Execution(threads, progress))
         return Answers(found)
 

@@ -215,6 +215,8 @@ def _add_query(sub: argparse.ArgumentParser) -> None:
     option(sub, "--top", parser.at_least_one, "K", "places for each view (default: 10)", default=10)
     option(sub, "--sequence", parser.at_least_one, "L", "views in a window, odd; 1: none (default: as the map's)")
     option(sub, "-o --output", parser.output_file, "FILE.parquet", "write the answers")
+    text = "the map as it was at a version of `map log`, or at a time (2026-01-31T12:00, UTC); on an object store"
+    option(sub, "--as-of", str, "VERSION|TIME", text)
     text = "who searches: this process, or Ray workers that see the map under the same path (default: local)"
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     option(sub, "--address", str, "HOST:PORT", "Ray cluster (default: one of this machine's cores)")

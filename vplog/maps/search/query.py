@@ -54,6 +54,8 @@ class MapQuery:
     """Workers that search the map, whose folder they see under the same path."""
     cache: Cache | None = None
     """Where the files of a map on an object store are read from, but for its manifests."""
+    as_of: str | None = None
+    """Version or time of a map on an object store; None: the newest."""
 
 
 def query_map(
@@ -66,7 +68,7 @@ def query_map(
     """
     if (out := query.out) is not None:
         check_file_output(out)
-    with map_store.reading(root, query.cache) as store:
+    with map_store.reading(root, query.cache, query.as_of) as store:
         _, pipeline, state = open_map(store, execution)
         settings = pipeline.sequence
         if query.sequence is not None:

@@ -42,10 +42,13 @@ __all__ += ["relocate", "writing"]
 
 
 @contextmanager
-def reading(root: Path, cache: Cache | None = None) -> Iterator[Store]:
+def reading(root: Path, cache: Cache | None = None, as_of: str | None = None) -> Iterator[Store]:
     """A map, local or on an object store, for those who only read it; with a cache, what is read of the latter stays
-    there for the next one. Raises ResultError, also where something in it is not its own file."""
+    there for the next one. The latter also as of a version or a time. Raises ResultError, also where something in it is
+    not its own file, and SettingsError where it was not there then."""
     if not isinstance(root, RemotePath):
+        if as_of is not None:
+            raise SettingsError(f"{root} is a folder, which has no older versions. Leave out --as-of.")
         check_regular(root, "map.json")
         yield Store(root)
         return
@@ -53,7 +56,7 @@ def reading(root: Path, cache: Cache | None = None) -> Iterator[Store]:
         raise ResultError(f"{root} is no map: a web server lists no folders. A map is a folder, s3://, gs:// or az://.")
     try:
         with scratch("map", None if cache is None else cache.open_folders) as folder:
-            mirror = Mirror(root, folder, cache)
+            mirror = Mirror(root, folder, cache, as_of=as_of)
             yield Store(folder, mirror, mirror.damaged)
     finally:
         if cache is not None:

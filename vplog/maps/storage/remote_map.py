@@ -42,10 +42,14 @@ class Mirror:
     """The drives of a map on a store, and the local folder that they are read and made through. A reader has them as of
     one snapshot; so has a writer, with its own changes, until `refresh`."""
 
-    def __init__(self, remote: RemotePath, local: Path, cache: Cache | None = None, *, writable: bool = False) -> None:
-        """With a cache nothing is fetched that is there. Raises ResultError where the store cannot be read."""
+    def __init__(
+        self, remote: RemotePath, local: Path, cache: Cache | None = None, *, writable: bool = False,
+        as_of: str | None = None,
+    ) -> None:  # fmt: skip
+        """With a cache nothing is fetched that is there; `as_of` as in `Manifest`. Raises ResultError where the store
+        cannot be read."""
         self.remote, self.local, self.cache, self.writable = remote, local, cache, writable
-        self.manifest = Manifest(remote)
+        self.manifest = Manifest(remote, as_of)
         self.drives: dict[str, dict[str, Any]] = dict(self.manifest.now["drives"])
         """As the snapshot has them."""
         self.damaged = dict(self.manifest.damaged)
@@ -116,9 +120,10 @@ class Mirror:
         """Raises ResultError where the files of a drive are gone because another snapshot has replaced it."""
         newest = Manifest(self.remote).now["drives"].get(drive)
         if newest is None or newest["generation"] != self.drives[drive]["generation"]:
+            then = "Run again." if self.manifest.as_of is None else "Name a newer version."
             raise ResultError(
                 f"{drive} was {'removed from' if newest is None else 'replaced in'} {self.remote} while it was read, "
-                "and what it was is removed. Run again."
+                f"and what it was is removed. {then}"
             )
 
     def place(self, drive: str) -> RemotePath:

@@ -29,7 +29,7 @@ from urllib.parse import unquote
 from pydantic import ConfigDict, Field, StrictInt, TypeAdapter, with_config
 from typing_extensions import TypedDict  # as pydantic needs it below Python 3.12
 
-from vplog.errors import ResultError
+from vplog.errors import ResultError, SettingsError
 from vplog.maps.storage import objects, older_maps
 from vplog.maps.storage.damage import UnreachableError
 from vplog.maps.storage.layout import ADD_AGAIN, FORMAT, folder_name
@@ -144,9 +144,10 @@ def empty() -> Snapshot:
 class Manifest:
     """The newest snapshot of a map as this process has read or written it last."""
 
-    def __init__(self, remote: RemotePath) -> None:
-        """Raises ResultError where it is damaged, NewerError, and UnreachableError."""
-        self.remote = remote
+    def __init__(self, remote: RemotePath, as_of: str | None = None) -> None:
+        """With `as_of`, a version or a time, the snapshot that was the newest then, for reading. Raises ResultError
+        where it is damaged, SettingsError where no snapshot is of then, NewerError, and UnreachableError."""
+        self.remote, self.as_of = remote, as_of
         self.version: objects.Version | None = None
         """State of map.json; None where there is none."""
         self.log: list[dict[str, Any]] = []
@@ -169,12 +170,16 @@ class Manifest:
                 return
             head = _json(found.data, place)
             check_version(cast("Path", place), head.get("format"), STORE_FORMAT, head.get("vplog"))
-            if head["format"] < STORE_FORMAT:
+            if head["format"] < STORE_FORMAT and self.as_of is None:
                 self._read_older(head)
                 return
-            rows = _validated(_ROWS, head.get("snapshots"), place)
+            rows = _validated(_ROWS, head.get("snapshots", []), place)
+            if not rows and head["format"] < STORE_FORMAT:
+                raise SettingsError(f"{self.remote} has no snapshots before the next change. Leave out --as-of.")
             if not rows:
                 raise ResultError(f"{place} names no snapshot: it is damaged. Copy it back from a backup.")
+            if self.as_of is not None:
+                rows = rows[_row_as_of(rows, self.as_of, self.remote) :]
             if self.log[:1] != rows[:1]:
                 top = self._object(rows[0], _SNAPSHOT)
                 known = {row["object"]: layer for row, layer in self.layers}
@@ -188,6 +193,10 @@ class Manifest:
         """A snapshot or a layer. Raises ResultError, and OSError."""
         place = self.remote / row["object"]
         data = objects.get(place) if is_below(row["object"]) else None
+        if data is None and self.as_of is not None:
+            raise ResultError(
+                f"What {self.remote} was at {self.as_of} is removed: {place} is gone. Name a newer version."
+            )
         if data is None or (len(data), sha256(data).hexdigest()) != (row["bytes"], row["sha256"]):
             raise ResultError(f"{place} is gone, or damaged. Copy it back from a backup.")
         try:
@@ -283,6 +292,27 @@ def _difference(wanted: Snapshot, layers: Sequence[tuple[Any, dict[str, Any]]]) 
         | dict.fromkeys(below[name].keys() - wanted[name].keys())
         for name in _LAYERED
     }
+
+
+def _row_as_of(rows: Sequence[dict[str, Any]], as_of: str, remote: RemotePath) -> int:
+    """Number of the snapshot of this version, or of the newest that is not younger than a time (UTC, unless it says
+    otherwise). Raises SettingsError."""
+    try:
+        then = None if as_of.isdecimal() else datetime.fromisoformat(as_of)
+    except ValueError:
+        raise SettingsError(
+            f"--as-of {as_of} is no version and no time. Write it as 12, or as 2026-01-31T12:00:00."
+        ) from None
+    for number, row in enumerate(rows):
+        made = datetime.fromisoformat(row["time"])
+        if (
+            str(row["version"]) == as_of
+            if then is None
+            else made <= (then if then.tzinfo else then.replace(tzinfo=UTC))
+        ):
+            return number
+    known = f"versions {rows[-1]['version']} of {rows[-1]['time']} to {rows[0]['version']} of {rows[0]['time']}"
+    raise SettingsError(f"{remote} has no snapshot as of {as_of}, but {known}: vplog map log {remote}")
 
 
 def _entries(layer: dict[str, dict[str, Any]]) -> int:

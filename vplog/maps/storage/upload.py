@@ -305,7 +305,9 @@ def vacuum(mirror: Mirror, hours: float) -> dict[str, int]:
     kept |= {f"runs/{folder_name(drive)}/{entry['generation']}" for drive, entry in snapshot["drives"].items()}
     kept |= {f"rest/{about['generation']}/{name}" for name, about in snapshot["rest"].items()}
     kept |= {f"libraries/{digest}" for digest in snapshot["libraries"]}
-    kept |= {row["object"] for row in [*mirror.manifest.log[:1], *(row for row, _ in mirror.manifest.layers)]}
+    log = mirror.manifest.log
+    recent = [row for row, newer in zip(log[1:], log, strict=False) if datetime.fromisoformat(newer["time"]) > before]
+    kept |= {row["object"] for row in [*log[:1], *recent, *(row for row, _ in mirror.manifest.layers)]}
     kept |= {f"{name}/{folder_name(drive)}/{name}.parquet" for drive in snapshot["drives"] for name in TABLES}
     kept |= snapshot["rest"].keys()
     removed = {"objects": 0, "bytes": 0}
