@@ -72,6 +72,16 @@ def vacuum(arguments: argparse.Namespace) -> None:
     print_result(arguments, found, printing.print_vacuumed)
 
 
+def write_delta(arguments: argparse.Namespace) -> None:
+    """Make the tables of a map Delta Lake tables, too, which DuckDB, Spark, Polars and Databricks read at a version, in
+    whole drives. From then on every change of the map is one of theirs."""
+    from vplog.maps.snapshots import write_delta as write
+
+    with one_stage(arguments, "delta"):
+        found = write(arguments.map, compact=arguments.compact)
+    print_result(arguments, found, printing.print_delta)
+
+
 def condense_map(arguments: argparse.Namespace) -> None:
     """Copy a map to another without the places and references that recognition can do without, at a stated loss."""
     from vplog.maps.condensation.condense import condense_map as condense
@@ -198,6 +208,8 @@ def add_maps(
     sub = verb("vacuum", vacuum, "remove what was replaced on an object store")
     text = "age of what is removed, longer than any reader runs (default: 168, a week)"
     option(sub, "--hours", parser.number(lambda value: value >= 24, "at least 24"), "H", text, default=168.0)
+    sub = verb("delta", write_delta, "keep the tables as Delta Lake tables, for other tools")
+    flag(sub, "--compact", "put small files of theirs together, up to 100 MB")
     sub = verb("condense", condense_map, "leave out the places and references that recognition can do without", threads)
     option(sub, "-o --target", place, "MAP2", "the new map", required=True)
     text = "recall at rank one that the map's own queries may lose (default: 0.01)"

@@ -440,6 +440,12 @@ def print_snapshots(found: dict[str, Any]) -> None:
         print(f"{one['version']:6}  {one['time']}  {plural(one['drives'], 'drive'):>14}  {one['change']}")
 
 
+def print_delta(found: dict[str, Any]) -> None:
+    counts = f"{plural(found['drives'], 'drive')} in {plural(found['files'], 'file')} each"
+    print(f"{found['map']}: version {found['version']}, {counts}")
+    print("\n".join(found["tables"]))
+
+
 def print_vacuumed(found: dict[str, Any]) -> None:
     print(f"{found['map']}: {plural(found['objects'], 'object')} removed, {found['bytes'] / 1e6:.1f} MB")
 

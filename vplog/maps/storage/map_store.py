@@ -7,6 +7,7 @@
     MAP/descriptors/... closures/... edges/... trajectory/...   it; hard links to the run folder's files
     MAP/failures.json                          drives that could not be run, each with its error
     MAP/removed.json                           drives that are being removed, while that is not done
+    MAP/delta/                                 the data sets as Delta Lake tables, once they are asked for (delta.py)
 
 A drive is in the map when its run folder is: that is one rename (local.py); on an object store, when the newest
 snapshot names it (remote_map.py). No byte is stored twice, and both names of a table always show the same bytes, since
@@ -20,10 +21,10 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 from vplog.errors import LibraryError, ResultError, SettingsError, VplogError
-from vplog.maps.storage import local, upload
+from vplog.maps.storage import delta, local, upload
 from vplog.maps.storage.contents import Head, Store, common_library
 from vplog.maps.storage.damage import UnreachableError, complete_record, damaged_table
 from vplog.maps.storage.layout import HASH, TABLES, folder_name, free_name, renamed, set_drive_id
@@ -79,6 +80,7 @@ def writing(root: Path) -> Iterator[Store]:
         _finish_removals(store)
         local.recover(store)
         yield store
+        follow_with_delta(store)
         shutil.rmtree(store.staging, ignore_errors=True)
 
 
@@ -100,6 +102,18 @@ def _writing_remote(root: RemotePath) -> Iterator[Store]:
                 upload.send_rest(mirror)
             raise
         upload.finish(mirror)
+        follow_with_delta(store)
+
+
+def follow_with_delta(store: Store, patience_s: float = 0.0, *, begin: bool = False, compact: bool = False) -> Any:
+    """Bring the Delta tables of a map that is written to up to its drives, where it has some, or is to `begin`; as
+    `delta.update`. Raises ResultError."""
+    if not begin and not delta.is_kept(store):
+        return None
+    if store.mirror is None:
+        return delta.update(store, patience_s, compact=compact)
+    with reading(cast("Path", store.mirror.remote)) as newest:  # others write, too
+        return delta.update(newest, patience_s, compact=compact)
 
 
 def publish(store: Store, drive: str, made: Path) -> str:
@@ -110,10 +124,13 @@ def publish(store: Store, drive: str, made: Path) -> str:
     store.damaged.pop(drive, None)
     if store.mirror is None:
         local.publish(store, drive, made)
+        follow_with_delta(store, delta.PATIENCE_S)
         return drive
     complete_record(made, hashed=False)
     try:
-        return upload.publish(store.mirror, drive, made)
+        drive = upload.publish(store.mirror, drive, made)
+        follow_with_delta(store, delta.PATIENCE_S)
+        return drive
     except upload.TakenError:
         record = run_record.read_run_json(made / "drive.json")
         free = free_name(drive, record["log"], store.mirror.manifest.now["drives"])
