@@ -78,8 +78,18 @@ def write_delta(arguments: argparse.Namespace) -> None:
     from vplog.maps.snapshots import write_delta as write
 
     with one_stage(arguments, "delta"):
-        found = write(arguments.map, compact=arguments.compact)
+        found = write(arguments.map)
     print_result(arguments, found, printing.print_delta)
+
+
+def compact_map(arguments: argparse.Namespace) -> None:
+    """Put small files of a map together: on an object store those of its drives, and everywhere those of its Delta
+    tables, into files of up to 100 MB. Every answer stays as it was; what was replaced `map vacuum` removes."""
+    from vplog.maps.snapshots import compact_map as compact
+
+    with one_stage(arguments, "compact"):
+        found = compact(arguments.map)
+    print_result(arguments, found, printing.print_compacted)
 
 
 def condense_map(arguments: argparse.Namespace) -> None:
@@ -208,8 +218,8 @@ def add_maps(
     sub = verb("vacuum", vacuum, "remove what was replaced on an object store")
     text = "age of what is removed, longer than any reader runs (default: 168, a week)"
     option(sub, "--hours", parser.number(lambda value: value >= 24, "at least 24"), "H", text, default=168.0)
-    sub = verb("delta", write_delta, "keep the tables as Delta Lake tables, for other tools")
-    flag(sub, "--compact", "put small files of theirs together, up to 100 MB")
+    verb("delta", write_delta, "keep the tables as Delta Lake tables, for other tools")
+    verb("compact", compact_map, "put small files together, up to 100 MB")
     sub = verb("condense", condense_map, "leave out the places and references that recognition can do without", threads)
     option(sub, "-o --target", place, "MAP2", "the new map", required=True)
     text = "recall at rank one that the map's own queries may lose (default: 0.01)"

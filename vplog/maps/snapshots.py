@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vplog.errors import ResultError
-from vplog.maps.storage import delta, map_store, upload
+from vplog.maps.storage import delta, map_store, packs, upload
 
 
 def snapshots_of(root: Path) -> dict[str, Any]:
@@ -40,11 +40,26 @@ def vacuum_map(root: Path, hours: float) -> dict[str, Any]:
         return {"map": str(root), "hours": hours, "objects": own["objects"], "bytes": own["bytes"]}
 
 
-def write_delta(root: Path, *, compact: bool = False) -> dict[str, Any]:
-    """Make the tables of a map Delta Lake tables, too, which later changes keep up; with `compact` small files are put
-    together. Their place, last version, drives and files. Raises VplogError."""
+def compact_map(root: Path) -> dict[str, Any]:
+    """Put small files of a map together in files of up to 100 MB: on an object store those of its drives, and those of
+    Delta tables. How many files of drives came into how many, and the state of the tables. Raises VplogError."""
     with map_store.reading(root) as store:  # not a map: nothing is made
         store.head()
     with map_store.writing(root) as store:
-        found = map_store.follow_with_delta(store, begin=True, compact=compact)
+        if store.mirror is None and not delta.is_kept(store):
+            raise ResultError(
+                f"{root} is a folder, where drives stay as they are, and has no Delta tables. To have some: vplog map "
+                f"delta {root}"
+            )
+        packed = {"files": 0, "packs": 0} if store.mirror is None else packs.compact(store.mirror)
+        return {"map": str(root), **packed, "delta": map_store.follow_with_delta(store, compact=True)}
+
+
+def write_delta(root: Path) -> dict[str, Any]:
+    """Make the tables of a map Delta Lake tables, too, which later changes keep up. Their place, last version, drives
+    and files. Raises VplogError."""
+    with map_store.reading(root) as store:  # not a map: nothing is made
+        store.head()
+    with map_store.writing(root) as store:
+        found = map_store.follow_with_delta(store, begin=True)
         return {"map": str(root), "tables": [f"{root}/delta/{name}" for name in map_store.TABLES], **found}

@@ -100,7 +100,7 @@ def test_others_read_a_map_at_a_version(root: Any, verb: Callable[..., Said], mo
         put(store, "five", 5)
     assert [seen(root, version) for version in range(3)] == states
     assert len(opened(root, "keyframes").file_uris()) == 2
-    assert "version 3, 3 drives in 1 file each" in verb("map", "delta", root, "--compact").out
+    assert "version 3, 3 drives in 1 file each" in verb("map", "compact", root).out
     table = opened(root, "keyframes")
     assert (seen(root), len(table.file_uris())) == (states[2], 1)
     entry = (root / "delta" / "keyframes" / "_delta_log" / f"{3:020}.json").read_text()

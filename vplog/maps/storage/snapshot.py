@@ -42,8 +42,8 @@ from vplog.version import __version__
 if TYPE_CHECKING:
     from pathlib import Path
 
-STORE_FORMAT = FORMAT + 1
-"""Version of this manifest. Before it each drive had one of its own (older_maps.py)."""
+STORE_FORMAT, PACKED_FORMAT = FORMAT + 1, FORMAT + 2
+"""Versions of this manifest: without packs, and with some. Before it each drive had one of its own (older_maps.py)."""
 LISTED = 100
 """Snapshots that map.json names, 200 bytes each."""
 _TRIES, _PAUSE_S = 100, 0.02
@@ -64,6 +64,23 @@ class LostRaceError(ResultError):
     """Another writer has changed the same part of the map."""
 
 
+class _Packed(TypedDict):
+    token: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
+    """Name of the pack, MAP/packs/TOKEN."""
+    section: tuple[StrictInt, StrictInt]
+    """First byte of the zstd frame that the file is in, and the one behind it."""
+    at: StrictInt
+    """Where the file begins in what is in that frame."""
+
+
+class _Pack(TypedDict):
+    bytes: StrictInt
+    sha256: str
+    tag: str
+    unpacked: StrictInt
+    """Bytes of the files that it was made of."""
+
+
 class _File(TypedDict):
     bytes: StrictInt
     sha256: Annotated[str, Field(pattern="^([0-9a-f]{64})?$")]
@@ -71,6 +88,8 @@ class _File(TypedDict):
     tag: NotRequired[str]
     """ETag."""
     rows: NotRequired[StrictInt]
+    pack: NotRequired[_Packed]
+    """Where a small file of a drive is, if not in its folder."""
     generation: NotRequired[Generation]
     """Folder of a file beside drives, MAP/rest/GENERATION/NAME: a random name."""
 
@@ -130,6 +149,8 @@ class _Snapshot(_Layer):
     """When folders and files that earlier snapshots name were replaced, in UTC."""
     layers: list[_Row]
     """From the lowest on."""
+    packs: NotRequired[dict[str, _Pack]]
+    """Those that files of drives are in, by token."""
 
 
 _ROWS, _LAYER, _SNAPSHOT = TypeAdapter(list[_Row]), TypeAdapter(_Layer), TypeAdapter(_Snapshot)
@@ -169,7 +190,7 @@ class Manifest:
                 self.log, self.now, self.layers = [], empty(), []
                 return
             head = _json(found.data, place)
-            check_version(cast("Path", place), head.get("format"), STORE_FORMAT, head.get("vplog"))
+            check_version(cast("Path", place), head.get("format"), PACKED_FORMAT, head.get("vplog"))
             if head["format"] < STORE_FORMAT and self.as_of is None:
                 self._read_older(head)
                 return
@@ -250,10 +271,11 @@ class Manifest:
         wanted["replaced"] = wanted["replaced"] | dict.fromkeys(left, now())
         row = self._send({**wanted, **changed, "layers": [row for row, _ in layers]}, drives, what)
         rows = [row, *self.log][:LISTED]
-        head = with_checksum({"format": STORE_FORMAT, "vplog": __version__, "snapshots": rows})
-        version = objects.put_if(self.remote / "map.json", json.dumps(head, indent=1).encode(), self.version)
-        if version is not None:
-            self.version, self.log, self.now, self.layers, self.damaged = version, rows, wanted, layers, {}
+        version = PACKED_FORMAT if wanted.get("packs") else STORE_FORMAT
+        head = with_checksum({"format": version, "vplog": __version__, "snapshots": rows})
+        written = objects.put_if(self.remote / "map.json", json.dumps(head, indent=1).encode(), self.version)
+        if written is not None:
+            self.version, self.log, self.now, self.layers, self.damaged = written, rows, wanted, layers, {}
             return True
         self.read()
         if row in self.log:  # the response was lost, and this is a repetition

@@ -28,7 +28,7 @@ VACUUM_S = 86_400
 """Age below which nothing is removed: no upload of a drive takes a day."""
 _PROBE = ".conditional-writes"
 """An empty object that no write may replace, for the store itself to show that it heeds conditions."""
-_OWN = ("runs", "rest", "libraries", "snapshots", "joins", "joint", *TABLES, *older_maps.NAMES)
+_OWN = ("runs", "packs", "rest", "libraries", "snapshots", "joins", "joint", *TABLES, *older_maps.NAMES)
 """Names in a map's folder that are of vplog."""
 _FIGURES = ("counts", "totals", "warnings", "descriptor_bits")
 """Fields of run.json that `map info` shows."""
@@ -94,7 +94,7 @@ def publish(mirror: Mirror, drive: str, made: Path) -> str:
     found = list[str]()
 
     def change(snapshot: Snapshot) -> None:
-        _check_recent(began)
+        check_recent(began)
         found[:] = _same_drive(mirror, snapshot["drives"], record)
         if not found:
             _check_untouched(mirror, snapshot, drive)
@@ -121,7 +121,7 @@ def publish(mirror: Mirror, drive: str, made: Path) -> str:
     return drive
 
 
-def _check_recent(began: float) -> None:
+def check_recent(began: float) -> None:
     """Raises ResultError where what was sent may be removed as that of a killed writer."""
     if not 0 <= time.time() - began < VACUUM_S:
         raise ResultError("This writer was stopped for too long, so what it sent may be gone. Run again.")
@@ -147,7 +147,9 @@ def _check_untouched(mirror: Mirror, snapshot: Snapshot, drive: str) -> None:
 def _replace_drive(snapshot: Snapshot, drive: str) -> None:
     """Take a drive out, and note when."""
     if (old := snapshot["drives"].pop(drive, None)) is not None:
-        snapshot["replaced"][f"runs/{folder_name(drive)}/{old['generation']}"] = now()
+        tokens = {about["pack"]["token"] for about in old["files"].values() if "pack" in about}
+        places = [f"runs/{folder_name(drive)}/{old['generation']}", *(f"packs/{token}" for token in tokens)]
+        snapshot["replaced"] |= dict.fromkeys(places, now())
 
 
 def _remove_quietly(place: RemotePath) -> None:
@@ -248,7 +250,7 @@ def send_rest(mirror: Mirror) -> None:
     components = _components(mirror.local / "joint.json") if {"joint.json"} & changes.keys() else None
 
     def change(snapshot: Snapshot) -> None:
-        _check_recent(began)
+        check_recent(began)
         contested = set(changes)
         if any(map(_of_order, changes)):  # drives are joined one after the other
             contested |= set(filter(_of_order, snapshot["rest"]))
@@ -302,7 +304,13 @@ def vacuum(mirror: Mirror, hours: float) -> dict[str, int]:
     bytes. Raises ResultError."""
     snapshot, before = mirror.manifest.now, datetime.now(UTC) - timedelta(hours=hours)
     kept = {name for name, when in snapshot["replaced"].items() if datetime.fromisoformat(when) > before}
-    kept |= {f"runs/{folder_name(drive)}/{entry['generation']}" for drive, entry in snapshot["drives"].items()}
+    for drive, entry in snapshot["drives"].items():
+        place = f"runs/{folder_name(drive)}/{entry['generation']}"
+        packed = any("pack" in about for about in entry["files"].values())
+        kept |= (
+            {f"{place}/{name}" for name, about in entry["files"].items() if "pack" not in about} if packed else {place}
+        )
+    kept |= {f"packs/{token}" for token in snapshot.get("packs", {})}
     kept |= {f"rest/{about['generation']}/{name}" for name, about in snapshot["rest"].items()}
     kept |= {f"libraries/{digest}" for digest in snapshot["libraries"]}
     log = mirror.manifest.log
