@@ -42,7 +42,8 @@ def vacuum_map(root: Path, hours: float) -> dict[str, Any]:
 
 def compact_map(root: Path) -> dict[str, Any]:
     """Put small files of a map together in files of up to 100 MB: on an object store those of its drives, and those of
-    Delta tables. How many files of drives came into how many, and the state of the tables. Raises VplogError."""
+    Delta tables, which there take the place of the tables copied by drive. How many files of drives came into how many,
+    and the state of the Delta tables. Raises VplogError."""
     with map_store.reading(root) as store:  # not a map: nothing is made
         store.head()
     with map_store.writing(root) as store:
@@ -52,7 +53,10 @@ def compact_map(root: Path) -> dict[str, Any]:
                 f"delta {root}"
             )
         packed = {"files": 0, "packs": 0} if store.mirror is None else packs.compact(store.mirror)
-        return {"map": str(root), **packed, "delta": map_store.follow_with_delta(store, compact=True)}
+        tables = map_store.follow_with_delta(store, compact=True)
+        if store.mirror is not None and tables is not None:
+            upload.drop_copies(store.mirror)
+        return {"map": str(root), **packed, "delta": tables}
 
 
 def write_delta(root: Path) -> dict[str, Any]:

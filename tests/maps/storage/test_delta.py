@@ -85,6 +85,13 @@ def seen(root: Any, version: int | None = None) -> dict[str, int]:
     return dict(found["keyframes"])
 
 
+def tables_by_drive(root: Any) -> set[str]:
+    """Folders of the data sets of a folder for each drive."""
+    return {
+        f"{name}/{path.name}" for name in map_store.TABLES if (root / name).exists() for path in (root / name).iterdir()
+    }
+
+
 def test_others_read_a_map_at_a_version(root: Any, verb: Callable[..., Said], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(delta, "_ALL_EVERY", 2)
     states = [{"one": 1, "two/3 %": 2}, {"one": 3, "four": 4}, {"one": 3, "four": 4, "five": 5}]
@@ -99,6 +106,7 @@ def test_others_read_a_map_at_a_version(root: Any, verb: Callable[..., Said], mo
     with map_store.writing(root) as store:
         put(store, "five", 5)
     assert [seen(root, version) for version in range(3)] == states
+    assert tables_by_drive(root) == {f"{name}/drive={drive}" for name in map_store.TABLES for drive in states[2]}
     assert len(opened(root, "keyframes").file_uris()) == 2
     assert "version 3, 3 drives in 1 file each" in verb("map", "compact", root).out
     table = opened(root, "keyframes")
@@ -119,7 +127,13 @@ def test_others_read_a_map_at_a_version(root: Any, verb: Callable[..., Said], mo
     with pytest.raises(Exception, match="No files"):
         opened(root, "keyframes", 1)
     with map_store.writing(root) as store:
-        map_store.remove(store, list(states[2]))
+        put(store, "one", 2)
+        map_store.remove(store, ["four", "five"])
+    assert seen(root) == {"one": 2}
+    links = set() if "://" in str(root) else {f"{name}/drive=one" for name in map_store.TABLES}
+    assert tables_by_drive(root) == links, "of a bucket the Delta tables alone are left"
+    with map_store.writing(root) as store:
+        map_store.remove(store, ["one"])
     assert seen(root) == {}
 
 

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 STORE_FORMAT, PACKED_FORMAT = FORMAT + 1, FORMAT + 2
-"""Versions of this manifest: without packs, and with some. Before it each drive had one of its own (older_maps.py)."""
+"""Versions of this manifest, before and after `map compact`. Before them each drive had its own (older_maps.py)."""
 LISTED = 100
 """Snapshots that map.json names, 200 bytes each."""
 _TRIES, _PAUSE_S = 100, 0.02
@@ -149,6 +149,8 @@ class _Snapshot(_Layer):
     """When folders and files that earlier snapshots name were replaced, in UTC."""
     layers: list[_Row]
     """From the lowest on."""
+    by_drive: NotRequired[bool]
+    """False where Delta tables alone are the data sets: no table is copied to MAP/NAME/drive=ID any more."""
     packs: NotRequired[dict[str, _Pack]]
     """Those that files of drives are in, by token."""
 
@@ -271,7 +273,7 @@ class Manifest:
         wanted["replaced"] = wanted["replaced"] | dict.fromkeys(left, now())
         row = self._send({**wanted, **changed, "layers": [row for row, _ in layers]}, drives, what)
         rows = [row, *self.log][:LISTED]
-        version = PACKED_FORMAT if wanted.get("packs") else STORE_FORMAT
+        version = STORE_FORMAT if wanted.keys() <= empty().keys() else PACKED_FORMAT
         head = with_checksum({"format": version, "vplog": __version__, "snapshots": rows})
         written = objects.put_if(self.remote / "map.json", json.dumps(head, indent=1).encode(), self.version)
         if written is not None:

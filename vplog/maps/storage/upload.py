@@ -100,7 +100,7 @@ def publish(mirror: Mirror, drive: str, made: Path) -> str:
             _check_untouched(mirror, snapshot, drive)
             _replace_drive(snapshot, drive)
             snapshot["drives"][drive] = entry
-            snapshot["copies"] |= copies
+            snapshot["copies"] |= copies if snapshot.get("by_drive", True) else {}
             snapshot["failures"].pop(drive, None)
 
     try:
@@ -117,7 +117,7 @@ def publish(mirror: Mirror, drive: str, made: Path) -> str:
         if name not in RUN_TABLES:  # a batch would fill the disk
             (made / name).unlink()
     mirror.adopt(drive, entry, made)
-    _copy(mirror, copies)
+    _copy(mirror, {name: source for name, source in mirror.manifest.now["copies"].items() if name in copies})
     return drive
 
 
@@ -299,6 +299,21 @@ def _components(path: Path) -> dict[str, str]:
     return {}
 
 
+def drop_copies(mirror: Mirror) -> None:
+    """Remove the tables that are copied by drive, for Delta tables have the same, and make no more. What is left of
+    them `vacuum` removes. Raises ResultError."""
+
+    def change(snapshot: Snapshot) -> None:
+        snapshot["by_drive"] = False
+        left = snapshot["copies"].items()
+        snapshot["copies"] = {name: source for name, source in left if name.split("/")[0] not in TABLES}
+
+    if mirror.manifest.now.get("by_drive", True):
+        mirror.commit("tables by drive dropped", change)
+        for name in TABLES:
+            _remove_quietly(mirror.remote / name)
+
+
 def vacuum(mirror: Mirror, hours: float) -> dict[str, int]:
     """Remove what was replaced more than `hours` ago, and what no snapshot names and is as old; how many objects and
     bytes. Raises ResultError."""
@@ -316,7 +331,8 @@ def vacuum(mirror: Mirror, hours: float) -> dict[str, int]:
     log = mirror.manifest.log
     recent = [row for row, newer in zip(log[1:], log, strict=False) if datetime.fromisoformat(newer["time"]) > before]
     kept |= {row["object"] for row in [*log[:1], *recent, *(row for row, _ in mirror.manifest.layers)]}
-    kept |= {f"{name}/{folder_name(drive)}/{name}.parquet" for drive in snapshot["drives"] for name in TABLES}
+    if snapshot.get("by_drive", True):
+        kept |= {f"{name}/{folder_name(drive)}/{name}.parquet" for drive in snapshot["drives"] for name in TABLES}
     kept |= snapshot["rest"].keys()
     removed = {"objects": 0, "bytes": 0}
     with store_errors(mirror.remote):
