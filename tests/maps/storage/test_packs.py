@@ -85,7 +85,7 @@ def test_every_answer_is_as_before(
     assert verb("map", "compact", root).out == f"{root}: 0 files of drives put into 0 packs\n"
 
 
-def test_packs_change_with_their_drives(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_packs_change_with_their_drives(root: Any, verb: Callable[..., Said], monkeypatch: pytest.MonkeyPatch) -> None:
     drives = {f"d{number}": number for number in range(6)}
     make_map(root, drives)
     before = {drive: {seed} for drive, seed in drives.items()}
@@ -94,6 +94,7 @@ def test_packs_change_with_their_drives(root: Any, monkeypatch: pytest.MonkeyPat
     with map_store.writing(root) as store:
         assert packs.compact(mirror(store)) == {"files": 6 * 7, "packs": 1}
     assert json.loads((root / "map.json").read_bytes())["format"] == snapshot.PACKED_FORMAT
+    assert verb("map", "vacuum", root, "--hours", 24, "--json").json["objects"] == 0
     assert state(root) == state(root, as_of=older) == before
     with counting() as asked:
         state(root)

@@ -74,4 +74,4 @@ def test_a_writer_asks_as_often_of_a_large_map(root: Any, finished: Path, verb: 
     with counting() as asked:
         verb("map", "remove", root, "new")
     assert asked["LIST"] <= 5
-    assert asked["GET"] <= 6
+    assert asked["GET"] <= 7

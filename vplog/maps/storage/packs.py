@@ -23,7 +23,6 @@ import zstandard
 
 from vplog.maps.storage import objects
 from vplog.maps.storage.damage import DamagedDriveError
-from vplog.maps.storage.layout import folder_name
 from vplog.maps.storage.remote_map import MOST_SECTION, Mirror, tag_of
 from vplog.maps.storage.snapshot import Snapshot, now, store_errors
 from vplog.maps.storage.upload import check_recent
@@ -140,9 +139,10 @@ def _replace(
     for (drive, name, about), place in zip(members, places, strict=True):
         entry = snapshot["drives"].get(drive)
         if entry is not None and entry["files"].get(name) == about:
-            old = about["pack"]["token"] if "pack" in about else None
-            was = f"packs/{old}" if old else f"runs/{folder_name(drive)}/{entry['generation']}/{name}"
-            snapshot["replaced"][was] = now()
+            if "pack" in about:
+                snapshot["replaced"][f"packs/{about['pack']['token']}"] = now()
+            else:
+                entry = {**entry, "packed": now()}
             files = {**entry["files"], name: {**about, "pack": {"token": token, **place}}}
             snapshot["drives"][drive] = {**entry, "files": files}
             unpacked += about["bytes"]

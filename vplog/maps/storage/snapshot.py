@@ -114,6 +114,8 @@ class _Drive(TypedDict):
     """Figures of its run.json."""
     stamps_ns: NotRequired[list[StrictInt] | None]
     """First and last keyframe."""
+    packed: NotRequired[str]
+    """When files of its folder were put into a pack, in UTC: from then on they are replaced."""
     component: NotRequired[str | None]
     """Folder of its joint graph."""
 

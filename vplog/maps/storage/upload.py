@@ -321,10 +321,10 @@ def vacuum(mirror: Mirror, hours: float) -> dict[str, int]:
     kept = {name for name, when in snapshot["replaced"].items() if datetime.fromisoformat(when) > before}
     for drive, entry in snapshot["drives"].items():
         place = f"runs/{folder_name(drive)}/{entry['generation']}"
-        packed = any("pack" in about for about in entry["files"].values())
-        kept |= (
-            {f"{place}/{name}" for name, about in entry["files"].items() if "pack" not in about} if packed else {place}
-        )
+        if "packed" in entry and datetime.fromisoformat(entry["packed"]) <= before:
+            kept |= {f"{place}/{name}" for name, about in entry["files"].items() if "pack" not in about}
+        else:
+            kept.add(place)
     kept |= {f"packs/{token}" for token in snapshot.get("packs", {})}
     kept |= {f"rest/{about['generation']}/{name}" for name, about in snapshot["rest"].items()}
     kept |= {f"libraries/{digest}" for digest in snapshot["libraries"]}
