@@ -64,7 +64,8 @@ def show_log(arguments: argparse.Namespace) -> None:
 
 
 def vacuum(arguments: argparse.Namespace) -> None:
-    """Remove from an object store what no snapshot of a map needs: replaced files, and those of killed writers."""
+    """Remove what no snapshot of a map on an object store, and no version of Delta tables, needs any more: replaced
+    files, and those of killed writers."""
     from vplog.maps.snapshots import vacuum_map
 
     with one_stage(arguments, "vacuum"):
@@ -215,7 +216,7 @@ def add_maps(
     sub = verb("remove", remove_drives, "remove drives")
     option(sub, "drives", str, "DRIVE", "as `map info` names them", nargs="+")
     verb("log", show_log, "the last changes of a map on an object store")
-    sub = verb("vacuum", vacuum, "remove what was replaced on an object store")
+    sub = verb("vacuum", vacuum, "remove what was replaced on an object store and in Delta tables")
     text = "age of what is removed, longer than any reader runs (default: 168, a week)"
     option(sub, "--hours", parser.number(lambda value: value >= 24, "at least 24"), "H", text, default=168.0)
     verb("delta", write_delta, "keep the tables as Delta Lake tables, for other tools")

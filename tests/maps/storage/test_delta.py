@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import time
@@ -21,6 +22,7 @@ from vplog.errors import ResultError
 from vplog.maps.storage import delta, delta_log, map_store, objects
 from vplog.results import tables
 from vplog.storage import remote_path
+from vplog.storage.json_records import with_checksum
 from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
@@ -193,3 +195,17 @@ def test_writers_at_once_and_readers_meanwhile(root: Any, monkeypatch: pytest.Mo
             writer.result()
     assert all(one <= other for one, other in pairwise(known))
     assert seen(root) == {f"d{seed}": seed for seed in range(9)}
+
+
+def test_damaged_commits_are_one_line(tmp_path: Path, verb: Callable[..., Said]) -> None:
+    root = make_map(tmp_path / "map", {"one": 1})
+    verb("map", "delta", root)
+    first = root / "delta" / "commits" / f"{0:020}.json"
+    whole = first.read_text()
+    for text in ("", "[]", whole[:-9], whole.replace('"one"', '"two"')):
+        first.write_text(text)
+        assert f"{root}/delta is damaged. Move it out of the map" in verb("map", "compact", root).error
+    first.write_text(whole.replace('"format": 1', '"format": 2'))
+    assert "is damaged" in verb("map", "delta", root).error, "its checksum is another"
+    first.write_text(json.dumps(with_checksum({"format": 2})))
+    assert "in version 2 of its format" in verb("map", "delta", root).error

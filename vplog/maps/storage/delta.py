@@ -175,16 +175,17 @@ def _commits(place: RemotePath, store: Store, at: int | None = None) -> list[del
     with ThreadPoolExecutor(objects.AT_ONCE) as pool:
         names = [f"commits/{version:020}.json" for version in range(first, newest + 1)]
         found = list(pool.map(lambda name: objects.get(place / name), names if newest >= 0 else []))
+    where = f"{store}/delta"
     try:
-        commits = [json.loads(data or b"") for data in found]
-        sound = all(map(has_checksum, commits))
-    except (ValueError, RecursionError, AttributeError):
-        sound, commits = False, []
-    if not sound:
-        raise ResultError(f"{store}/delta is damaged. Remove it, and make it again: vplog map delta {store}")
-    for commit in commits:
-        check_version(Path(f"{store}/delta"), commit.get("format"), _FORMAT)
-    return commits
+        records = [json.loads(data or b"") for data in found]
+        if not all(isinstance(record, dict) and has_checksum(record) for record in records):
+            raise ValueError
+        for record in records:
+            check_version(Path(where), record.get("format"), _FORMAT)
+        return [dict(delta_log.COMMIT.validate_python(record)) for record in records]
+    except (ValueError, RecursionError):
+        again = f"Move it out of the map, and make it again: vplog map delta {store}"
+        raise ResultError(f"{where} is damaged. {again}") from None
 
 
 def _files(commits: Sequence[delta_log.Commit]) -> dict[str, dict[str, Any]]:

@@ -9,10 +9,12 @@ from __future__ import annotations
 import io
 import json
 import uuid
-from typing import Any
+from typing import Annotated, Any, NotRequired
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from pydantic import Field, StrictInt, TypeAdapter
+from typing_extensions import TypedDict  # as pydantic needs it below Python 3.12
 
 from vplog.errors import ResultError
 from vplog.version import __version__
@@ -45,9 +47,40 @@ _CHECKPOINT = pa.schema(
 )
 
 Commit = dict[str, Any]
-"""A version of all tables: `id` of them all, `version`, `time` (ms since 1970), `change` (whether rows differ from
-before), `schemas` by table, `replaced` (whether those differ from before), `added` and `removed` files by name. A file
-has `drives`, with a hash of what each was made from, and `tables`: bytes and rows of each that has rows."""
+"""Fields as in `_Commit`, as plain values."""
+
+
+class _DataFile(TypedDict):
+    drives: dict[str, str]
+    """Drives in it, with a hash of what each was made from."""
+    tables: dict[str, tuple[StrictInt, StrictInt]]
+    """Bytes and rows of each table that has rows."""
+
+
+_DataFiles = dict[Annotated[str, Field(pattern="^part-[0-9a-f]{32}$")], _DataFile]
+
+
+class _Commit(TypedDict):
+    """A version of all tables."""
+
+    format: StrictInt
+    id: Annotated[str, Field(pattern="^[0-9a-f-]{36}$")]
+    """Of the tables."""
+    version: StrictInt
+    time: StrictInt
+    """ms since 1970."""
+    change: bool
+    """Whether rows differ from those before."""
+    schemas: dict[str, str]
+    replaced: bool
+    """Whether schemas differ from those before."""
+    added: _DataFiles
+    removed: _DataFiles
+    files: NotRequired[_DataFiles]
+    """All there are after it."""
+
+
+COMMIT = TypeAdapter(_Commit)
 
 
 def plain_schema(schema: pa.Schema) -> pa.Schema:

@@ -80,8 +80,8 @@ def writing(root: Path) -> Iterator[Store]:
         _finish_removals(store)
         local.recover(store)
         yield store
-        follow_with_delta(store)
         shutil.rmtree(store.staging, ignore_errors=True)
+        follow_with_delta(store)
 
 
 @contextmanager
