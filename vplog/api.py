@@ -463,6 +463,7 @@ class Map:
         address: str | None = None,
         cache: Path | None = None,
         cache_gb: float | None = None,
+        as_of: str | None = None,
         threads: int | None = None,
         progress: Progress = silent,
     ) -> Answers:
@@ -474,6 +475,7 @@ class Map:
         out: a Parquet file for the answers.
         engine, address: who searches, as in `batch`.
         cache, cache_gb: folder and size of the cache of a map by URL.
+        as_of: version or time (ISO 8601, UTC) of a map on an object store, None is the newest.
         """
         from vplog.batch.engine import BatchOptions, open_engine
         from vplog.maps.search.query import MapQuery, query_map
@@ -484,7 +486,7 @@ class Map:
         downloads = cache_in(cache, cache_gb) if isinstance(self.place, RemotePath) else None
         with limited(threads), open_engine(BatchOptions(engine=engine, address=address), threads) as workers:
             place = None if out is None else located(out)
-            query = MapQuery(top, sequence, place, workers.executor, downloads, drives, box, near_fixes_m)
+            query = MapQuery(top, sequence, place, workers.executor, downloads, drives, box, near_fixes_m, as_of)
             found = query_map(self.place, located(log), _topics(topics), query, Execution(threads, progress))
         return Answers(found)
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 from tests.benchmarks import backend
 from tests.benchmarks.ask import ask
 from tests.benchmarks.batch import PARTS, batch
+from tests.benchmarks.compaction import compaction
 from tests.benchmarks.condense import condense
 from tests.benchmarks.discovery import discovery
 from tests.benchmarks.graphs import graphs
@@ -50,7 +51,7 @@ DISCOVERY_BAR = 1000.0
 SEARCH_BARS = (4.0, 40.0)
 """Times faster than a scan of binary codes, and of vectors of floats."""
 SIZES = (10_000, 100_000, 1_000_000, 10_000_000)
-LONG = {"large", "batch", "localize", "condense", "ask", "serve"}
+LONG = {"large", "batch", "localize", "condense", "compaction", "ask", "serve"}
 """What is measured where it is named."""
 LARGEST_NEEDS_GB = 12.0
 """Memory that must be free for the largest map: the places, the index, and what the system needs beside."""
@@ -89,6 +90,7 @@ def _arguments() -> argparse.Namespace:
         "batch",
         "localize",
         "condense",
+        "compaction",
         "ask",
     )
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
@@ -162,6 +164,8 @@ def _long(arguments: argparse.Namespace) -> Iterator[Figure]:
     if "serve" in arguments.what:
         with tempfile.TemporaryDirectory() as made:
             yield from serve(arguments.places, arguments.folder or Path(made))
+    if "compaction" in arguments.what:
+        yield from compaction()
     if "ask" in arguments.what:
         yield from ask(arguments.questions, arguments.seeds, arguments.runs)
     if "localize" in arguments.what:

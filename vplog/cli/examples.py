@@ -27,6 +27,8 @@ EXAMPLES = {
     "vplog map condense": "vplog map condense out/map -o out/small --loss 0.01",
     "vplog map join": "vplog map join out/map",
     "vplog map remove": "vplog map remove out/map a",
+    "vplog map compact": "vplog map compact s3://fleet/maps/city",
+    "vplog map delta": "vplog map delta maps/city",
     "vplog map log": "vplog map log s3://fleet/maps/city",
     "vplog map vacuum": "vplog map vacuum s3://fleet/maps/city --hours 48",
     "vplog map redescribe": "vplog map redescribe out/map --library out/library -o out/map2",

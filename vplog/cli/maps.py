@@ -65,12 +65,33 @@ def show_log(arguments: argparse.Namespace) -> None:
 
 
 def vacuum(arguments: argparse.Namespace) -> None:
-    """Remove from an object store what no snapshot of a map needs: replaced files, and those of killed writers."""
+    """Remove what no snapshot of a map on an object store, and no version of Delta tables, needs any more: replaced
+    files, and those of killed writers."""
     from vplog.maps.snapshots import vacuum_map
 
     with one_stage(arguments, "vacuum"):
         found = vacuum_map(arguments.map, arguments.hours)
     print_result(arguments, found, printing.print_vacuumed)
+
+
+def write_delta(arguments: argparse.Namespace) -> None:
+    """Make the tables of a map Delta Lake tables, too, which DuckDB, Spark, Polars and Databricks read at a version, in
+    whole drives. From then on every change of the map is one of theirs."""
+    from vplog.maps.snapshots import write_delta as write
+
+    with one_stage(arguments, "delta"):
+        found = write(arguments.map)
+    print_result(arguments, found, printing.print_delta)
+
+
+def compact_map(arguments: argparse.Namespace) -> None:
+    """Put small files of a map together: on an object store those of its drives, and everywhere those of its Delta
+    tables, into files of up to 100 MB. Every answer stays as it was; what was replaced `map vacuum` removes."""
+    from vplog.maps.snapshots import compact_map as compact
+
+    with one_stage(arguments, "compact"):
+        found = compact(arguments.map)
+    print_result(arguments, found, printing.print_compacted)
 
 
 def condense_map(arguments: argparse.Namespace) -> None:
@@ -233,9 +254,11 @@ def add_maps(
     sub = verb("remove", remove_drives, "remove drives")
     option(sub, "drives", str, "DRIVE", "as `map info` names them", nargs="+")
     verb("log", show_log, "the last changes of a map on an object store")
-    sub = verb("vacuum", vacuum, "remove what was replaced on an object store")
+    sub = verb("vacuum", vacuum, "remove what was replaced on an object store and in Delta tables")
     text = "age of what is removed, longer than any reader runs (default: 168, a week)"
     option(sub, "--hours", parser.number(lambda value: value >= 24, "at least 24"), "H", text, default=168.0)
+    verb("delta", write_delta, "keep the tables as Delta Lake tables, for other tools")
+    verb("compact", compact_map, "put small files together, up to 100 MB")
     sub = verb("condense", condense_map, "leave out the places and references that recognition can do without", threads)
     option(sub, "-o --target", place, "MAP2", "the new map", required=True)
     text = "recall at rank one that the map's own queries may lose (default: 0.01)"
@@ -261,6 +284,8 @@ def _add_query(sub: argparse.ArgumentParser) -> None:
     text = "search only drives that may have places within M metres of the log's satellite fixes"
     option(where, "--near-fixes", parser.positive, "M", text, dest="near_fixes_m")
     option(sub, "-o --output", parser.output_file, "FILE.parquet", "write the answers")
+    text = "the map as it was at a version of `map log`, or at a time (2026-01-31T12:00, UTC); on an object store"
+    option(sub, "--as-of", str, "VERSION|TIME", text)
     text = "who searches: this process, or Ray workers that see the map under the same path (default: local)"
     sub.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
     option(sub, "--address", str, "HOST:PORT", "Ray cluster (default: one of this machine's cores)")

@@ -477,6 +477,22 @@ def print_snapshots(found: dict[str, Any]) -> None:
         print(f"{one['version']:6}  {one['time']}  {plural(one['drives'], 'drive'):>14}  {one['change']}")
 
 
+def print_delta(found: dict[str, Any]) -> None:
+    print(f"{found['map']}: {_delta_state(found)}")
+    print("\n".join(found["tables"]))
+
+
+def print_compacted(found: dict[str, Any]) -> None:
+    print(f"{found['map']}: {plural(found['files'], 'file')} of drives put into {plural(found['packs'], 'pack')}")
+    if found["delta"] is not None:
+        print(f"Delta tables: {_delta_state(found['delta'])}")
+
+
+def _delta_state(found: dict[str, Any]) -> str:
+    counts = f"{plural(found['drives'], 'drive')} in {plural(found['files'], 'file')} each"
+    return f"version {found['version']}, {counts}"
+
+
 def print_vacuumed(found: dict[str, Any]) -> None:
     print(f"{found['map']}: {plural(found['objects'], 'object')} removed, {found['bytes'] / 1e6:.1f} MB")
 

@@ -202,6 +202,41 @@ def test_what_no_snapshot_names_goes_by_age(
         put(writer, "two", 5)
 
 
+def as_of(root: Any, then: str) -> dict[str, set[Any]]:
+    """What the drives of a map said at a version or a time."""
+    with map_store.reading(root, as_of=then) as store:
+        return {drive: seeds(store.run(drive)) for drive in store.drives()}
+
+
+def test_a_map_is_read_as_of_a_version_or_a_time_until_it_is_vacuumed(
+    root: Any, verb: Callable[..., Said], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    days = iter(range(1, 1000))
+    monkeypatch.setattr(snapshot, "now", lambda: f"2026-01-{next(days):02}T12:00:00+00:00")
+    monkeypatch.setattr(snapshot, "_MOST_CHANGES", 2)
+    make_map(root, {"one": 1, "two": 2})
+    with map_store.writing(root) as store:
+        put(store, "one", 3)
+        map_store.remove(store, ["two"])
+    rows = verb("map", "log", root, "--json").json["snapshots"]
+    states = {one["version"]: as_of(root, str(one["version"])) for one in rows}
+    assert [state for number, state in sorted(states.items()) if state != states.get(number - 1)] == [
+        {}, {"one": {1}}, {"one": {1}, "two": {2}}, {"one": {3}, "two": {2}}, {"one": {3}},
+    ]  # fmt: skip
+    assert {one["version"]: as_of(root, one["time"][:13]) for one in rows} == states
+    assert as_of(root, rows[1]["time"].replace("T12:", "T13:")) == states[rows[1]["version"]]
+    query = ("map", "query", root, root, "--cache-gb", 0, "--as-of")
+    first, last = rows[-1]["time"], rows[0]["version"]
+    said = f"has no snapshot as of {last + 1}, but versions 1 of {first} to {last} of {rows[0]['time']}: vplog map log"
+    assert said in verb(*query, last + 1).error
+    assert "has no snapshot as of 2025-12-31" in verb(*query, "2025-12-31").error
+    assert "is no version and no time" in verb(*query, "yesterday").error
+    with map_store.writing(root) as store:
+        upload.vacuum(store.mirror, -1.0)  # pyrefly: ignore[bad-argument-type]
+    assert f"What {root} was at 2 is removed" in verb(*query, 2).error
+    assert as_of(root, str(snapshot.Manifest(root).log[0]["version"])) == {"one": {3}}
+
+
 def test_what_joins_drives_is_kept_of_a_writer_that_fails(root: Any) -> None:
     make_map(root, {"one": 1})
     with pytest.raises(KeyboardInterrupt), map_store.writing(root) as store:

@@ -69,9 +69,9 @@ def test_a_writer_asks_as_often_of_a_large_map(root: Any, finished: Path, verb: 
     with counting() as asked, map_store.writing(root) as store:
         put_rows(store, "new", finished, library, slice(5, 20))
     assert asked.keys() == {"GET", "PUT", "COPY"}
-    assert asked["GET"] <= 4
+    assert asked["GET"] <= 5, "two of them whether there are Delta tables"
     assert asked["COPY"] == len(map_store.TABLES)
     with counting() as asked:
         verb("map", "remove", root, "new")
     assert asked["LIST"] <= 5
-    assert asked["GET"] <= 6
+    assert asked["GET"] <= 7

@@ -62,6 +62,8 @@ class MapQuery:
     """Only drives that may have places in it are searched."""
     near_fixes_m: float | None = None
     """Only drives that may have places as near to the log's own satellite fixes are searched."""
+    as_of: str | None = None
+    """Version or time of a map on an object store; None: the newest."""
 
 
 def query_map(
@@ -74,7 +76,7 @@ def query_map(
     """
     if (out := query.out) is not None:
         check_file_output(out)
-    with map_store.reading(root, query.cache) as store:
+    with map_store.reading(root, query.cache, query.as_of) as store:
         _, pipeline, state = open_map(store, execution)
         settings = pipeline.sequence
         if query.sequence is not None:

@@ -66,7 +66,7 @@ class Store:
     def index(self) -> Path:
         """Folder of the index; of a map on an object store it is the reader's own, in the cache if there is one."""
         if self.mirror is not None and self.mirror.cache is not None:
-            return self.mirror.cache.index_of(self.mirror.remote)
+            return self.mirror.cache.index_of(self.mirror.remote, self.mirror.manifest.as_of or "")
         return self.root / "index"
 
     @property

@@ -34,9 +34,10 @@ class Cache:
     def open_folders(self) -> Path:
         return self.root / "open"
 
-    def index_of(self, place: RemotePath) -> Path:
-        """The folder for the index of the map at this place."""
-        return self.root / "index" / hashlib.sha256(f"{s3_place()} {place}".encode()).hexdigest()[:32]
+    def index_of(self, place: RemotePath, as_of: str = "") -> Path:
+        """The folder for the index of the map at this place, or of what it was at a version or a time."""
+        name = f"{s3_place()} {place}{as_of and f'@{as_of}'}"
+        return self.root / "index" / hashlib.sha256(name.encode()).hexdigest()[:32]
 
     def fetch_to(self, digest: str, target: Path) -> bool:
         """Link the file with this sha256 to `target`, which is not there yet; False where the cache lacks it."""

@@ -7,6 +7,7 @@
     MAP/descriptors/... closures/... edges/... trajectory/...   it; hard links to the run folder's files
     MAP/failures.json                          drives that could not be run, each with its error
     MAP/removed.json                           drives that are being removed, while that is not done
+    MAP/delta/                                 the data sets as Delta Lake tables, once they are asked for (delta.py)
 
 A drive is in the map when its run folder is: that is one rename (local.py); on an object store, when the newest
 snapshot names it (remote_map.py). No byte is stored twice, and both names of a table always show the same bytes, since
@@ -20,10 +21,10 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from vplog.errors import LibraryError, ResultError, SettingsError, VplogError
-from vplog.maps.storage import local, upload
+from vplog.maps.storage import delta, local, upload
 from vplog.maps.storage.contents import Head, Store, common_library
 from vplog.maps.storage.damage import UnreachableError, complete_record, damaged_table
 from vplog.maps.storage.layout import HASH, RUN_TABLES, TABLES, folder_name, free_name, renamed, set_drive_id
@@ -42,10 +43,13 @@ __all__ += ["RUN_TABLES", "annotate", "writing"]
 
 
 @contextmanager
-def reading(root: Path, cache: Cache | None = None) -> Iterator[Store]:
+def reading(root: Path, cache: Cache | None = None, as_of: str | None = None) -> Iterator[Store]:
     """A map, local or on an object store, for those who only read it; with a cache, what is read of the latter stays
-    there for the next one. Raises ResultError, also where something in it is not its own file."""
+    there for the next one. The latter also as of a version or a time. Raises ResultError, also where something in it is
+    not its own file, and SettingsError where it was not there then."""
     if not isinstance(root, RemotePath):
+        if as_of is not None:
+            raise SettingsError(f"{root} is a folder, which has no older versions. Leave out --as-of.")
         check_regular(root, "map.json")
         yield Store(root)
         return
@@ -53,7 +57,7 @@ def reading(root: Path, cache: Cache | None = None) -> Iterator[Store]:
         raise ResultError(f"{root} is no map: a web server lists no folders. A map is a folder, s3://, gs:// or az://.")
     try:
         with scratch("map", None if cache is None else cache.open_folders) as folder:
-            mirror = Mirror(root, folder, cache)
+            mirror = Mirror(root, folder, cache, as_of=as_of)
             yield Store(folder, mirror, mirror.damaged)
     finally:
         if cache is not None:
@@ -77,6 +81,7 @@ def writing(root: Path) -> Iterator[Store]:
         local.recover(store)
         yield store
         shutil.rmtree(store.staging, ignore_errors=True)
+        follow_with_delta(store)
 
 
 @contextmanager
@@ -97,6 +102,18 @@ def _writing_remote(root: RemotePath) -> Iterator[Store]:
                 upload.send_rest(mirror)
             raise
         upload.finish(mirror)
+        follow_with_delta(store)
+
+
+def follow_with_delta(store: Store, patience_s: float = 0.0, *, begin: bool = False, compact: bool = False) -> Any:
+    """Bring the Delta tables of a map that is written to up to its drives, where it has some, or is to `begin`; as
+    `delta.update`. Raises ResultError."""
+    if not begin and not delta.is_kept(store):
+        return None
+    if store.mirror is None:
+        return delta.update(store, patience_s, compact=compact)
+    with reading(cast("Path", store.mirror.remote)) as newest:  # others write, too
+        return delta.update(newest, patience_s, compact=compact)
 
 
 def publish(store: Store, drive: str, made: Path) -> str:
@@ -107,10 +124,13 @@ def publish(store: Store, drive: str, made: Path) -> str:
     store.damaged.pop(drive, None)
     if store.mirror is None:
         local.publish(store, drive, made)
+        follow_with_delta(store, delta.PATIENCE_S)
         return drive
     complete_record(made, hashed=False)
     try:
-        return upload.publish(store.mirror, drive, made)
+        drive = upload.publish(store.mirror, drive, made)
+        follow_with_delta(store, delta.PATIENCE_S)
+        return drive
     except upload.TakenError:
         record = run_record.read_run_json(made / "drive.json")
         free = free_name(drive, record["log"], store.mirror.manifest.now["drives"])

@@ -3,6 +3,7 @@
     MAP/map.json, snapshots/...                       the manifest, which names all below with length and sha256
     MAP/libraries/HASH/...                            as in a folder
     MAP/runs/drive=ID/GENERATION/...                  the run folder; its generation is a random name, never used twice
+    MAP/packs/TOKEN                                   small files of drives together, after `map compact` (packs.py)
     MAP/rest/GENERATION/...                           all else that a map's folder has, as what joins its drives
     MAP/keyframes/drive=ID/keyframes.parquet          tables as data sets, and what joins drives by its own name; copied
                                                       within the store, after the manifest
@@ -19,8 +20,12 @@ import threading
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from hashlib import sha256
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
+
+import zstandard
 
 from vplog.errors import ResultError
 from vplog.maps.storage import objects
@@ -28,12 +33,17 @@ from vplog.maps.storage.damage import DamagedDriveError, UnreachableError
 from vplog.maps.storage.layout import ADD_AGAIN, RUN_TABLES, TABLES, folder_name
 from vplog.maps.storage.snapshot import Manifest, Snapshot, store_errors
 from vplog.results import run_record
+from vplog.storage.object_store import plain_errors
 from vplog.storage.remote_path import RemotePath, objects_below, reason
 from vplog.storage.scratch import files_in
 
 if TYPE_CHECKING:
     from vplog.maps.storage.download_cache import Cache
 
+MOST_SECTION = 1 << 21
+"""Bytes of files that are compressed as one, and fetched for any of them: zstd finds what is alike in as much."""
+_SECTIONS = 8
+"""Sections that a reader holds."""
 Copies = dict[str, str | None]
 """Objects to copy within the store, by the new name; None: to remove."""
 
@@ -42,10 +52,14 @@ class Mirror:
     """The drives of a map on a store, and the local folder that they are read and made through. A reader has them as of
     one snapshot; so has a writer, with its own changes, until `refresh`."""
 
-    def __init__(self, remote: RemotePath, local: Path, cache: Cache | None = None, *, writable: bool = False) -> None:
-        """With a cache nothing is fetched that is there. Raises ResultError where the store cannot be read."""
+    def __init__(
+        self, remote: RemotePath, local: Path, cache: Cache | None = None, *, writable: bool = False,
+        as_of: str | None = None,
+    ) -> None:  # fmt: skip
+        """With a cache nothing is fetched that is there; `as_of` as in `Manifest`. Raises ResultError where the store
+        cannot be read."""
         self.remote, self.local, self.cache, self.writable = remote, local, cache, writable
-        self.manifest = Manifest(remote)
+        self.manifest = Manifest(remote, as_of)
         self.drives: dict[str, dict[str, Any]] = dict(self.manifest.now["drives"])
         """As the snapshot has them."""
         self.damaged = dict(self.manifest.damaged)
@@ -57,6 +71,7 @@ class Mirror:
         self.copied: Copies = {}
         """Copies within the store that are made, and not noted as such in the manifest."""
         self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+        self._section = lru_cache(_SECTIONS)(self._fetch_section)
 
     @property
     def exists(self) -> bool:
@@ -116,9 +131,10 @@ class Mirror:
         """Raises ResultError where the files of a drive are gone because another snapshot has replaced it."""
         newest = Manifest(self.remote).now["drives"].get(drive)
         if newest is None or newest["generation"] != self.drives[drive]["generation"]:
+            then = "Run again." if self.manifest.as_of is None else "Name a newer version."
             raise ResultError(
                 f"{drive} was {'removed from' if newest is None else 'replaced in'} {self.remote} while it was read, "
-                "and what it was is removed. Run again."
+                f"and what it was is removed. {then}"
             )
 
     def place(self, drive: str) -> RemotePath:
@@ -131,10 +147,18 @@ class Mirror:
         place, files = self.place(drive), self.drives[drive]["files"]
         with store_errors(self.remote):
             there = {name: (meta["size"], tag_of(meta)) for name, meta in objects_below(place).items()}
-        gone = [f"{place / name} is not there." for name in files.keys() - there.keys()]
+            packs = {name: (meta["size"], tag_of(meta)) for name, meta in objects_below(self.remote / "packs").items()}
+        packed = {name: about["pack"]["token"] for name, about in files.items() if "pack" in about}
+        gone = [f"{place / name} is not there." for name in files.keys() - there.keys() - packed.keys()]
+        known = self.manifest.now.get("packs", {})
         doubtful = [
+            name
+            for name, token in packed.items()
+            if packs.get(token) != _state(known.get(token, {"bytes": 0, "tag": ""}))
+        ]
+        doubtful += [
             name for name, about in files.items()
-            if there.get(name, "") not in ("", (about["bytes"], about.get("tag")))
+            if name not in packed and there.get(name, "") not in ("", (about["bytes"], about.get("tag")))
             and (name in RUN_TABLES or about["bytes"] != there[name][0])
         ]  # fmt: skip
         try:
@@ -194,7 +218,12 @@ class Mirror:
             return ""
         part = target.with_name(f".{target.name}.part")
         try:
-            digest = objects.fetch(place, part, about["bytes"])
+            if "pack" in about:
+                data = self._packed(about)
+                part.write_bytes(data)
+                digest = sha256(data).hexdigest()
+            else:
+                digest = objects.fetch(place, part, about["bytes"])
         except FileNotFoundError:
             raise
         except OSError as error:
@@ -206,6 +235,29 @@ class Mirror:
         if self.cache is not None:
             self.cache.keep(digest, target)
         return ""
+
+    def _packed(self, about: dict[str, Any]) -> bytes:
+        """A file that is in a pack, if that is sound. Raises OSError."""
+        token, section, at = about["pack"]["token"], about["pack"]["section"], about["pack"]["at"]
+        with self._locks[token]:  # files of one section come together
+            return self._section(token, *section)[at : at + about["bytes"]]
+
+    def _fetch_section(self, token: str, start: int, stop: int) -> bytes:
+        """What is in a section of a pack; nothing of a damaged one. Raises OSError."""
+        if not 0 <= start < stop <= start + 2 * MOST_SECTION:
+            return b""
+        try:
+            with plain_errors():
+                data = bytes((self.remote / "packs" / token).ask("get", options={"range": (start, stop)}).bytes())
+        except OSError as error:
+            if "range" in str(error).lower():  # InvalidRange: it is too short
+                return b""
+            raise
+        try:
+            sound = 0 < zstandard.frame_content_size(data) <= MOST_SECTION
+            return zstandard.ZstdDecompressor().decompress(data) if sound else b""
+        except zstandard.ZstdError:
+            return b""
 
     def adopt(self, drive: str, entry: dict[str, Any], made: Path) -> None:
         """Move the folder of a drive that was just uploaded into the local folder."""
@@ -219,6 +271,10 @@ class Mirror:
     def run(self, drive: str) -> Path:
         """The drive's local folder."""
         return self.local / "runs" / folder_name(drive)
+
+
+def _state(about: dict[str, Any]) -> tuple[int, str]:
+    return about["bytes"], about["tag"]
 
 
 def tag_of(meta: Any) -> str:

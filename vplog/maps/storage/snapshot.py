@@ -29,7 +29,7 @@ from urllib.parse import unquote
 from pydantic import ConfigDict, Field, StrictInt, TypeAdapter, with_config
 from typing_extensions import TypedDict  # as pydantic needs it below Python 3.12
 
-from vplog.errors import ResultError
+from vplog.errors import ResultError, SettingsError
 from vplog.maps.storage import objects, older_maps
 from vplog.maps.storage.damage import UnreachableError
 from vplog.maps.storage.layout import ADD_AGAIN, FORMAT, folder_name
@@ -42,8 +42,8 @@ from vplog.version import __version__
 if TYPE_CHECKING:
     from pathlib import Path
 
-STORE_FORMAT = FORMAT + 1
-"""Version of this manifest. Before it each drive had one of its own (older_maps.py)."""
+STORE_FORMAT, PACKED_FORMAT = FORMAT + 1, FORMAT + 2
+"""Versions of this manifest, before and after `map compact`. Before them each drive had its own (older_maps.py)."""
 LISTED = 100
 """Snapshots that map.json names, 200 bytes each."""
 _TRIES, _PAUSE_S = 100, 0.02
@@ -64,6 +64,23 @@ class LostRaceError(ResultError):
     """Another writer has changed the same part of the map."""
 
 
+class _Packed(TypedDict):
+    token: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
+    """Name of the pack, MAP/packs/TOKEN."""
+    section: tuple[StrictInt, StrictInt]
+    """First byte of the zstd frame that the file is in, and the one behind it."""
+    at: StrictInt
+    """Where the file begins in what is in that frame."""
+
+
+class _Pack(TypedDict):
+    bytes: StrictInt
+    sha256: str
+    tag: str
+    unpacked: StrictInt
+    """Bytes of the files that it was made of."""
+
+
 class _File(TypedDict):
     bytes: StrictInt
     sha256: Annotated[str, Field(pattern="^([0-9a-f]{64})?$")]
@@ -71,6 +88,8 @@ class _File(TypedDict):
     tag: NotRequired[str]
     """ETag."""
     rows: NotRequired[StrictInt]
+    pack: NotRequired[_Packed]
+    """Where a small file of a drive is, if not in its folder."""
     generation: NotRequired[Generation]
     """Folder of a file beside drives, MAP/rest/GENERATION/NAME: a random name."""
 
@@ -95,6 +114,8 @@ class _Drive(TypedDict):
     """Figures of its run.json."""
     stamps_ns: NotRequired[list[StrictInt] | None]
     """First and last keyframe."""
+    packed: NotRequired[str]
+    """When files of its folder were put into a pack, in UTC: from then on they are replaced."""
     component: NotRequired[str | None]
     """Folder of its joint graph."""
 
@@ -130,6 +151,10 @@ class _Snapshot(_Layer):
     """When folders and files that earlier snapshots name were replaced, in UTC."""
     layers: list[_Row]
     """From the lowest on."""
+    by_drive: NotRequired[bool]
+    """False where Delta tables alone are the data sets: no table is copied to MAP/NAME/drive=ID any more."""
+    packs: NotRequired[dict[str, _Pack]]
+    """Those that files of drives are in, by token."""
 
 
 _ROWS, _LAYER, _SNAPSHOT = TypeAdapter(list[_Row]), TypeAdapter(_Layer), TypeAdapter(_Snapshot)
@@ -144,9 +169,10 @@ def empty() -> Snapshot:
 class Manifest:
     """The newest snapshot of a map as this process has read or written it last."""
 
-    def __init__(self, remote: RemotePath) -> None:
-        """Raises ResultError where it is damaged, NewerError, and UnreachableError."""
-        self.remote = remote
+    def __init__(self, remote: RemotePath, as_of: str | None = None) -> None:
+        """With `as_of`, a version or a time, the snapshot that was the newest then, for reading. Raises ResultError
+        where it is damaged, SettingsError where no snapshot is of then, NewerError, and UnreachableError."""
+        self.remote, self.as_of = remote, as_of
         self.version: objects.Version | None = None
         """State of map.json; None where there is none."""
         self.log: list[dict[str, Any]] = []
@@ -168,13 +194,17 @@ class Manifest:
                 self.log, self.now, self.layers = [], empty(), []
                 return
             head = _json(found.data, place)
-            check_version(cast("Path", place), head.get("format"), STORE_FORMAT, head.get("vplog"))
-            if head["format"] < STORE_FORMAT:
+            check_version(cast("Path", place), head.get("format"), PACKED_FORMAT, head.get("vplog"))
+            if head["format"] < STORE_FORMAT and self.as_of is None:
                 self._read_older(head)
                 return
-            rows = _validated(_ROWS, head.get("snapshots"), place)
+            rows = _validated(_ROWS, head.get("snapshots", []), place)
+            if not rows and head["format"] < STORE_FORMAT:
+                raise SettingsError(f"{self.remote} has no snapshots before the next change. Leave out --as-of.")
             if not rows:
                 raise ResultError(f"{place} names no snapshot: it is damaged. Copy it back from a backup.")
+            if self.as_of is not None:
+                rows = rows[_row_as_of(rows, self.as_of, self.remote) :]
             if self.log[:1] != rows[:1]:
                 top = self._object(rows[0], _SNAPSHOT)
                 known = {row["object"]: layer for row, layer in self.layers}
@@ -188,6 +218,10 @@ class Manifest:
         """A snapshot or a layer. Raises ResultError, and OSError."""
         place = self.remote / row["object"]
         data = objects.get(place) if is_below(row["object"]) else None
+        if data is None and self.as_of is not None:
+            raise ResultError(
+                f"What {self.remote} was at {self.as_of} is removed: {place} is gone. Name a newer version."
+            )
         if data is None or (len(data), sha256(data).hexdigest()) != (row["bytes"], row["sha256"]):
             raise ResultError(f"{place} is gone, or damaged. Copy it back from a backup.")
         try:
@@ -241,10 +275,11 @@ class Manifest:
         wanted["replaced"] = wanted["replaced"] | dict.fromkeys(left, now())
         row = self._send({**wanted, **changed, "layers": [row for row, _ in layers]}, drives, what)
         rows = [row, *self.log][:LISTED]
-        head = with_checksum({"format": STORE_FORMAT, "vplog": __version__, "snapshots": rows})
-        version = objects.put_if(self.remote / "map.json", json.dumps(head, indent=1).encode(), self.version)
-        if version is not None:
-            self.version, self.log, self.now, self.layers, self.damaged = version, rows, wanted, layers, {}
+        version = STORE_FORMAT if wanted.keys() <= empty().keys() else PACKED_FORMAT
+        head = with_checksum({"format": version, "vplog": __version__, "snapshots": rows})
+        written = objects.put_if(self.remote / "map.json", json.dumps(head, indent=1).encode(), self.version)
+        if written is not None:
+            self.version, self.log, self.now, self.layers, self.damaged = written, rows, wanted, layers, {}
             return True
         self.read()
         if row in self.log:  # the response was lost, and this is a repetition
@@ -283,6 +318,27 @@ def _difference(wanted: Snapshot, layers: Sequence[tuple[Any, dict[str, Any]]]) 
         | dict.fromkeys(below[name].keys() - wanted[name].keys())
         for name in _LAYERED
     }
+
+
+def _row_as_of(rows: Sequence[dict[str, Any]], as_of: str, remote: RemotePath) -> int:
+    """Number of the snapshot of this version, or of the newest that is not younger than a time (UTC, unless it says
+    otherwise). Raises SettingsError."""
+    try:
+        then = None if as_of.isdecimal() else datetime.fromisoformat(as_of)
+    except ValueError:
+        raise SettingsError(
+            f"--as-of {as_of} is no version and no time. Write it as 12, or as 2026-01-31T12:00:00."
+        ) from None
+    for number, row in enumerate(rows):
+        made = datetime.fromisoformat(row["time"])
+        if (
+            str(row["version"]) == as_of
+            if then is None
+            else made <= (then if then.tzinfo else then.replace(tzinfo=UTC))
+        ):
+            return number
+    known = f"versions {rows[-1]['version']} of {rows[-1]['time']} to {rows[0]['version']} of {rows[0]['time']}"
+    raise SettingsError(f"{remote} has no snapshot as of {as_of}, but {known}: vplog map log {remote}")
 
 
 def _entries(layer: dict[str, dict[str, Any]]) -> int:

@@ -28,7 +28,7 @@ VACUUM_S = 86_400
 """Age below which nothing is removed: no upload of a drive takes a day."""
 _PROBE = ".conditional-writes"
 """An empty object that no write may replace, for the store itself to show that it heeds conditions."""
-_OWN = ("runs", "rest", "libraries", "snapshots", "joins", "joint", *TABLES, *older_maps.NAMES)
+_OWN = ("runs", "packs", "rest", "libraries", "snapshots", "joins", "joint", *TABLES, *older_maps.NAMES)
 """Names in a map's folder that are of vplog."""
 _FIGURES = ("counts", "totals", "warnings", "descriptor_bits")
 """Fields of run.json that `map info` shows."""
@@ -94,13 +94,13 @@ def publish(mirror: Mirror, drive: str, made: Path) -> str:
     found = list[str]()
 
     def change(snapshot: Snapshot) -> None:
-        _check_recent(began)
+        check_recent(began)
         found[:] = _same_drive(mirror, snapshot["drives"], record)
         if not found:
             _check_untouched(mirror, snapshot, drive)
             _replace_drive(snapshot, drive)
             snapshot["drives"][drive] = entry
-            snapshot["copies"] |= copies
+            snapshot["copies"] |= copies if snapshot.get("by_drive", True) else {}
             snapshot["failures"].pop(drive, None)
 
     try:
@@ -117,11 +117,11 @@ def publish(mirror: Mirror, drive: str, made: Path) -> str:
         if name not in RUN_TABLES:  # a batch would fill the disk
             (made / name).unlink()
     mirror.adopt(drive, entry, made)
-    _copy(mirror, copies)
+    _copy(mirror, {name: source for name, source in mirror.manifest.now["copies"].items() if name in copies})
     return drive
 
 
-def _check_recent(began: float) -> None:
+def check_recent(began: float) -> None:
     """Raises ResultError where what was sent may be removed as that of a killed writer."""
     if not 0 <= time.time() - began < VACUUM_S:
         raise ResultError("This writer was stopped for too long, so what it sent may be gone. Run again.")
@@ -147,7 +147,9 @@ def _check_untouched(mirror: Mirror, snapshot: Snapshot, drive: str) -> None:
 def _replace_drive(snapshot: Snapshot, drive: str) -> None:
     """Take a drive out, and note when."""
     if (old := snapshot["drives"].pop(drive, None)) is not None:
-        snapshot["replaced"][f"runs/{folder_name(drive)}/{old['generation']}"] = now()
+        tokens = {about["pack"]["token"] for about in old["files"].values() if "pack" in about}
+        places = [f"runs/{folder_name(drive)}/{old['generation']}", *(f"packs/{token}" for token in tokens)]
+        snapshot["replaced"] |= dict.fromkeys(places, now())
 
 
 def _remove_quietly(place: RemotePath) -> None:
@@ -248,7 +250,7 @@ def send_rest(mirror: Mirror) -> None:
     components = _components(mirror.local / "joint.json") if {"joint.json"} & changes.keys() else None
 
     def change(snapshot: Snapshot) -> None:
-        _check_recent(began)
+        check_recent(began)
         contested = set(changes)
         if any(map(_of_order, changes)):  # drives are joined one after the other
             contested |= set(filter(_of_order, snapshot["rest"]))
@@ -297,16 +299,40 @@ def _components(path: Path) -> dict[str, str]:
     return {}
 
 
+def drop_copies(mirror: Mirror) -> None:
+    """Remove the tables that are copied by drive, for Delta tables have the same, and make no more. What is left of
+    them `vacuum` removes. Raises ResultError."""
+
+    def change(snapshot: Snapshot) -> None:
+        snapshot["by_drive"] = False
+        left = snapshot["copies"].items()
+        snapshot["copies"] = {name: source for name, source in left if name.split("/")[0] not in TABLES}
+
+    if mirror.manifest.now.get("by_drive", True):
+        mirror.commit("tables by drive dropped", change)
+        for name in TABLES:
+            _remove_quietly(mirror.remote / name)
+
+
 def vacuum(mirror: Mirror, hours: float) -> dict[str, int]:
     """Remove what was replaced more than `hours` ago, and what no snapshot names and is as old; how many objects and
     bytes. Raises ResultError."""
     snapshot, before = mirror.manifest.now, datetime.now(UTC) - timedelta(hours=hours)
     kept = {name for name, when in snapshot["replaced"].items() if datetime.fromisoformat(when) > before}
-    kept |= {f"runs/{folder_name(drive)}/{entry['generation']}" for drive, entry in snapshot["drives"].items()}
+    for drive, entry in snapshot["drives"].items():
+        place = f"runs/{folder_name(drive)}/{entry['generation']}"
+        if "packed" in entry and datetime.fromisoformat(entry["packed"]) <= before:
+            kept |= {f"{place}/{name}" for name, about in entry["files"].items() if "pack" not in about}
+        else:
+            kept.add(place)
+    kept |= {f"packs/{token}" for token in snapshot.get("packs", {})}
     kept |= {f"rest/{about['generation']}/{name}" for name, about in snapshot["rest"].items()}
     kept |= {f"libraries/{digest}" for digest in snapshot["libraries"]}
-    kept |= {row["object"] for row in [*mirror.manifest.log[:1], *(row for row, _ in mirror.manifest.layers)]}
-    kept |= {f"{name}/{folder_name(drive)}/{name}.parquet" for drive in snapshot["drives"] for name in TABLES}
+    log = mirror.manifest.log
+    recent = [row for row, newer in zip(log[1:], log, strict=False) if datetime.fromisoformat(newer["time"]) > before]
+    kept |= {row["object"] for row in [*log[:1], *recent, *(row for row, _ in mirror.manifest.layers)]}
+    if snapshot.get("by_drive", True):
+        kept |= {f"{name}/{folder_name(drive)}/{name}.parquet" for drive in snapshot["drives"] for name in TABLES}
     kept |= snapshot["rest"].keys()
     removed = {"objects": 0, "bytes": 0}
     with store_errors(mirror.remote):
