@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vplog.data import Floats, Gps
+from vplog.data import Floats, Gps, Ints
 from vplog.errors import ResultError, SettingsError, plural
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.geo import Earth, on_earth
@@ -101,29 +101,38 @@ def box_of_fixes(gps: Gps | None, radius_m: float, name: str) -> Box:
     return box_around(latitude.min(), longitude.min(), latitude.max(), longitude.max(), radius_m)
 
 
-def drives_within(
-    drives: Mapping[str, Mapping[str, Any]], wanted: Sequence[str], box: Box | None, name: str
-) -> tuple[list[str], list[str]]:
-    """The drives of a map that are wanted, all of them if none is, and may have places in a box; and warnings.
+class DriveBounds:
+    """Where each drive of a map is on earth."""
 
-    A drive whose place on earth is not known is not in any box. Raises SettingsError where the map has no drive of such
-    a name, and ResultError where none is left.
-    """
-    if unknown := [drive for drive in wanted if drive not in drives]:
-        raise SettingsError(f"{name} has no drive {unknown[0]!r}. `vplog map info {name}` names them.")
-    chosen, warnings = [drive for drive in drives if not wanted or drive in wanted], list[str]()
-    if box is None:
-        return chosen, warnings
-    bounds = {drive: bounds_of(drives[drive].get("earth")) for drive in chosen}
-    within = [drive for drive, own in bounds.items() if own is not None and _overlap(own, box)]
-    unplaced = sum(own is None for own in bounds.values())
-    without = f"{plural(unplaced, 'drive')} of {len(chosen)} without a place on earth."
-    if not within:
-        raise ResultError(f"No drive of {name} is in the box that is searched; {without}")
-    return within, [f"Not searched: {without}"] if unplaced else []
+    def __init__(self, drives: Mapping[str, Mapping[str, Any]]) -> None:
+        """`drives` are records by name."""
+        self.names = list(drives)
+        nowhere = [math.nan] * 4
+        found = [bounds_of(record.get("earth")) or nowhere for record in drives.values()]
+        self._bounds = np.array(found, np.float64).reshape(-1, 4)
+
+    def within(self, wanted: Sequence[str], box: Box | None, name: str) -> tuple[Ints, list[str]]:
+        """Numbers of the drives that are wanted, all of them if none is, and may have places in a box; and warnings.
+
+        A drive whose place on earth is not known is in no box. Raises SettingsError where the map of this name has no
+        such drive, and ResultError where none is left.
+        """
+        if unknown := set(wanted).difference(self.names) if wanted else set():
+            raise SettingsError(f"{name} has no drive {min(unknown)!r}. `vplog map info {name}` names them.")
+        chosen = np.flatnonzero(np.isin(self.names, wanted)) if wanted else np.arange(len(self.names))
+        if box is None:
+            return chosen, []
+        bounds = self._bounds[chosen]
+        within, unplaced = chosen[_overlap(bounds, box)], int(np.isnan(bounds[:, 0]).sum())
+        without = f"{plural(unplaced, 'drive')} of {len(chosen)} without a place on earth."
+        if not len(within):
+            raise ResultError(f"No drive of {name} is in the box that is searched; {without}")
+        return within, [f"Not searched: {without}"] if unplaced else []
 
 
-def _overlap(bounds: Sequence[float], box: Box) -> bool:
+def _overlap(bounds: Floats, box: Box) -> NDArray[np.bool_]:
+    """(N,) which bounds (N, 4) meet the box; those of NaN meet none."""
     south, west, north, east = box
     parts = [(west, east)] if west <= east else [(west, 180.0), (-180.0, east)]
-    return bounds[0] <= north and bounds[2] >= south and any(bounds[1] <= b and bounds[3] >= a for a, b in parts)
+    along = np.logical_or.reduce([(bounds[:, 1] <= b) & (bounds[:, 3] >= a) for a, b in parts])
+    return (bounds[:, 0] <= north) & (bounds[:, 2] >= south) & along

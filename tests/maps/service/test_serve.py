@@ -172,11 +172,12 @@ def test_boxes_around_a_point_and_drives_within_them() -> None:
         "far": {"earth": {"bounds": [10.0, 0.0, 10.1, 0.1]}},
         "nowhere": {},
     }
-    chosen, warnings = geo_bounds.drives_within(drives, (), over, "MAP")
-    assert chosen == ["east", "west"]
+    bounds = geo_bounds.DriveBounds(drives)
+    chosen, warnings = bounds.within((), over, "MAP")
+    assert chosen.tolist() == [0, 1]
     assert warnings == ["Not searched: 1 drive of 4 without a place on earth."]
-    assert geo_bounds.drives_within(drives, ["far"], None, "MAP")[0] == ["far"]
+    assert bounds.within(["far"], None, "MAP")[0].tolist() == [2]
     with pytest.raises(ResultError, match="No drive of MAP is in the box"):
-        geo_bounds.drives_within(drives, ["far"], over, "MAP")
+        bounds.within(["far"], over, "MAP")
     with pytest.raises(SettingsError, match="no drive 'none'"):
-        geo_bounds.drives_within(drives, ["none"], None, "MAP")
+        bounds.within(["none"], None, "MAP")

@@ -57,7 +57,9 @@ class SegmentView:
 
     def of(self, numbers: Iterable[int]) -> SegmentView:
         """Without the drives of other numbers."""
-        return replace(self, numbers=np.where(np.isin(self.numbers, list(numbers)), self.numbers, np.int32(-1)))
+        return replace(
+            self, numbers=np.where(np.isin(self.numbers, np.fromiter(numbers, np.int32)), self.numbers, np.int32(-1))
+        )
 
 
 def update_index(

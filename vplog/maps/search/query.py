@@ -15,7 +15,7 @@ from vplog.data import Floats, Ints, Keyframes
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
-from vplog.maps.geo_bounds import box_of_fixes, drives_within
+from vplog.maps.geo_bounds import DriveBounds, box_of_fixes
 from vplog.maps.search.exact import Answers, best_places
 from vplog.maps.search.index import SegmentView, place_keyframes, update_index
 from vplog.maps.search.probability import answer_probabilities
@@ -77,7 +77,7 @@ def query_map(
     if (out := query.out) is not None:
         check_file_output(out)
     with map_store.reading(root, query.cache, query.as_of) as store:
-        _, pipeline, state = open_map(store, execution)
+        known, pipeline, state = open_map(store, execution)
         settings = pipeline.sequence
         if query.sequence is not None:
             settings = SequenceSettings.read({**settings.model_dump(), "length": query.sequence}, "--sequence")
@@ -86,16 +86,17 @@ def query_map(
             settings = settings.model_copy(update={"length": 1})  # pictures are spaced as they come
         if query.near_fixes_m is not None:
             query = replace(query, box=box_of_fixes(log.gps(), query.near_fixes_m, log.name))
-        drives_within(map_store.common_library(store)[1], query.drives, query.box, str(store))  # before any work
+        DriveBounds(known).within(query.drives, query.box, str(store))  # before any work
         stamps, descriptors, warnings = describe_log(log, pipeline, state, execution)
 
         def attempt() -> tuple[list[str], Answers, list[str], pa.Table, list[dict[str, Any]]]:
             drives = map_store.common_library(store)[1]
-            chosen, short = drives_within(drives, query.drives, query.box, str(store))
-            short += _short_drives(store, chosen, settings.length)
-            part = replace(query, drives=chosen)
+            names = list(drives)
+            numbers, short = DriveBounds(drives).within(query.drives, query.box, str(store))
+            numbered = {number: names[number] for number in numbers.tolist()}
+            short += _short_drives(store, numbered.values(), settings.length)
+            part = replace(query, drives=list(numbered.values()))
             answers, more = search(store, drives, state, descriptors, part, settings, execution)
-            numbered = _numbered(drives, chosen)
             p_match = answer_probabilities(store, numbered, state, descriptors, answers, settings, execution)
             table = _table(store, list(drives), answers, stamps, p_match)
             return list(drives), answers, short + more, table, _named(store, drives, table, log)
@@ -226,7 +227,8 @@ def search(
     Ties go to the earlier drive, then row. Single views are ranked exactly, by the map's index where the recogniser is
     `bobb`. Lines are drawn in every drive of a map of up to EXACT_PLACES, else in the likely ones (`sequences.py`).
     """
-    numbered = _numbered(drives, query.drives or drives)
+    wanted = set(query.drives or drives)
+    numbered = {number: drive for number, drive in enumerate(drives) if drive in wanted}
     count, warnings, executor = len(numbered), list[str](), query.executor
     if not isinstance(state, CodedState):
         places = sum(store.rows("descriptors", drive) for drive in numbered.values())
@@ -247,12 +249,6 @@ def search(
         elif executor is not None:
             warnings.append(f"Ray was not used: sequences in maps of up to {EXACT_PLACES} places are searched here.")
     return best_lines(store, numbered, state, descriptors, min(query.top, places), settings, execution), warnings
-
-
-def _numbered(drives: Iterable[str], chosen: Iterable[str]) -> dict[int, str]:
-    """The chosen ones of the drives of a map, by number."""
-    wanted = set(chosen)
-    return {number: drive for number, drive in enumerate(drives) if drive in wanted}
 
 
 def _short_drives(store: Store, drives: Iterable[str], length: int) -> list[str]:

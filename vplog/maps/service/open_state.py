@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from vplog.data import Int32s, Ints
 from vplog.errors import VplogError
 from vplog.execution.execution import Execution
-from vplog.maps.geo_bounds import drives_within
+from vplog.maps.geo_bounds import DriveBounds
 from vplog.maps.localization.places import opened
 from vplog.maps.search.exact import best_places
 from vplog.maps.search.index import SegmentView, place_keyframes, update_index
@@ -54,20 +54,23 @@ class OpenState:
             return sum(part.places for part in self.parts)
         return sum(self.store.rows("descriptors", drive) for drive in self.drives)
 
+    @cached_property
+    def _bounds(self) -> DriveBounds:
+        return DriveBounds(self.drives)
+
     def answers(self, descriptors: Sequence[Any], query: MapQuery) -> tuple[list[dict[str, Any]], list[str]]:
         """The best places for each view by itself, best first, as plain values; and warnings."""
-        chosen, warnings = drives_within(self.drives, query.drives, query.box, str(self.store))
+        names = self._bounds.names
+        numbers, warnings = self._bounds.within(query.drives, query.box, str(self.store))
         if isinstance(self.state, CodedState):
-            wanted = set(chosen)
-            numbers = [number for number, drive in enumerate(self.drives) if drive in wanted]
             parts = [part for one in self.parts if (part := one.of(numbers)).places]
             top = min(query.top, sum(part.places for part in parts))
             found = best_places(parts, self.state, descriptors, top)
         else:
-            only = MapQuery(query.top, drives=chosen)
+            only = MapQuery(query.top, drives=[names[number] for number in numbers.tolist()])
             found, more = search(self.store, self.drives, self.state, descriptors, only, SequenceSettings(length=1))
             warnings += more
-        names, answers = list(self.drives), []
+        answers = []
         for view, count in enumerate(found.count.tolist()):
             for rank in range(count):
                 drive, row = names[int(found.drive[view, rank])], int(found.keyframe[view, rank])
