@@ -8,7 +8,6 @@ import os
 import shutil
 from concurrent.futures import Future
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -98,11 +97,9 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def quick() -> Iterator[None]:
-    """No line a minute on stderr, however slow the machine; one parser of all verbs, which takes 25 ms to make; and no
-    waiting for the disk."""
+    """No line a minute on stderr, however slow the machine, and no waiting for the disk."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(progress, "LINE_EVERY_S", 1e9)
-        patch.setattr(main, "_parser", cache(main._parser))
         patch.setattr(os, "fsync", lambda _: None)
         yield
 

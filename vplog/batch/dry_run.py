@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from vplog import logs
 from vplog.batch.plan import common_record, plan_drives, with_topics
 from vplog.batch.worker import made_by
-from vplog.cache.input_hashes import files_of
+from vplog.cache.input_hashes import bytes_of, files_of
 from vplog.errors import ResultError, VplogError
 from vplog.maps.storage import map_store
 from vplog.places.library_files import read_library_record
@@ -100,8 +100,7 @@ def _sizes(one: PlannedDrive) -> dict[str, Any]:
 
 
 def _bytes(path: Path) -> int:
-    files = path.rglob("*") if path.is_dir() else [path]
-    return sum(file.stat().st_size for file in files if isinstance(file, RemotePath) or file.is_file())
+    return path.stat().st_size if isinstance(path, RemotePath) else bytes_of(path)
 
 
 def _cpu_s_per_image(store: Store) -> tuple[float, int]:
