@@ -82,6 +82,11 @@ class SiftSettings(Settings):
         )
 
     @property
+    def coarse(self) -> SiftSettings | None:
+        """The same without the smallest features, in a third of the time; None where these are left out already."""
+        return self.model_copy(update={"doubled": False}) if self.doubled else None
+
+    @property
     def least_features(self) -> int:
         """`min_features`, a third of it without the smallest features, and no more than are wanted."""
         return min(self.min_features if self.doubled else self.min_features // 3, self.max_features)

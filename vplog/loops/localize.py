@@ -4,7 +4,7 @@ that agree."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -125,15 +125,30 @@ def localize(
 
 
 def _verified(query: _Query, places: Sequence[KeyframeLandmarks]) -> list[_Fit]:
-    """The picture against each place, most matches first. A pose that one gives is tried on the next before any is
-    sampled: places around a picture agree, and one elsewhere does not."""
+    """The picture against each place, most matches first. Once there is a pose, a place that cannot have a rival of it
+    has no pose of its own and adds the landmarks that agree; at another that pose is tried before any is sampled."""
     matched = [_matched(query, place) for place in places]
-    fits, world_from_camera = list[_Fit](), None
+    fits, best = list[_Fit](), None
     for number in sorted(range(len(places)), key=lambda number: -len(matched[number][0])):
-        fits.append(_fitted(query, number, places[number], *matched[number], world_from_camera))
-        if world_from_camera is None:
-            world_from_camera = fits[-1].world_from_camera
+        place, fit = places[number], _Fit(number, *matched[number], Pose(Verdict.TOO_FEW_INLIERS, 0, 0.0))
+        if best is None or _may_be_rival(query, fit, place, best, places[best.place].world_from_camera):
+            fit = _fitted(query, fit, place, None if best is None else best.world_from_camera)
+        if fit.world_from_camera is not None and (best is None or fit.pose.inliers > best.pose.inliers):
+            best = fit
+        fits.append(fit)
     return sorted(fits, key=lambda fit: fit.place)
+
+
+def _may_be_rival(query: _Query, fit: _Fit, place: KeyframeLandmarks, best: _Fit, anchor: Floats) -> bool:
+    """Whether a place's matches may give a pose elsewhere with as many inliers as the best one has, which is of the
+    place with the camera `anchor` (4, 4): whether so many disagree with it, and a pose may be so far off."""
+    metric, start, least = query.settings.metric, best.pose.match_from_query, _rival_inliers(best.pose.inliers)
+    if start is None or best.world_from_camera is None or len(fit.mine) <= least:
+        return False
+    apart = np.linalg.norm(place.world_from_camera[:3, 3] - best.world_from_camera[:3, 3])
+    if apart + metric.max_depths / place.landmarks.rho[fit.rows].min() < metric.max_distance_m:
+        return False
+    return len(fit.mine) - len(_agreeing(query, fit, place, anchor, start)[2]) > least
 
 
 def _matched(query: _Query, place: KeyframeLandmarks) -> tuple[Ints, Ints]:
@@ -143,15 +158,15 @@ def _matched(query: _Query, place: KeyframeLandmarks) -> tuple[Ints, Ints]:
     return mine[usable], rows[usable]
 
 
-def _fitted(query: _Query, number: int, place: KeyframeLandmarks, mine: Ints, rows: Ints, start: Floats | None) -> _Fit:
+def _fitted(query: _Query, fit: _Fit, place: KeyframeLandmarks, start: Floats | None) -> _Fit:
     """The picture's pose by its matches with one place; `start` is world_from_camera (4, 4) to try first."""
-    if len(mine) < query.settings.metric.min_inliers:
+    if len(fit.mine) < query.settings.metric.min_inliers:
         few = Verdict.TOO_FEW_MATCHES if place.landmarks.known.any() else Verdict.TOO_FEW_LANDMARKS
-        return _Fit(number, mine, rows, Pose(few, 0, 0.0))
+        return replace(fit, pose=Pose(few, 0, 0.0))
     start = None if start is None else se3.between(place.world_from_camera, start)
-    pose = query.solve(place.landmarks, rows, mine, start)
+    pose = query.solve(place.landmarks, fit.rows, fit.mine, start)
     found = pose.match_from_query
-    return _Fit(number, mine, rows, pose, None if found is None else place.world_from_camera @ found)
+    return replace(fit, pose=pose, world_from_camera=None if found is None else place.world_from_camera @ found)
 
 
 def _is_rival(fit: _Fit, best: _Fit, settings: VerifySettings) -> bool:
@@ -163,8 +178,12 @@ def _is_rival(fit: _Fit, best: _Fit, settings: VerifySettings) -> bool:
     if fit.world_from_camera is None or best.world_from_camera is None:
         return False
     apart = np.linalg.norm(fit.world_from_camera[:3, 3] - best.world_from_camera[:3, 3])
-    alike = fit.pose.inliers > best.pose.inliers - _RIVAL_SIGMA * np.sqrt(best.pose.inliers)
-    return bool(apart >= settings.metric.max_distance_m and alike)
+    return bool(apart >= settings.metric.max_distance_m and fit.pose.inliers > _rival_inliers(best.pose.inliers))
+
+
+def _rival_inliers(best: int) -> float:
+    """Inliers that a pose has more of where it is as good as one with `best` of them, but for their count's noise."""
+    return best - _RIVAL_SIGMA * best**0.5
 
 
 def _refined(query: _Query, fits: Sequence[_Fit], best: _Fit, places: Sequence[KeyframeLandmarks]) -> Localization:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,19 +22,18 @@ from vplog.geometry.masking import masked
 from vplog.loops.localize import Localization, localize
 from vplog.results.geo import on_earth
 from vplog.results.tables import POSE_COLUMNS
-from vplog.stages import EncodedFrame, FrameState, Log, PlaceState, StoredState
+from vplog.stages import EncodedFrame, Extractor, FrameState, Log, PlaceState, StoredState
 from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
     from vplog.maps.localization.places import Places
-    from vplog.pipeline import Pipeline
 
 TOP = 10
 """Places that a picture is verified against."""
 _AROUND = 2
 """Keyframes before and after the likeliest of each drive that are looked at too: they see the same landmarks."""
-_BLOCK = 64
-"""Pictures whose features are in memory at once, some 20 MB."""
+_BLOCK = 16
+"""Pictures that are in memory at once, some 20 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +104,7 @@ def localize_image(places: Places, image: Bytes | Path | str, camera: Camera | P
 
 
 def localize_frame(places: Places, frame: Frame, execution: Execution) -> LocalizedPicture:
-    picture = described(places.state, places.pipeline, frame, places.name)
-    return next(_localized(places, [picture], execution, TOP, {}))
+    return next(_localized(places, [_first_look(places, frame)], execution, TOP, {}))
 
 
 def _frame(image: Bytes | Path | str, camera: Camera | Path | str) -> Frame:
@@ -138,6 +137,8 @@ class Picture:
     features: Features | None
     descriptor: Any = None
     problem: str = ""
+    closer: Callable[[], Picture] | None = None
+    """Describes it again, with its smallest features; None where these are there already."""
 
 
 def _described(places: Places, frames: Iterator[EncodedFrame], execution: Execution) -> Iterator[Picture]:
@@ -145,26 +146,47 @@ def _described(places: Places, frames: Iterator[EncodedFrame], execution: Execut
 
     def work(encoded: EncodedFrame) -> Picture:
         try:
-            return described(places.state, places.pipeline, encoded.decode(colour), places.name)
+            return _first_look(places, encoded.decode(colour))
         except LogError as error:
             return Picture(encoded.stamp_ns, None, None, problem=str(error))
 
     return execution.map(work, frames, ahead=2)
 
 
-def described(state: PlaceState, pipeline: Pipeline, frame: Frame, name: str) -> Picture:
+def _first_look(places: Places, frame: Frame) -> Picture:
+    """A picture without its smallest features, which take two thirds of the time and few pictures need."""
+    full = places.pipeline.features
+    if full.coarse is None:
+        return described(places.state, full, frame, places.name)
+    closer = partial(described, places.state, full, frame, places.name)
+    return replace(described(places.state, full.coarse, frame, places.name), closer=closer)
+
+
+def described(state: PlaceState, extractor: Extractor, frame: Frame, name: str) -> Picture:
     """A picture as the places of a run or map of this name are described. Raises LibraryError where it cannot be."""
     if isinstance(state, StoredState):
         raise LibraryError(
             f"The places of {name} have descriptors from a file, which new pictures lack. Make the map with a "
             "recogniser that describes pictures: --set places.kind=bobb."
         )
-    features = describe(pipeline.features, frame)  # depths of a pair would cost as much again, and add little
+    features = describe(extractor, frame)  # depths of a pair would cost as much again, and add little
     descriptor = state.describe_frame(masked(frame)) if isinstance(state, FrameState) else state.describe(features)
     return Picture(frame.stamp_ns, frame.camera, features, descriptor)
 
 
 def _localized(
+    places: Places, block: Sequence[Picture], execution: Execution, top: int, names: dict[int, str]
+) -> Iterator[LocalizedPicture]:
+    """The answers for some pictures; those without a pose are looked at once more with all their features."""
+    found = list(_answers(places, block, execution, top, names))
+    again = [at for at, one in enumerate(block) if one.closer is not None and not found[at].localized]
+    closer = list(execution.map(lambda at: block[at].closer(), again)) if again else []
+    for at, one in zip(again, _answers(places, closer, execution, top, names), strict=True):
+        found[at] = one
+    return iter(found)
+
+
+def _answers(
     places: Places, block: Sequence[Picture], execution: Execution, top: int, names: dict[int, str]
 ) -> Iterator[LocalizedPicture]:
     sound = [one for one in block if one.features is not None]

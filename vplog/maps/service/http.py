@@ -171,7 +171,7 @@ def _answered(now: OpenState, body: bytes, query: MapQuery, limits: Limits) -> d
             descriptors = _descriptors(now, folder / "descriptors.parquet", body, limits)
         else:
             frame = _frame(folder / "image", body, None, isinstance(now.state, FrameState) and now.state.colour)
-            descriptors = [described(now.state, now.pipeline, frame, str(now.store)).descriptor]
+            descriptors = [described(now.state, now.pipeline.features, frame, str(now.store)).descriptor]
     answers, warnings = now.answers(descriptors, query)
     return {"library": now.state.hash, "views": len(descriptors), "answers": answers, "warnings": warnings}
 
