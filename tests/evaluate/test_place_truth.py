@@ -22,6 +22,13 @@ if TYPE_CHECKING:
     from vplog.data import Floats, Ints
     from vplog.stages import Log
 
+PICTURES = [
+    (["60.png", "68.png"], ["000068.png", "000060.png"], [[1], [0]]),
+    (["day1_7_left.png", "day1_9_left.png"], ["0009.png", "0007.png"], [[1], [0]]),
+    (["60_2.png"], ["60_1.png", "61_1.png"], [[0]]),
+    (["61_0.png", "60_1.png"], ["cam0_60_1.png", "cam0_61_1.png"], [[1], [0]]),
+]
+"""Names of query and map, and the rows of the same picture."""
 METRES_A_DEGREE = 6_378_137.0 * np.pi / 180.0
 """Of longitude at the equator."""
 
@@ -37,12 +44,13 @@ class Recorded:
     """(T, 2) m east and north of the equator at longitude 0, at the frames' stamps."""
 
     body_from_camera: Floats = field(default_factory=lambda: np.eye(4))
+    names: list[str] | None = None
 
     def stamps(self) -> Ints:
         return self.stamp_ns
 
     def file_names(self) -> list[str] | None:
-        return None
+        return self.names
 
     def camera(self) -> Camera:
         return Camera("camera", None, "none", np.zeros(0), 640, 480, self.body_from_camera)
@@ -75,6 +83,13 @@ def found_rows(choice: TruthChoice, query: Recorded, other: Recorded) -> list[li
     truth = open_truth(choice, cast("Log", query), cast("Log", other))
     pairs = truth.pairs(truth.query_frames, truth.map_frames)
     return [pairs.rows(q).tolist() for q in range(len(pairs))]
+
+
+@pytest.mark.parametrize(("query", "other", "rows"), PICTURES)
+def test_numbers_in_names_are_of_one_place_in_them(query: list[str], other: list[str], rows: list[list[int]]) -> None:
+    """A second number, of a camera or a crop, counts no pictures."""
+    here, there = (Recorded("", np.arange(len(names)), names=names) for names in (query, other))
+    assert found_rows(TruthChoice("index"), here, there) == rows
 
 
 def test_odometry_of_both_drives() -> None:

@@ -19,24 +19,29 @@ _DIGITS = 9
 
 
 def numbers_of(query: Sequence[str], match: Sequence[str]) -> tuple[Ints, Ints] | None:
-    """(Q,) and (M,) numbers in the names of two sets: in each the last that no other of the set has.
+    """(Q,) and (M,) numbers in the names of two sets: the last that no other of its set has, at one place from the end
+    where both have one there.
 
     None where one has no such number, or its names are times.
     """
     here, there = _own_numbers(query), _own_numbers(match)
-    return None if here is None or there is None else (here, there)
+    if not here or not there:
+        return None
+    both = min(here.keys() & there.keys(), default=None)
+    return here[min(here) if both is None else both], there[min(there) if both is None else both]
 
 
-def _own_numbers(names: Sequence[str]) -> Ints | None:
+def _own_numbers(names: Sequence[str]) -> dict[int, Ints]:
+    """The numbers in names that no two share, by their place from the end."""
     stems = [PurePosixPath(name).stem for name in names]
     if any(re.fullmatch(r"\d+\.\d+", stem) for stem in stems):
-        return None
-    found = [re.findall(r"\d+", stem) for stem in stems]
+        return {}
+    found, own = [re.findall(r"\d+", stem) for stem in stems], dict[int, Ints]()
     for at in range(1, 1 + min(map(len, found), default=0)):
         column = [numbers[-at] for numbers in found]
         if max(map(len, column)) <= _DIGITS and len(set(map(int, column))) == len(column):
-            return np.array(column, np.int64)
-    return None
+            own[at] = np.array(column, np.int64)
+    return own
 
 
 def folders_of(names: Sequence[str], drive: str) -> list[str]:

@@ -125,7 +125,7 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
     warnings = [line for line in dict.fromkeys(found.warnings + log.warnings + missing) if line not in problems]
     named = {**asdict(found), "warnings": warnings}
     timing = _timing(stamp_ns)
-    assumed = found.kind == "images" and np.array_equal(stamp_ns, np.arange(len(stamp_ns)) * PERIOD_NS)
+    assumed = found.kind in ("images", "utm-images") and np.array_equal(stamp_ns, np.arange(len(stamp_ns)) * PERIOD_NS)
     if assumed:  # as the names of the images hold no times
         timing["rate_hz"] = None
     for topic, entry in zip(found.topics, named["topics"], strict=True):

@@ -13,11 +13,6 @@ from vplog.geometry.utm_name import utm_name
 from vplog.logs.datasets.streams import DataSet, camera_streams, fix_stream
 from vplog.logs.image_folder import image_files, named_stamps, natural_order
 
-_UNORDERED = (
-    "The names hold no time: the images are taken in the order of their panoramas and tiles, 0.1 s apart, which need "
-    "not be that of a drive."
-)
-
 
 def roots(path: Path) -> list[Path]:
     first = next((file.name for file in path.iterdir() if file.suffix), "") if path.is_dir() else ""
@@ -25,7 +20,8 @@ def roots(path: Path) -> list[Path]:
 
 
 def read(path: Path) -> DataSet:
-    """The truth is positions in UTM, without orientations. Raises LogError where a name has no place."""
+    """The truth is positions in UTM, without orientations; without times the images are in the order of their panoramas
+    and tiles. Raises LogError where a name has no place."""
     found = {file: utm_name(file.name) for file in image_files(path)}
     named = {file: place for file, place in found.items() if place is not None}
     if bad := sorted(found.keys() - named):
@@ -45,4 +41,4 @@ def read(path: Path) -> DataSet:
         streams.append(fix_stream("position", Gps(stamp_ns, latitude_deg, longitude_deg, position[:, 2], unknown)))
     truth = Trajectory(stamp_ns, se3.pose(np.eye(3), position))
     names = {time_ns: file.name for time_ns, file in zip(stamp_ns.tolist(), files, strict=True)}
-    return DataSet("utm-images", streams, truth, [] if timed else [_UNORDERED], names)
+    return DataSet("utm-images", streams, truth, names=names)
