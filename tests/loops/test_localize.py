@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -12,6 +12,8 @@ from tests.loops.scene import NOISE_PX, camera, empty, pose, scene, view
 from vplog.data import Verdict
 from vplog.geometry import se3
 from vplog.loops.landmarks import from_depth
+from vplog.loops import localize as localize_module
+from vplog.loops import verify_metric
 from vplog.loops.localize import KeyframeLandmarks, landmarks_from, localize
 from vplog.loops.undistort import rays
 from vplog.loops.verify import VerifySettings
@@ -86,6 +88,37 @@ def test_a_picture_of_two_equal_places_is_at_neither() -> None:
     picture = view(world, pose(0.2), LENS, rng)
     assert localize(picture, LENS, [here, there], SETTINGS).verdict is Verdict.INCONSISTENT
     assert localize(picture, LENS, [here], SETTINGS).verdict is Verdict.ACCEPTED
+
+
+def test_places_that_cannot_be_rivals_change_no_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a pose fitted at every place the verdicts are the same, and the poses within their covariance."""
+    worlds, solved, solve = [], list[Any](), verify_metric.solve
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        world, far = scene(rng), pose(0.0, 0.0, rng.choice([2.0, 30.0]))
+        places = [place(world, pose(x), rng) for x in rng.uniform(0.0, 3.0, rng.integers(1, 5))]
+        copied = [one for one in places if rng.random() < 0.3]
+        places += [replace(one, world_from_camera=far @ one.world_from_camera) for one in copied]
+        worlds.append((view(world, pose(rng.uniform(0.0, 3.0)), LENS, rng), places))
+
+    def counted(*given: Any) -> Any:
+        solved.append(given)
+        return solve(*given)
+
+    monkeypatch.setattr(verify_metric, "solve", counted)
+    counts, found = [], []
+    for _ in range(2):
+        solved.clear()
+        found.append([localize(picture, LENS, places, SETTINGS) for picture, places in worlds])
+        counts.append(len(solved))
+        monkeypatch.setattr(localize_module, "_may_be_rival", lambda *_: True)
+    assert [one.verdict for one in found[0]] == [one.verdict for one in found[1]]
+    assert {Verdict.ACCEPTED, Verdict.INCONSISTENT} == {one.verdict for one in found[0]}
+    for fast, slow in zip(*found, strict=True):
+        if fast.world_from_camera is not None and slow.world_from_camera is not None and fast.covariance is not None:
+            error = se3.log(se3.between(fast.world_from_camera, slow.world_from_camera))
+            assert error @ np.linalg.solve(fast.covariance, error) < 6.0
+    assert counts[0] < 0.7 * counts[1]
 
 
 @pytest.mark.parametrize("count", [0, 1])
