@@ -17,7 +17,7 @@ from tests.maps.joining.test_join import digests
 from vplog.data import Ranking
 from vplog.execution.execution import Execution
 from vplog.maps.condensation.own_queries import PASSES, OwnPlaces, later_passes
-from vplog.maps.condensation.redundancy import OwnQueries, remove_redundant
+from vplog.maps.condensation.redundancy import OwnQueries, remove_cross_validated, remove_redundant
 from vplog.maps.joining.candidate_drives import places_of
 from vplog.maps.search.query import open_map
 from vplog.maps.storage import map_store
@@ -80,6 +80,30 @@ def test_no_more_queries_are_lost_than_may_be(most: int) -> None:
     assert np.diff(rest).min() > 1, "no gap is left while there are smaller ones"
     longer = remove_redundant(queries, np.zeros(60, np.int64), at, every, ~every, most + 3)
     assert longer.places[: len(removal.places)].tolist() == removal.places.tolist()
+
+
+def test_a_drive_not_seen_loses_no_more_than_is_stated() -> None:
+    """Queries of the same places with noise of their own, in the mean over maps. Counted by the queries that choose,
+    more are lost."""
+    every, stated, unseen = np.ones(80, np.bool_), 4, {True: list[int](), False: list[int]()}
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        at, queries = line(rng, 80, 3.0)
+        _, others = line(rng, 80, 3.0)
+        about = np.zeros(80, np.int64), at, every, ~every, stated
+        for folds, removal in (
+            (True, remove_cross_validated(queries, at % 2 == 0, *about)[0]),
+            (False, remove_redundant(queries, *about)),
+        ):
+            kept = every.copy()
+            kept[removal.places] = False
+            rows = [others.deeper(query, 80).rows for query in range(80)]
+            whole, small = (
+                sum(bool(others.right(query, one[kept_of_it[one]][:1])[0]) for query, one in enumerate(rows))
+                for kept_of_it in (every, kept)
+            )
+            unseen[folds].append(whole - small)
+    assert np.mean(unseen[True]) <= stated < np.mean(unseen[False])
 
 
 def test_places_that_later_drives_pass_without_finding_them_fade() -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from vplog.errors import SettingsError
 from vplog.execution.execution import Execution
 from vplog.maps.condensation.own_queries import OwnAnswers, OwnPlaces, query_own_places, read_own_places, search_of
-from vplog.maps.condensation.redundancy import remove_redundant
+from vplog.maps.condensation.redundancy import remove_cross_validated
 from vplog.maps.condensation.references import remove_references
 from vplog.maps.merge import copy_library, put_library
 from vplog.maps.search.query import open_map
@@ -54,7 +54,7 @@ class Condensed:
     retained: Bools
     """(N,) places that the new map has."""
     lost: int
-    """Queries that are not answered rightly any more, for want of a place."""
+    """Queries that are not answered rightly any more, for want of a place, where they did not choose which."""
     state: PlaceState
     whole: PlaceState
     """The recogniser of the map as it was."""
@@ -103,13 +103,12 @@ def condense_places(
     if isinstance(state, CodedState):
         places, answers, small = remove_references(places, answers, state, distance_m, most_lost // 2, execution)
     every = np.arange(len(posed))
-    removable = posed & (np.isin(every, answers.place) | answers.faded)
+    removable, along_m = posed & (np.isin(every, answers.place) | answers.faded), np.cumsum(places.steps_m())
     total = int(removable.sum())
-    removal = remove_redundant(
-        answers.queries, places.drive, np.cumsum(places.steps_m()), removable, answers.faded,
+    removal, lost = remove_cross_validated(
+        answers.queries, answers.place % 2 == 0, places.drive, along_m, removable, answers.faded,
         most_lost - (len(asked.place) - len(answers.place)), lambda done: execution.progress("remove", done, total),
     )  # fmt: skip
-    lost = int(removal.lost[-1]) if len(removal.lost) else 0
     retained = ~np.isin(every, removal.places)
     return Condensed(places, answers, distance_m, retained, lost, small, state, asked)
 

@@ -32,6 +32,15 @@ class OwnQueries:
     right: Callable[[int, Int32s | Ints], Bools]
     """Whether places show that of a query."""
 
+    def some(self, chosen: Bools) -> OwnQueries:
+        """Those of the (Q,) queries."""
+        rows: list[int] = np.flatnonzero(chosen).tolist()
+        return OwnQueries(
+            [self.best[row] for row in rows],
+            lambda query, top: self.deeper(rows[query], top),
+            lambda query, others: self.right(rows[query], others),
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Removal:
@@ -146,13 +155,36 @@ class _Gaps:
         self.before[after] = before if before < place else after
 
 
+def remove_cross_validated(
+    queries: OwnQueries, fold: Bools, drive: Ints, along_m: Floats, removable: Bools, faded: Bools, most_lost: int,
+    progress: Callable[[int], None] = lambda _: None,
+) -> tuple[Removal, int]:  # fmt: skip
+    """Remove as many places (N,) as cost at most so many of the queries (Q,), and how many these cost.
+
+    Queries that choose what goes lose hardly any of their own answers by it, and a drive that the map has not seen
+    does. So how many go is decided by the queries of one fold (Q,) on what those of the other choose, both ways round;
+    which ones, by all. Both folds are to be everywhere: where none chooses, more goes.
+    """
+    about, losses = (drive, along_m, removable, faded), list[Ints]()
+    for choosing in (fold, ~fold):
+        judges = queries.some(~choosing)
+        losses.append(remove_redundant(queries.some(choosing), *about, most_lost, judges=judges).lost)
+    count = min(map(len, losses))
+    lost = losses[0][:count] + losses[1][:count]
+    most = int(np.argmax([*(lost > most_lost), True]))
+    removal = remove_redundant(queries, *about, len(fold), progress, most=most)
+    return removal, int(lost[most - 1]) if most else 0
+
+
 def remove_redundant(
     queries: OwnQueries, drive: Ints, along_m: Floats, removable: Bools, faded: Bools, most_lost: int,
-    progress: Callable[[int], None] = lambda _: None,
+    progress: Callable[[int], None] = lambda _: None, judges: OwnQueries | None = None, most: int | None = None,
 ) -> Removal:  # fmt: skip
-    """Remove places (N,) of drives, in their order and so far along them, as long as at most so many queries are lost.
-    `faded` ones that cost no query go before all others; of each drive one place stays."""
+    """Remove places (N,) of drives, in their order and so far along them, as long as at most so many queries are lost:
+    of `judges`, which have no say in what goes, where these are given. `faded` ones that cost no query go before all
+    others; of each drive one place stays. No more than `most` go."""
     remaining = _Remaining(queries, np.ones(len(drive), np.bool_))
+    judging = remaining if judges is None else _Remaining(judges, np.ones(len(drive), np.bool_))
     gaps, left, lost, order, losses = _Gaps.of(drive, along_m), np.bincount(drive), 0, list[int](), list[int]()
 
     def key(place: int) -> tuple[float, int, float, int]:
@@ -162,7 +194,7 @@ def remove_redundant(
 
     heap = [key(place) for place in np.flatnonzero(removable).tolist()]
     heapq.heapify(heap)
-    while heap:
+    while heap and (most is None or len(order) < most):
         place = heapq.heappop(heap)[-1]
         if left[drive[place]] == 1:
             continue
@@ -170,11 +202,13 @@ def remove_redundant(
         if heap and now > heap[0]:
             heapq.heappush(heap, now)
             continue
-        if lost + now[1] > most_lost:
+        lost += judging.cost(place)[0]
+        if lost > most_lost:
             break
         remaining.remove(place)
+        if judging is not remaining:
+            judging.remove(place)
         gaps.remove(place)
-        lost += now[1]
         left[drive[place]] -= 1
         order.append(place)
         losses.append(lost)
