@@ -11,9 +11,9 @@ import pytest
 from tests.loops.scene import NOISE_PX, camera, empty, pose, scene, view
 from vplog.data import Verdict
 from vplog.geometry import se3
-from vplog.loops.landmarks import from_depth
 from vplog.loops import localize as localize_module
 from vplog.loops import verify_metric
+from vplog.loops.landmarks import from_depth
 from vplog.loops.localize import KeyframeLandmarks, landmarks_from, localize
 from vplog.loops.undistort import rays
 from vplog.loops.verify import VerifySettings
