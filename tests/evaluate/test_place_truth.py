@@ -27,6 +27,8 @@ PICTURES = [
     (["day1_7_left.png", "day1_9_left.png"], ["0009.png", "0007.png"], [[1], [0]]),
     (["60_2.png"], ["60_1.png", "61_1.png"], [[0]]),
     (["61_0.png", "60_1.png"], ["cam0_60_1.png", "cam0_61_1.png"], [[1], [0]]),
+    (["hall/0.png", "hall/1.png", "lift/0.png"], ["lift/00.png", "lift/01.png", "hall/01.png"], [[], [2], [0]]),
+    (["left/4.png"], ["right/04.png", "right/05.png"], [[0]]),
 ]
 """Names of query and map, and the rows of the same picture."""
 METRES_A_DEGREE = 6_378_137.0 * np.pi / 180.0

@@ -510,7 +510,8 @@ def print_condensed(found: dict[str, Any]) -> None:
         f"own queries  {asked['places']}: {asked['by_other_drives']} answered by other drives, "
         f"{asked['by_own_drive']} by their own, {asked['alone']} by no other place, within {found['distance_m']:g} m"
     )
-    print(f"recall       {recall['before']:.4f} before, {recall['after']:.4f} after; {found['loss']:g} may be lost")
+    after = f"{recall['after']:.4f} after, by queries that did not choose what goes"
+    print(f"recall       {recall['before']:.4f} before, {after}; {found['loss']:g} may be lost")
     if found["faded"]["found"]:
         print(f"faded        {found['faded']['found']} places, {found['faded']['removed']} of them removed")
     library, known = found["library_bytes"], found["references"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -18,29 +18,34 @@ _DIGITS = 9
 """Longest number that counts images; longer ones are times."""
 
 
-def numbers_of(query: Sequence[str], match: Sequence[str]) -> tuple[Ints, Ints] | None:
+def numbers_of(query: Sequence[str], match: Sequence[str]) -> tuple[Ints, Ints, bool] | None:
     """(Q,) and (M,) numbers in the names of two sets: the last that no other of its set has, at one place from the end
-    where both have one there.
+    where both have one there; and whether folders are part of them, as where each counts its own images.
 
     None where one has no such number, or its names are times.
     """
-    here, there = _own_numbers(query), _own_numbers(match)
-    if not here or not there:
-        return None
-    both = min(here.keys() & there.keys(), default=None)
-    return here[min(here) if both is None else both], there[min(there) if both is None else both]
+    folders = sorted({str(PurePosixPath(name).parent) for name in (*query, *match)})
+    number = {folder: at for at, folder in enumerate(folders)}
+    for by_folder in (False, True):
+        here, there = (_own_numbers(names, number if by_folder else {}) for names in (query, match))
+        if here and there:
+            both = min(here.keys() & there.keys(), default=None)
+            return here[min(here) if both is None else both], there[min(there) if both is None else both], by_folder
+    return None
 
 
-def _own_numbers(names: Sequence[str]) -> dict[int, Ints]:
-    """The numbers in names that no two share, by their place from the end."""
-    stems = [PurePosixPath(name).stem for name in names]
-    if any(re.fullmatch(r"\d+\.\d+", stem) for stem in stems):
+def _own_numbers(names: Sequence[str], folders: Mapping[str, int]) -> dict[int, Ints]:
+    """The numbers in names that no two share, by their place from the end; those of each of the numbered folders are
+    far from those of the others."""
+    paths = [PurePosixPath(name) for name in names]
+    if any(re.fullmatch(r"\d+\.\d+", path.stem) for path in paths):
         return {}
-    found, own = [re.findall(r"\d+", stem) for stem in stems], dict[int, Ints]()
+    found, own = [re.findall(r"\d+", path.stem) for path in paths], dict[int, Ints]()
+    first = [2 * 10**_DIGITS * folders.get(str(path.parent), 0) for path in paths]
     for at in range(1, 1 + min(map(len, found), default=0)):
         column = [numbers[-at] for numbers in found]
-        if max(map(len, column)) <= _DIGITS and len(set(map(int, column))) == len(column):
-            own[at] = np.array(column, np.int64)
+        if max(map(len, column)) <= _DIGITS and len(set(zip(first, map(int, column), strict=True))) == len(column):
+            own[at] = np.array(first, np.int64) + np.array(column, np.int64)
     return own
 
 

@@ -129,8 +129,11 @@ def _by_index(choice: TruthChoice, query: Log, other: Log) -> _Found:
     """By the numbers in file names, or by rows where these have none."""
     tolerance, names = choice.tolerance or 0, (query.file_names(), other.file_names())
     numbers = None if names[0] is None or names[1] is None else numbers_of(names[0], names[1])
-    by = "frame number, counted from 0 in each drive" if numbers is None else "number in the file name"
-    here, there = numbers or (np.arange(len(query.stamps())), np.arange(len(other.stamps())))
+    by = "frame number, counted from 0 in each drive"
+    here, there = (np.arange(len(log.stamps())) for log in (query, other))
+    if numbers is not None:
+        here, there, by_folder = numbers
+        by = "folder and number in the file name" if by_folder else "number in the file name"
     about = {"tolerance": tolerance, "by": "rows" if numbers is None else "names"}
     about["same_place"] = f"the same {by}" + (f", give or take {tolerance}" if tolerance else "")
     known, ordered = _all_frames(query, other), all(np.all(np.diff(one) > 0) for one in (here, there))
