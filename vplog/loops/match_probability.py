@@ -10,6 +10,8 @@ the more queries have one, the more cautious the probabilities are.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import scipy
 
@@ -73,6 +75,29 @@ def best_places(row: Float32s, extent: int) -> Floats:
         found[place] = score[at]
         score[max(at - extent, 0) : at + extent + 1] = -np.inf
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class LookAlikes:
+    """The best scores of places that look alike to each of Q queries, in the part of a map that its first answer is
+    of."""
+
+    best: Floats
+    """(Q, 3), NaN where there are no more."""
+    rows: Floats
+    """(Q,) places of that part."""
+
+    @classmethod
+    def of(cls, queries: int) -> LookAlikes:
+        """None yet."""
+        return cls(np.full((queries, 3), np.nan), np.ones(queries))
+
+    def take(self, scores: Float32s, rows: Ints, queries: Ints) -> None:
+        """The best of the (rows, M) scores of one part for some queries (V,), whose rows are (V,)."""
+        if len(rows):
+            extent = place_extent(scores[rows[np.unique(np.linspace(0, len(rows) - 1, _SAMPLED).astype(int))]])
+            self.best[queries] = [best_places(scores[row], extent) for row in rows.tolist()]
+            self.rows[queries] = scores.shape[1]
 
 
 def null_probabilities(found: Floats, null: Floats) -> Floats:

@@ -114,17 +114,21 @@ def sequence_rows(
 
 
 def rank_places(
-    index: PlaceIndex, descriptors: Sequence[Any], stops: Ints, k: int, settings: SequenceSettings, execution: Execution
-) -> Iterator[tuple[Ranking, Int32s]]:
+    index: PlaceIndex, descriptors: Sequence[Any], stops: Ints, k: int, settings: SequenceSettings,
+    execution: Execution, lines: Float32s | None = None,
+) -> Iterator[tuple[Ranking, Int32s]]:  # fmt: skip
     """For each query in order: its k best rows below its stop, and their support, 0 where the length is 1.
 
-    Rows that are no more alike than chance are left out; ties go to the earlier row.
+    Rows that are no more alike than chance are left out; ties go to the earlier row. The scores of lines are written to
+    `lines` (Q, M).
     """
     if settings.length > 1:
         rows = sequence_rows(
             lambda query: index.scores(descriptors[query], int(stops[query])), stops, settings, execution
         )
-        for score, support in rows:
+        for query, (score, support) in enumerate(rows):
+            if lines is not None:
+                lines[query, : len(score)] = score
             best = best_rows(np.maximum(score, 0.0), k)
             yield best, support[best.rows]
         return

@@ -15,6 +15,7 @@ from vplog.data import Floats, Ints, Keyframes
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
+from vplog.loops.match_probability import LookAlikes
 from vplog.maps.geo_bounds import DriveBounds, box_of_fixes
 from vplog.maps.search.exact import Answers, best_places
 from vplog.maps.search.index import SegmentView, place_keyframes, update_index
@@ -96,8 +97,9 @@ def query_map(
             numbered = {number: names[number] for number in numbers.tolist()}
             short += _short_drives(store, numbered.values(), settings.length)
             part = replace(query, drives=list(numbered.values()))
-            answers, more = search(store, drives, state, descriptors, part, settings, execution)
-            p_match = answer_probabilities(store, numbered, state, descriptors, answers, settings, execution)
+            known = None if settings.length == 1 else LookAlikes.of(len(descriptors))
+            answers, more = search(store, drives, state, descriptors, part, settings, execution, known)
+            p_match = answer_probabilities(store, numbered, state, descriptors, answers, known, execution)
             table = _table(store, list(drives), answers, stamps, p_match)
             return list(drives), answers, short + more, table, _named(store, drives, table, log)
 
@@ -221,6 +223,7 @@ def _descriptors(
 def search(
     store: Store, drives: Mapping[str, Mapping[str, Any]], state: PlaceState, descriptors: Sequence[Any],
     query: MapQuery, settings: SequenceSettings, execution: Execution = Execution(),
+    look_alikes: LookAlikes | None = None,
 ) -> tuple[Answers, list[str]]:  # fmt: skip
     """The best places of the map's drives, or of `query.drives` of them, for each of Q views in order, and warnings.
 
@@ -248,7 +251,8 @@ def search(
             warnings.append(f"Sequences were searched in the {len(numbered)} of {count} drives most like single views.")
         elif executor is not None:
             warnings.append(f"Ray was not used: sequences in maps of up to {EXACT_PLACES} places are searched here.")
-    return best_lines(store, numbered, state, descriptors, min(query.top, places), settings, execution), warnings
+    top = min(query.top, places)
+    return best_lines(store, numbered, state, descriptors, top, settings, execution, look_alikes), warnings
 
 
 def _short_drives(store: Store, drives: Iterable[str], length: int) -> list[str]:

@@ -10,6 +10,7 @@ views.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -23,8 +24,10 @@ from vplog.maps.storage.damage import reading_drive
 from vplog.places.dense import best_rows
 from vplog.places.sequence import SequenceSettings, rank_places
 from vplog.stages import PlaceIndex, PlaceState, index_of_part
+from vplog.storage.scratch import scratch
 
 if TYPE_CHECKING:
+    from vplog.loops.match_probability import LookAlikes
     from vplog.maps.storage.map_store import Store
 
 EXACT_PLACES = 200_000
@@ -37,31 +40,40 @@ _DRIVES_A_STRETCH = 8
 
 def best_lines(
     store: Store, drives: Mapping[int, str], state: PlaceState, descriptors: Sequence[Any], top: int,
-    settings: SequenceSettings, execution: Execution,
+    settings: SequenceSettings, execution: Execution, look_alikes: LookAlikes | None = None,
 ) -> Answers:  # fmt: skip
     """The `top` best places of some drives, by their numbers in the map, for each of Q views in order.
 
-    Drives are read one after the other, so memory is that of the largest. Works for any recogniser, and for a window
-    of one view. Raises LibraryError where a drive's descriptors are of another library.
+    Drives are read one after the other, so memory is that of the largest; of lines, `look_alikes` are taken from the
+    scores of one drive, which are on disk meanwhile. Works for any recogniser, and for a window of one view. Raises
+    LibraryError where a drive's descriptors are of another library.
     """
     best = no_answers(len(descriptors), top)
     for number, drive in execution.counted("search", drives.items(), len(drives)):
         index, nearest = drive_index(store, drive, state, settings)
         stops = np.full(len(descriptors), len(index), np.int64)
         most = top if nearest is None else top * -(-len(nearest) // (int(nearest[-1]) + 1))
-        rankings = rank_places(index, descriptors, stops, most, settings, Execution(execution.threads))
         found = no_answers(len(descriptors), top)
         found.drive[:] = number
-        for view, (ranking, support) in enumerate(rankings):
-            rows, first = ranking.rows, np.arange(len(ranking.rows))
-            if nearest is not None:  # of the keyframes that a place stands for, the best one
-                rows = nearest[rows]
-                first = np.sort(np.unique(rows, return_index=True)[1])
-            first = first[:top]
-            count = len(first)
-            found.keyframe[view, :count], found.score[view, :count] = rows[first], ranking.score[first]
-            found.support[view, :count] = support[first]
-        best = merge([best, found], top)
+        with ExitStack() as stack:
+            lines, shape = None, (len(descriptors), len(index))
+            if look_alikes is not None:
+                file = stack.enter_context(scratch("scores")) / "scores.npy"
+                lines = np.lib.format.open_memmap(file, "w+", np.dtype("<f4"), shape)
+            rankings = rank_places(index, descriptors, stops, most, settings, Execution(execution.threads), lines)
+            for view, (ranking, support) in enumerate(rankings):
+                rows, first = ranking.rows, np.arange(len(ranking.rows))
+                if nearest is not None:  # of the keyframes that a place stands for, the best one
+                    rows = nearest[rows]
+                    first = np.sort(np.unique(rows, return_index=True)[1])
+                first = first[:top]
+                count = len(first)
+                found.keyframe[view, :count], found.score[view, :count] = rows[first], ranking.score[first]
+                found.support[view, :count] = support[first]
+            best = merge([best, found], top)
+            if lines is not None and look_alikes is not None:  # in place of an earlier drive's, whose answers are worse
+                first = np.flatnonzero((best.count > 0) & (best.drive[:, 0] == number))
+                look_alikes.take(lines, first, first)
     return best
 
 
