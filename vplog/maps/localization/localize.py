@@ -179,10 +179,14 @@ def _localized(
 ) -> Iterator[LocalizedPicture]:
     """The answers for some pictures; those without a pose are looked at once more with all their features."""
     found = list(_answers(places, block, execution, top, names))
-    again = [at for at, one in enumerate(block) if one.closer is not None and not found[at].localized]
-    closer = list(execution.map(lambda at: block[at].closer(), again)) if again else []
-    for at, one in zip(again, _answers(places, closer, execution, top, names), strict=True):
-        found[at] = one
+    again = {
+        at: one.closer for at, one in enumerate(block)
+        if one.closer and not found[at].localized and found[at].found.verdict is not Verdict.NO_CALIBRATION
+    }  # fmt: skip
+    if again:
+        closer = list(execution.map(lambda describe: describe(), again.values()))
+        for at, one in zip(again, _answers(places, closer, execution, top, names), strict=True):
+            found[at] = one
     return iter(found)
 
 
