@@ -18,10 +18,13 @@ from vplog.data import Ranking
 from vplog.execution.execution import Execution
 from vplog.maps.condensation.own_queries import PASSES, OwnPlaces, later_passes
 from vplog.maps.condensation.redundancy import OwnQueries, remove_cross_validated, remove_redundant
+from vplog.maps.condensation.references import by_coverage
 from vplog.maps.joining.candidate_drives import places_of
 from vplog.maps.search.query import open_map
 from vplog.maps.storage import map_store
 from vplog.maps.storage.map_store import Store
+from vplog.places.bobb import NOBODY
+from vplog.places.code_search import build_lists
 from vplog.results import tables
 
 if TYPE_CHECKING:
@@ -104,6 +107,14 @@ def test_a_drive_not_seen_loses_no_more_than_is_stated() -> None:
             )
             unseen[folds].append(whole - small)
     assert np.mean(unseen[True]) <= stated < np.mean(unseen[False])
+
+
+def test_references_go_by_how_many_each_place_is_left_with() -> None:
+    """The only reference of a place outlasts one that many places name beside others."""
+    references = np.array([[0, 1, 2], [0, 1, 2], [0, 1, NOBODY], [0, 1, NOBODY], [3, NOBODY, NOBODY]], np.uint16)
+    weights = np.where(references == NOBODY, 0, 9).astype(np.uint8)
+    lists = build_lists(references, weights, np.zeros((*references.shape, 1), np.uint8), 5, 2)
+    assert by_coverage(lists).tolist() == [4, 2, 0, 3, 1]
 
 
 def test_places_that_later_drives_pass_without_finding_them_fade() -> None:

@@ -32,7 +32,7 @@ def remove_references(
 ) -> tuple[OwnPlaces, OwnAnswers, CodedState]:  # fmt: skip
     """The places by the references that stay, their answers, and the recogniser with these. No more than so many
     queries fewer are answered rightly."""
-    order = _by_coverage(state.lists(*places.columns))
+    order = by_coverage(state.lists(*places.columns))
 
     def without(count: int) -> tuple[OwnPlaces, OwnAnswers, CodedState]:
         retained = np.sort(order[count:])
@@ -48,7 +48,7 @@ def remove_references(
     return without(count) if count else (places, answers, state)
 
 
-def _by_coverage(lists: CodeLists) -> Ints:
+def by_coverage(lists: CodeLists) -> Ints:
     """References in the order in which they go: always the one that takes least from the sum over all places of the
     logarithm of how many references each has. That is less the more of them the place has beside it, so that none is
     left with few."""
