@@ -84,6 +84,8 @@ class _Query:
 
     features: Features
     rays: Floats
+    noise: Floats
+    """(M, 2, 2) covariance of the rays."""
     camera: Camera
     settings: VerifySettings
 
@@ -116,7 +118,9 @@ def localize(
         return Localization(Verdict.NO_CALIBRATION, -1, 0, 0)
     if not places:
         return Localization(Verdict.TOO_FEW_MATCHES, -1, 0, 0)
-    query = _Query(features, undistort.rays(camera, features.points), camera, settings)
+    rays = undistort.rays(camera, features.points)
+    noise = undistort.noise_of_rays(camera, rays, settings.landmarks.pixel_sigma)
+    query = _Query(features, rays, noise, camera, settings)
     fits = _verified(query, places)
     best = max(fits, key=lambda fit: (_PROGRESS.index(fit.pose.verdict), fit.pose.inliers, len(fit.mine)))
     if any(_is_rival(fit, best, settings) for fit in fits):
@@ -212,11 +216,9 @@ def _refined(query: _Query, fits: Sequence[_Fit], best: _Fit, places: Sequence[K
 
 def _agreeing(query: _Query, fit: _Fit, place: KeyframeLandmarks, anchor: Floats, pose: Floats) -> _Agreeing:
     """The landmarks of a place that agree with a pose in the camera `anchor` (4, 4), in that camera."""
-    rays = query.rays[fit.mine]
+    rays, noise, unknown = query.rays[fit.mine], query.noise[fit.mine], np.full(len(fit.mine), np.nan)
     points, covariance = _moved(se3.between(anchor, place.world_from_camera), place.landmarks, fit.rows)
-    by_pixel = undistort.noise_of_rays(query.camera, rays, query.settings.landmarks.pixel_sigma)
-    unknown = np.full(len(rays), np.nan)
-    squared, _ = pose_refinement.agreement(pose, Matches(points, covariance, rays, by_pixel, unknown, unknown))
+    squared, _ = pose_refinement.agreement(pose, Matches(points, covariance, rays, noise, unknown, unknown))
     agrees = squared < verify_metric.CHI2_2
     return points[agrees], covariance[agrees], fit.mine[agrees]
 
