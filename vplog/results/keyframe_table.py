@@ -18,9 +18,13 @@ from vplog.storage.scratch import replacing
 T = TypeVar("T")
 
 
-def write_groups(path: Path, schema: pa.Schema, groups: Iterable[Sequence[Any]], level: int) -> None:
-    """Write the values of each row group by column, with zstd of a level. Raises ResultError where the disk is full."""
+def write_groups(
+    path: Path, schema: pa.Schema, groups: Iterable[Sequence[Any]], level: int, split: Sequence[str] = ()
+) -> None:
+    """Write the values of each row group by column, with zstd of a level; of the columns `split` the first bytes of all
+    values come first, then the second ones. Raises ResultError where the disk is full."""
     options: dict[str, Any] = {"compression": "zstd", "compression_level": level, "use_dictionary": False}
+    options["column_encoding"] = dict.fromkeys(split, "BYTE_STREAM_SPLIT") or None
     with replacing(path, parents=True) as stream, table_writer(stream, schema, **options) as writer:
         for columns in groups:
             arrays = [pa.array(values, field.type) for values, field in zip(columns, schema, strict=True)]

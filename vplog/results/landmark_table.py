@@ -1,6 +1,6 @@
 """landmarks.parquet: the landmarks of every keyframe of a drive, by which pictures are localised in it.
 
-A landmark takes 72 bytes: its pixel to 1/8191 of the image, inverse depth and its error as half floats, and four bits
+A landmark takes 72 bytes: its pixel to 1/65535 of the image, inverse depth and its error as half floats, and four bits
 of each value of its descriptor.
 """
 
@@ -28,16 +28,16 @@ _KEYFRAMES_PER_GROUP = 16
 """Keyframes read at once, some 200 kB; a row group for each would take as much for its head as for landmarks."""
 _IN_MEMORY = 64
 """Row groups that are cached, some 20 MB."""
-_PIXELS = 8191
-"""Steps of a pixel's position along a side of the image: a quarter of a px of full HD, and a feature errs by more."""
+_PIXELS = 65535
+"""Steps of a pixel's position along a side of the image: a fiftieth of a px of full HD."""
 
 _UINT16_LIST = pa.list_(pa.field("element", pa.uint16(), nullable=False))
 _HALF_LIST = pa.list_(pa.field("element", pa.float16(), nullable=False))
 LANDMARKS = pa.schema(
     [
         column("keyframe", pa.int32(), "row", "Row of the keyframe, 0 is the first."),
-        column("x", _UINT16_LIST, "1/8191", "Column of each landmark in the image, as a share of its width."),
-        column("y", _UINT16_LIST, "1/8191", "Row of each landmark in the image, as a share of its height."),
+        column("x", _UINT16_LIST, "1/65535", "Column of each landmark in the image, as a share of its width."),
+        column("y", _UINT16_LIST, "1/65535", "Row of each landmark in the image, as a share of its height."),
         column("inverse_depth", _HALF_LIST, "1/m", "Inverse depth along the camera's z."),
         column("sigma", _HALF_LIST, "1/m", "Standard deviation of the inverse depth."),
         column(
@@ -80,7 +80,8 @@ def write_landmarks(
     }  # fmt: skip
     rows = enumerate(keyframes)
     groups = iter(lambda: list(islice(rows, _KEYFRAMES_PER_GROUP)), [])
-    write_groups(path, LANDMARKS.with_metadata(header), map(_columns, groups), _LEVEL)
+    split = ("x.list.element", "y.list.element")  # two bytes of four are zero
+    write_groups(path, LANDMARKS.with_metadata(header), map(_columns, groups), _LEVEL, split)
 
 
 def _columns(keyframes: Sequence[tuple[int, tuple[Features, Floats]]]) -> list[list[Any]]:
