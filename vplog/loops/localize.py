@@ -193,11 +193,15 @@ def _rival_inliers(best: int) -> float:
 def _refined(query: _Query, fits: Sequence[_Fit], best: _Fit, places: Sequence[KeyframeLandmarks]) -> Localization:
     """The best fit, improved by the landmarks of all places that agree with it, where it has a pose."""
     start, own = best.pose.match_from_query, best.pose.covariance
-    pose, used, matches = best.pose, 1, len(best.mine)
+    pose, used = best.pose, 1
     if start is None or own is None:
-        return Localization(pose.verdict, best.place, matches, pose.inliers)
-    anchor = places[best.place].world_from_camera
-    agreeing = [_agreeing(query, fit, places[fit.place], anchor, start) for fit in fits if len(fit.mine)]
+        return Localization(pose.verdict, best.place, len(best.mine), pose.inliers)
+    anchor, matched = places[best.place].world_from_camera, [fit for fit in fits if len(fit.mine)]
+    agreeing = [_agreeing(query, fit, places[fit.place], anchor, start) for fit in matched]
+    # of the places that explain it well, the nearest: one seen again later may have more landmarks, from further off
+    counts, true = [len(rows) for _, _, rows in agreeing], anchor @ start
+    well = [fit for fit, count in zip(matched, counts, strict=True) if 2 * count >= max(counts)]
+    most = min(well, key=lambda fit: float(np.linalg.norm((places[fit.place].world_from_camera - true)[:3, 3])))
     points, covariance, mine = map(np.concatenate, zip(*agreeing, strict=True))
     # a feature counts once, by the landmark whose depth is surest: its pixel has one error, however many match it
     order = np.lexsort((covariance[:, 2, 2] / points[:, 2] ** 2, mine))
@@ -211,7 +215,7 @@ def _refined(query: _Query, fits: Sequence[_Fit], best: _Fit, places: Sequence[K
         pose, start, own = refined, refined.match_from_query, refined.covariance
         used = sum(len(rows) > 0 for _, _, rows in agreeing)  # else other places drew it away
     own = own + motion_covariance(start, query.settings.calibration.least_share)
-    return Localization(Verdict.ACCEPTED, best.place, matches, pose.inliers, used, anchor @ start, own)
+    return Localization(Verdict.ACCEPTED, most.place, len(most.mine), pose.inliers, used, anchor @ start, own)
 
 
 def _agreeing(query: _Query, fit: _Fit, place: KeyframeLandmarks, anchor: Floats, pose: Floats) -> _Agreeing:
