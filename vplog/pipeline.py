@@ -185,7 +185,7 @@ def run(
         others = {topic: topics.of_camera(topic) for topic in log.further_cameras() if odometry.metric}
         views = do(read_cameras, log, others, odometry, keyframes, pipeline, library is None) if others else []
         if library is None:
-            images = do(own_images, log, selected, keyframes, features, pipeline.library)
+            images = do(own_images, log, keyframes, features, pipeline.library)
             references = own_references(keyframes, features, images)
             references += [one for view in views for one in view.references]
         else:

@@ -101,7 +101,7 @@ def test_matches_are_of_the_kinds_asked_for(kinds: dict[str, float], references:
     seen = noisy(references[2].features, 9)
     found = matcher.match(seen)
     assert np.argmax(np.add.reduceat(np.append(found.weight, 0), found.start[:-1])) == 2
-    expected = min(len(large_enough(seen, wanted)), wanted.features) + 169 * (wanted.patch_weight > 0)
+    expected = min(len(large_enough(seen, wanted)), wanted.features) + 169 * (wanted.patch_weight != 0)
     assert len(found.points) == expected
     assert found.itself == -1
     assert matcher.match(references[2].features).itself == 2

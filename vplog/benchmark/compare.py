@@ -29,7 +29,8 @@ from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, no_truth, open_t
 from vplog.execution.execution import Execution, logged_warnings
 from vplog.logs import EVERY_IMAGE
 from vplog.places.library_files import check_descriptors, load_references, references_hash
-from vplog.places.reference_choice import PAPER_SIZE, LibrarySettings, choose
+from vplog.places.reference_choice import FRAMES_A_REFERENCE, PAPER_SIZE, LibrarySettings, choose
+from vplog.places.self_recognition import NO_IMAGE, add_until_enough
 from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record
 from vplog.results.staging import check_contents, staged
@@ -63,7 +64,8 @@ class CompareOptions:
 
     library: Path | None = None
     """A drive, or a saved library; None for the map."""
-    library_size: int = PAPER_SIZE
+    library_size: int | None = None
+    """None for the paper's 100, and more of a map whose places look alike, see `places.self_recognition`."""
     library_seed: int = 0
     min_gap: int | None = None
     """Frames that a match is older, at least, in a drive compared with itself."""
@@ -171,20 +173,34 @@ class _Drives:
         warnings = list(dict.fromkeys(map_traversal.warnings + query_traversal.warnings))
         if isinstance(source, list):
             return map_traversal, query_traversal, source, warnings
-        wanted = LibrarySettings(choose="random", size=options.library_size, seed=options.library_seed)
+        size = options.library_size or PAPER_SIZE
+        wanted = LibrarySettings(choose="random", size=size, seed=options.library_seed)
         if source is None or self.library is None:
-            chosen = known.map_frames[choose(self.map_log.stamps()[known.map_frames], wanted)]
-            references = references_of(map_traversal, chosen)
+            rows = self._reference_rows(map_traversal, wanted)
+            references = references_of(map_traversal, map_traversal.frames[rows])
         else:
             chosen = choose(source.stamps(), wanted)
             traversal = self.traversal_of(self.library, source, chosen)
             references = references_of(traversal, chosen)
             warnings += traversal.warnings
-        if (size := options.library_size) > len(references):
+        if options.library_size is not None and size > len(references):
             warnings.append(
                 f"The library has {len(references)} images instead of {size}: its drive has no more frames."
             )
         return map_traversal, query_traversal, references, warnings
+
+    def _reference_rows(self, traversal: Traversal, wanted: LibrarySettings) -> Ints:
+        """Rows of the map's frames that become references: all of them at most, of a drive in its own past fewer."""
+        itself = self.query_log is self.map_log
+
+        def reference(row: int) -> Reference:
+            return Reference(NO_IMAGE, traversal.store[row], traversal.name, int(traversal.stamp_ns[row]))
+
+        stamp_ns, most = traversal.stamp_ns, len(traversal) // (FRAMES_A_REFERENCE if itself else 1)
+        rows = choose(stamp_ns, wanted)
+        if self.options.library_size is None:
+            rows = add_until_enough(rows, stamp_ns, wanted, most, reference, self.execution)
+        return rows
 
     def account(self, inputs: MethodInputs) -> dict[str, Any]:
         """compare.json, but for methods and warnings."""

@@ -8,6 +8,7 @@ to the letter; here votes have the closed form of `expected_votes.py`, and the o
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
@@ -20,8 +21,9 @@ from vplog.places import expected_votes
 from vplog.places.code_search import BLOCK, CodeIndex, CodeLists, Place, build_lists
 from vplog.places.columns import RecordState, from_column, to_column
 from vplog.places.library_files import RelearnedSettings
-from vplog.places.matches import Matcher, Matches, Once, WeighedMatchSettings, index_references
+from vplog.places.matches import PATCH_WEIGHT, Matcher, Matches, Once, WeighedMatchSettings, index_references
 from vplog.places.overlap import list_shared
+from vplog.places.self_recognition import patches_mislead
 
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution
@@ -105,7 +107,7 @@ class BobbSettings(WeighedMatchSettings, RelearnedSettings):
     def learn(self, references: Iterable[Reference], execution: Execution) -> BobbState:
         """Index the references, and how popular they are. Raises LibraryError where they have no features."""
         state = self.prepare(references, execution)
-        state.rarity()
+        state.weights()
         return state
 
     def prepare(self, references: Iterable[Reference], execution: Execution) -> BobbState:
@@ -116,23 +118,33 @@ class BobbSettings(WeighedMatchSettings, RelearnedSettings):
                 f"A library may have {NOBODY - 1} reference images, this one {len(matcher)}. Set library.size lower."
             )
 
-        def rarity() -> Floats:
-            explained = list(execution.map(lambda row: _explained(matcher.match(row.features)), matcher.references))
-            return _rarity(np.array(explained), self.popularity)
+        def votes(weights: tuple[float, float]) -> Floats:
+            found = execution.map(lambda one: matcher.match(one.features, weights).votes(), matcher.references)
+            return np.array(list(found))
 
-        return BobbState(self, matcher, Once(rarity))
+        def weights() -> Weights:
+            if self.patch_weight is not None:
+                return Weights.of((1.0, self.patch_weight), votes((1.0, self.patch_weight)), self.popularity)
+            keypoints, patches = votes((1.0, 0.0)), votes((0.0, 1.0))
+            used = 0.0 if patches_mislead(keypoints, patches, matcher.references) else PATCH_WEIGHT
+            return Weights.of((1.0, used), keypoints + used * patches, self.popularity)
+
+        return BobbState(self, matcher, Once(weights))
 
 
-def _sums(matches: Matches) -> Floats:
-    """(L,) total weight of each reference's matches, added in the order they stand."""
-    count = np.diff(matches.start)
-    return np.asarray(np.bincount(np.repeat(np.arange(len(count)), count), matches.weight, len(count)), np.float64)
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """What counts how much, by a library's own images."""
 
+    kinds: tuple[float, float]
+    """Of a keypoint's match and a patch's."""
+    rarity: Floats
+    """(L,) of each reference."""
 
-def _explained(matches: Matches) -> Floats:
-    """(L,) shares of an image's matches by reference."""
-    total = _sums(matches)
-    return total / max(total.sum(), 1e-9)
+    @classmethod
+    def of(cls, kinds: tuple[float, float], votes: Floats, popularity: float) -> Weights:
+        """With the votes (L, L) of each reference for the others."""
+        return cls(kinds, _rarity(votes / np.maximum(votes.sum(axis=1, keepdims=True), 1e-9), popularity))
 
 
 def _rarity(explained: Floats, power: float) -> Floats:
@@ -150,10 +162,9 @@ class BobbState(RecordState):
 
     record, none = Place, NOBODY
 
-    def __init__(self, settings: BobbSettings, matcher: Matcher, rarity: Once[Floats]) -> None:
-        """`rarity` is the weight (L,) of each reference."""
+    def __init__(self, settings: BobbSettings, matcher: Matcher, weights: Once[Weights]) -> None:
         super().__init__(settings, matcher.references)
-        s, self.matcher, self.rarity = settings, matcher, rarity
+        s, self.matcher, self.weights = settings, matcher, weights
         self._windows = expected_votes.even_windows(s.windows_along, s.window_share)
         self._along_x = expected_votes.box_sums(s.columns, s.patches_x, s.box_columns)
         self._along_y = expected_votes.box_sums(s.rows, s.patches_y, s.box_rows)
@@ -178,7 +189,7 @@ class BobbState(RecordState):
         references = np.full(s.references, NOBODY, np.uint16)
         weights = np.zeros(s.references, np.uint8)
         boxes = np.full((s.references, s.boxes), NOWHERE, np.uint8)
-        matches = self.matcher.match(features)
+        matches = self.matcher.match(features, self.weights().kinds)
         for j, (reference, share, here, there, agreed) in enumerate(self._retrieve(matches)):
             references[j], weights[j] = reference, max(round(255 * share**s.share_power), 1)
             boxes[j] = expected_votes.best_boxes(
@@ -192,8 +203,8 @@ class BobbState(RecordState):
         The first 3 J by the sum of weights are looked at again, with matches that agree in their motion counting more.
         """
         s = self.settings
-        rarity = self.rarity()
-        total = _sums(matches) * rarity
+        rarity = self.weights().rarity
+        total = matches.votes() * rarity
         found: list[tuple[int, float, Float32s, Float32s, Float32s]] = []
         for reference in np.argsort(-total, kind="stable")[: s.candidates * s.references].tolist():
             if total[reference] <= 0.0:
@@ -237,7 +248,7 @@ class BobbState(RecordState):
 
     def voting_maps(self, features: Features, references: Sequence[int]) -> list[Floats]:
         """(36, 64) expected vote at the middle of every cell, by the closed form of `expected_votes`."""
-        matches = self.matcher.match(features)
+        matches = self.matcher.match(features, self.weights().kinds)
         return [self._voting_map(matches, reference) for reference in references]
 
     def _voting_map(self, matches: Matches, reference: int) -> Floats:
@@ -272,8 +283,9 @@ class BobbState(RecordState):
         return build_lists(references, weights, boxes, len(self.matcher), BLOCK)
 
     def subset(self, references: Ints, execution: Execution) -> BobbState:
-        """The recogniser with some of the references alone, in their order."""
-        return self.settings.prepare([self.references[row] for row in references.tolist()], execution)
+        """The recogniser with some of the references alone, in their order, and the weight of patches as it is."""
+        settings = self.settings.model_copy(update={"patch_weight": self.weights().kinds[1]})
+        return settings.prepare([self.references[row] for row in references.tolist()], execution)
 
     def on_subset(self, column: pa.Array, references: Ints) -> pa.Array:
         """The places of a column by some of the references alone, with the numbers that `subset` gives them."""

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from pydantic import Field
 
-from vplog.data import Features, Float32s, Int32s, Ints, Reference
+from vplog.data import Features, Float32s, Floats, Int32s, Ints, Reference
 from vplog.errors import LibraryError
 from vplog.places.library import hnsw
 from vplog.places.library_files import keep_references
@@ -23,6 +23,9 @@ from vplog.places.patches import describe_patches
 from vplog.places.vocabulary import root_sift_steps
 from vplog.settings import Settings
 
+PATCH_WEIGHT = 2.0
+"""Weight of a patch's match where patches are used: 169 of them then weigh about as much as 400 keypoints, on the
+images of a library among themselves."""
 Described = tuple[Float32s, Float32s]
 """Descriptors (M, 128), whole numbers 0..255, and (M, 2) points as shares of the image's sides."""
 
@@ -53,9 +56,9 @@ class WeighedMatchSettings(Settings):
     grain that another camera, resolution or light does not show again."""
     root_sift: bool = True
     """Compare the roots of descriptors (Arandjelovic & Zisserman 2012) instead of the descriptors."""
-    patch_weight: float = Field(default=2.0, ge=0)
-    """A patch's match weighs this many times a keypoint's: 400 keypoints then weigh about as much as the 169
-    patches, on the images of a library among themselves. 0 uses keypoints alone."""
+    patch_weight: float | None = Field(default=None, ge=0)
+    """A patch's match weighs this many times a keypoint's; 0 uses keypoints alone. None takes 2, or 0 where storeys or
+    aisles of one layout mislead patches, as the library's own images show (see vplog/places/self_recognition.py)."""
     neighbours: int = Field(default=24, ge=2)
     """Nearest library features looked at for each feature; the last one sets the scale of the others' distances."""
     reach: float = Field(default=0.8, gt=0)
@@ -83,6 +86,12 @@ class Matches:
     points: Float32s
     """(M, 2) where all the image's features are, as shares of its sides."""
 
+    def votes(self) -> Floats:
+        """(L,) total weight of each reference's matches, added in the order they stand."""
+        count = np.diff(self.start)
+        owner = np.repeat(np.arange(len(count)), count)
+        return np.asarray(np.bincount(owner, self.weight, len(count)), np.float64)
+
 
 @dataclass(frozen=True, eq=False)
 class Indexed:
@@ -93,8 +102,6 @@ class Indexed:
     points: Float32s
     """(F, 2) as shares of the reference's sides."""
     graph: Any
-    weight: float
-    """Weight of a match."""
 
 
 class Matcher:
@@ -102,41 +109,41 @@ class Matcher:
 
     def __init__(self, references: list[Reference], settings: WeighedMatchSettings) -> None:
         self.references, self.settings = references, settings
-        self.indexed = Once(lambda: (self._index(keypoints_of, 1.0), self._index(patches_of, settings.patch_weight)))
+        self.indexed = Once(lambda: (self._index(keypoints_of), self._index(patches_of)))
         """Keypoints and patches; None where they are not used, or the references have none."""
 
     def __len__(self) -> int:
         return len(self.references)
 
-    def _index(self, described: Callable[[Features, WeighedMatchSettings], Described], weight: float) -> Indexed | None:
+    def _index(self, described: Callable[[Features, WeighedMatchSettings], Described]) -> Indexed | None:
         s = self.settings
         values, points = zip(*(described(r.features, s) for r in self.references), strict=True)
         owner = np.repeat(np.arange(len(values), dtype=np.int32), list(map(len, values)))
         if not len(owner):
             return None
         graph = hnsw(np.concatenate(values), s.hnsw_links, s.hnsw_ef_construction, s.neighbours)
-        return Indexed(owner, np.concatenate(points), graph, weight)
+        return Indexed(owner, np.concatenate(points), graph)
 
-    def match(self, features: Features) -> Matches:
-        """Matches of an image."""
+    def match(self, features: Features, weights: tuple[float, float] = (1.0, PATCH_WEIGHT)) -> Matches:
+        """Matches of an image, those of keypoints and those of patches with these weights; none of a kind with 0."""
         s, L = self.settings, len(self.references)
         found = []
-        for kind, described in zip(self.indexed(), (keypoints_of, patches_of), strict=True):
-            if kind is not None:
+        for kind, described, times in zip(self.indexed(), (keypoints_of, patches_of), weights, strict=True):
+            if kind is not None and times > 0:
                 values, points = described(features, s)
                 if len(values):
-                    found.append((kind, points, *kind.graph.search(values, s.neighbours)))
-        itself = max((_itself(distance, entry, kind.owner, L) for kind, _, distance, entry in found), default=-1)
+                    found.append((kind, times, points, *kind.graph.search(values, s.neighbours)))
+        itself = max((_itself(distance, entry, kind.owner, L) for kind, *_, distance, entry in found), default=-1)
         none = np.zeros((0, 2), np.float32)
         parts = [(np.zeros(0, np.int32), none, none, none[:, 0])]
-        for kind, points, distance, entry in found:
+        for kind, times, points, distance, entry in found:
             feature, library, weight = _weigh(distance, entry, kind.owner, L, itself, s.reach)
-            weight *= np.float32(kind.weight)
+            weight *= np.float32(times)
             parts.append((kind.owner[library], points[feature], kind.points[library], weight))
         owner, here, there, weight = map(np.concatenate, zip(*parts, strict=True))
         order = np.argsort(owner, kind="stable")
         start = np.searchsorted(owner[order], np.arange(L + 1)).astype(np.int32)
-        points = np.concatenate([none, *(points for _, points, _, _ in found)])
+        points = np.concatenate([none, *(points for _, _, points, _, _ in found)])
         return Matches(start, here[order], there[order], weight[order], itself, points)
 
 

@@ -98,7 +98,7 @@ def read_cameras(
             row, selected = pictures_at(keyframes, other.stamps(), odometry)
             features = extract(other, choice, selected, settings, steps=steps, execution=execution)
             pictures, camera = decoded(selected, features, settings.features), other.camera()
-            chosen = (other, selected, pictures, features, settings.library)
+            chosen = (other, pictures, features, settings.library)
             images = steps.part(own_images, *chosen) if own_library else ()
         except LogError as error:
             _log.warning("Camera %s is not used: %s", topic, error)

@@ -30,7 +30,8 @@ from vplog.places.library import WordSettings
 from vplog.places.library import build_library as index_words
 from vplog.places.library_files import check_descriptors, load_references, read_library_record, read_sources
 from vplog.places.plugin import PluginSettings
-from vplog.places.reference_choice import PAPER_SIZE, LibrarySettings, choose, evenly
+from vplog.places.reference_choice import FRAMES_A_REFERENCE, PAPER_SIZE, LibrarySettings, choose, evenly
+from vplog.places.self_recognition import MOST, NO_IMAGE, add_until_enough, further, suffices
 from vplog.results.staging import check_contents, recover, staged
 from vplog.storage.folders import check_regular
 
@@ -63,7 +64,8 @@ def check_library(folder: Path | None, pipeline: Describing) -> None:
     places = pipeline.places.recogniser() if isinstance(pipeline.places, PluginSettings) else pipeline.places
     made = places.read(read_library_record(folder)["settings"], f"{folder}/library.json")
     for name, value in places:
-        if name not in made.LOCATIONS and getattr(made, name) != value:
+        left_open = value is None or name in made.LOCATIONS  # None leaves it to the library
+        if not left_open and getattr(made, name) != value:
             raise LibraryError(
                 f"{folder} was made with places.{name}={getattr(made, name)}, and this run has {value}. "
                 f"Build another with `vplog library`, or run with --set places.{name}={getattr(made, name)}."
@@ -72,23 +74,20 @@ def check_library(folder: Path | None, pipeline: Describing) -> None:
 
 @step("choose", lambda *_: images_codec(), without=("log",))  # the features stand for the log's images
 def own_images(
-    log: Log,
-    selected: Keyframes,
-    keyframes: Keyframes,
-    features: Extracted,
-    settings: LibrarySettings,
-    *,
-    execution: Execution,
+    log: Log, keyframes: Keyframes, features: Extracted, settings: LibrarySettings, *, execution: Execution
 ) -> list[tuple[int, Bytes]]:
-    """Rows and images of the keyframes that become the drive's own references; these images are read once more.
-
-    `keyframes` are those of the `selected` that decode.
-    """
+    """Rows and images of the keyframes that become the drive's own references; these images are read once more."""
     if settings.choose == "coverage":
         rows = choose_by_coverage(len(features), lambda row: features[row].descriptors, settings, execution)
     else:
-        chosen_ns = selected.stamp_ns[choose(selected.stamp_ns, settings)]
-        rows = np.flatnonzero(np.isin(keyframes.stamp_ns, chosen_ns))
+        most = len(keyframes.stamp_ns) // FRAMES_A_REFERENCE
+
+        def reference(row: int) -> Reference:
+            return Reference(NO_IMAGE, features[row], keyframes.drive, int(keyframes.stamp_ns[row]))
+
+        rows = choose(keyframes.stamp_ns, settings)
+        if settings.size is None:
+            rows = add_until_enough(rows, keyframes.stamp_ns, settings, most, reference, execution)
     frames = log.frames(keyframes.stamp_ns[rows])
     return [(row, masked(encoded.decode()).image) for row, encoded in zip(rows.tolist(), frames, strict=True)]
 
@@ -160,15 +159,12 @@ def library_of_logs(
     without `force` one with references of other logs is not replaced.
     Raises VplogError where that cannot be.
     """
-    references: list[Reference] = []
-    by_coverage = pipeline.library.choose == "coverage"
+    settings = pipeline.library
     with staged(out, lambda: _library_in(out, None if force else opened)) as made:
-        wanted = _stamps_by_coverage(opened, pipeline, execution) if by_coverage else _shares(opened, pipeline)
-        for log, stamps in zip(opened, wanted, strict=True):
-            frames = extract_frames(log.frames(stamps), pipeline.features, execution)
-            for stamp_ns, frame, features, _ in execution.counted(f"extract {log.name}", frames, len(stamps)):
-                if frame is not None and features is not None:
-                    references.append(Reference(masked(frame).image, features, log.name, stamp_ns))
+        wanted = _stamps_by_coverage if settings.choose == "coverage" else _shares
+        references = _extracted(opened, wanted(opened, pipeline, execution), pipeline, execution)
+        if settings.choose != "coverage" and settings.size is None:
+            _add_until_enough(references, opened, pipeline, execution)
         for line in dict.fromkeys(line for log in opened for line in log.warnings):
             warn(line)
         state = pipeline.places.learn(references, execution)
@@ -202,7 +198,40 @@ def _check_same_logs(out: Path, opened: Sequence[Log]) -> None:
         raise SettingsError(f"{out} is a library of {names}, and {given} is another log or has changed. {remedy}")
 
 
-def _shares(opened: Sequence[Log], pipeline: Describing) -> list[Ints]:
+def _extracted(
+    opened: Sequence[Log], stamps_ns: Sequence[Ints], pipeline: Describing, execution: Execution
+) -> list[Reference]:
+    """References of the frames of each log with these stamps, without those that do not decode."""
+    references = []
+    for log, stamps in zip(opened, stamps_ns, strict=True):
+        frames = extract_frames(log.frames(stamps), pipeline.features, execution)
+        for stamp_ns, frame, features, _ in execution.counted(f"extract {log.name}", frames, len(stamps)):
+            if frame is not None and features is not None:
+                references.append(Reference(masked(frame).image, features, log.name, stamp_ns))
+    return references
+
+
+def _add_until_enough(
+    references: list[Reference], opened: Sequence[Log], pipeline: Describing, execution: Execution
+) -> None:
+    """Add twice as many frames of each log as long as the references recognise each other too seldom."""
+    stamps = [log.stamps() for log in opened]
+    rows = [np.flatnonzero(np.isin(one, chosen)) for one, chosen in zip(stamps, _shares(opened, pipeline), strict=True)]
+    most = min(sum(map(len, stamps)) // FRAMES_A_REFERENCE, MOST)
+    while (total := sum(map(len, rows))) < most and references and not suffices(references, execution):
+        share = min(1.0, (most - total) / total)
+        added = [
+            further(one, old, pipeline.library, min(round(share * len(old)), len(one) - len(old)))
+            for one, old in zip(stamps, rows, strict=True)
+        ]
+        if not any(map(len, added)):
+            break
+        wanted = [one[new] for one, new in zip(stamps, added, strict=True)]
+        references += _extracted(opened, wanted, pipeline, execution)
+        rows = [np.union1d(old, new) for old, new in zip(rows, added, strict=True)]
+
+
+def _shares(opened: Sequence[Log], pipeline: Describing, _: Execution | None = None) -> list[Ints]:
     """Stamps of an equal share of references for each log."""
     size, result = pipeline.library.size or PAPER_SIZE, []
     for number, log in enumerate(opened):
