@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from vplog.data import LogInfo, Topic, Trajectory
 from vplog.errors import LogError
+from vplog.geometry import se3
 from vplog.logs.calibration_file import SidecarFiles
 from vplog.logs.cameras import BODY, body_from_camera, camera_of
 from vplog.logs.content import read_content
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 
 _LISTED = 8
 """Topics that an error lists."""
+_MOST_TURNED_RAD = 0.5
+"""Between the cameras of a pair, which see the same; those of a car's two sides are 110 degrees apart."""
 
 
 class RecordedLog:
@@ -122,8 +125,16 @@ class RecordedLog:
         choice, body = self._choice, self._body or BODY
         if choice.cameras is not None or choice.image is not None:
             return list(choice.cameras or ())
-        known = further_cameras(self._candidates, self._selection)
-        return [c.channel.topic for c in known if self._content.tree.between(body, c.frame) is not None]
+        tree, known = self._content.tree, further_cameras(self._candidates, self._selection)
+        return [
+            c.channel.topic for c, left in known
+            if tree.between(body, c.frame) is not None and (left is None or self._are_apart(left.frame, c.frame))
+        ]
+
+    def _are_apart(self, left: str, right: str) -> bool:
+        """Whether two cameras, a pair by their names, look to two sides."""
+        turned = self._content.tree.between(left, right)
+        return turned is not None and float(se3.angle(turned)) > _MOST_TURNED_RAD
 
     def has_depth(self) -> bool:
         return self._pair is not None or self._depth is not None
@@ -274,6 +285,10 @@ class RecordedLog:
                 raise NoPairError(f"{right.topic} has no calibration")
             other, size = self._images.first(right, content.companions["right"], self._path.name)
             camera = camera_of(right.topic, theirs, size, self._notes)
+            if other and frame and self._are_apart(frame, other):
+                if not self._choice.right:
+                    return None
+                raise NoPairError(f"{right.topic} looks to another side")
             right_from_left = content.tree.between(other, frame) if other and frame else None
             right_from_left = self._sidecar.right_from_left(image.topic, right.topic) if known else right_from_left
             pair = pair_of(Side(left, own), Side(camera, theirs), right_from_left)
