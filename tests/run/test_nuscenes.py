@@ -124,6 +124,9 @@ def test_six_cameras_and_tf_are_used_unasked(drive: Path, verb: Callable[..., Sa
     assert set(found["cameras"]) == topics
     closures = tables.read_closures(out / "closures.parquet")
     assert len({*closures.query_camera[closures.accepted], *closures.match_camera[closures.accepted]}) > 2
+    far = closures.accepted & ~closures.of_first_camera
+    assert far.any()
+    assert (closures.p_false[far] < 0.1).all()
     judged = verb("evaluate", out, "--truth", drive / "truth.tum", "--json").json
     assert judged["closures"]["accepted_false"] == 0
     assert judged["ate_after"]["rmse_m"] < 0.5 * judged["ate_before"]["rmse_m"]
