@@ -202,8 +202,9 @@ def run(
         views = [View.of(log, drive, descriptors), *(do(describe_cameras, views, state) if views else [])]
         if len(views) > 1:
             closures = do(verify_cameras, closures, views, state, pipeline)
+        pictures, rows = [view.pictures for view in views], [view.row for view in views]
         closures = do(
-            rate_closures, closures, odometry, drive, pipeline.null_pairs, pipeline.propose, pipeline.noise
+            rate_closures, closures, odometry, pictures, rows, pipeline.null_pairs, pipeline.propose, pipeline.noise
         )  # fmt: skip
         if decisions is not None:
             closures = do(decide, closures, decisions, drive)

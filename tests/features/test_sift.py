@@ -160,7 +160,7 @@ def test_poor_pictures_give_the_features_of_good_ones(kind: str) -> None:
     poor = np.clip(np.rint(POOR[kind](image, np.random.default_rng(1))), 0, 255).astype(np.uint8)
     bare, found = SiftSettings(min_features=0)(poor), SiftSettings()(poor)
     assert len(found) > max(2 * len(bare), 150)
-    good = SiftSettings()(image)
+    good = SiftSettings(doubled=True)(image)  # poor ones are doubled before anything else
     points = found.points * (image.shape[1] / poor.shape[1])
     off = np.linalg.norm(points[:, None] - good.points[None], axis=2).min(axis=1)
     assert np.median(off) < 2.0  # where those of the good picture are, not of the noise
@@ -174,6 +174,15 @@ def test_a_good_picture_is_taken_as_it_is(doubled: bool) -> None:
     assert len(good(image)) > good.least_features
     same = SiftSettings(doubled=doubled, min_features=0)
     assert good(image).descriptors.tobytes() == same(image).descriptors.tobytes()
+
+
+def test_a_picture_with_few_features_is_doubled_and_no_other() -> None:
+    image = texture(7, 640, 400)
+    few = cv2.resize(image, (160, 100), interpolation=cv2.INTER_AREA).astype(np.uint8)
+    for picture, doubled in ((image, False), (few, True)):
+        found = SiftSettings(min_features=250)(picture)
+        same = SiftSettings(doubled=doubled, min_features=0)(picture)
+        assert found.descriptors.tobytes() == same.descriptors.tobytes()
 
 
 def test_no_features_are_made_of_noise() -> None:

@@ -23,6 +23,7 @@ from vplog.loops.false_rate import (
     with_p_false,
     wrong_poses,
 )
+from vplog.loops.propose import Proposals
 from vplog.loops.verify import drive_of, verify_between
 
 
@@ -108,8 +109,8 @@ def test_what_odometry_rules_out_is_false_and_what_was_not_verified_has_no_rate(
 def test_a_mirrored_view_is_no_closure() -> None:
     ledger, drive = road()
     assert ledger.of(Verdict.ACCEPTED).all()
-    rows = np.arange(len(ledger))
-    assert (mirrored_evidence(ledger, rows, drive, Execution()) == 0).all()
+    proposals = Proposals(ledger.query, ledger.match, ledger.rank, ledger.score, ledger.support)
+    assert (mirrored_evidence(proposals, drive, drive, Execution()) == 0).all()
 
 
 def test_features_are_mirrored_as_the_image_is() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ from vplog.logs.formats.container import Channel
 from vplog.logs.topic_selection import Candidate, Selection, further_cameras
 from vplog.loops.propose import Proposals
 from vplog.results import tables
+from vplog.results.mcap_read import read_pictures
 from vplog.results.run_record import read_run_json
 from vplog.run import cameras
 
@@ -52,6 +54,11 @@ def test_the_rear_camera_closes_the_way_back(rig: Path, verb: Callable[..., Said
     assert (closures.query_camera + closures.match_camera)[used].tolist() == [1] * used.sum()
     pairs = list(zip(closures.query.tolist(), closures.match.tolist(), strict=True))
     assert len(set(pairs)) == len(pairs)
+    thumbnails = read_pictures(out / "result.mcap").thumbnails
+    rear = np.where(closures.query_camera == 1, closures.query, closures.match)[used]
+    assert {(1, row) for row in rear.tolist()} <= thumbnails.keys()
+    page = (out / "report.html").read_text()
+    assert all(base64.b64encode(jpeg).decode() in page for jpeg in thumbnails.values())
     judged = verb("evaluate", out, "--truth", rig / "truth.tum", "--json").json
     assert judged["closures"]["accepted_false"] == 0
     assert judged["ate_after"]["rmse_m"] < 0.5 * judged["ate_before"]["rmse_m"]
@@ -90,7 +97,7 @@ def candidate(name: str, role: str = "image", **more: Any) -> Candidate:
     return Candidate(Channel(f"/{name}", "", ""), 10, role, **more)
 
 
-def test_further_cameras_are_calibrated_have_frames_of_their_own_and_are_not_right() -> None:
+def test_further_cameras_are_calibrated_and_have_frames_of_their_own() -> None:
     images = ["front/image", "front/image_small", "left/image", "right/image", "rear/image", "dark/image", "top/image"]
     frames = ["front", "front", "left", "right", "rear", "dark", ""]
     found = [candidate(name, frame=frame) for name, frame in zip(images, frames, strict=True)]
@@ -98,8 +105,11 @@ def test_further_cameras_are_calibrated_have_frames_of_their_own_and_are_not_rig
     found += [candidate(f"{name}/camera_info", "camera_info", calibrated=True) for name in known]
     found += [candidate("dark/camera_info", "camera_info")]
     front = Selection(image=found[0].channel)
-    assert [one.channel.topic for one in further_cameras(found, front)] == ["/left/image", "/rear/image"]
-    assert "/left/image" not in [c.channel.topic for c in further_cameras(found, replace(front, mask=found[2].channel))]
+    others = {one.channel.topic: left and left.channel.topic for one, left in further_cameras(found, front)}
+    assert others == {"/left/image": None, "/right/image": "/left/image", "/rear/image": None}
+    assert "/left/image" not in [
+        one.channel.topic for one, _ in further_cameras(found, replace(front, mask=found[2].channel))
+    ]
 
 
 def poses_of(rng: np.random.Generator, count: int) -> np.ndarray:

@@ -1,7 +1,7 @@
 """SIFT (Lowe 2004) by OpenCV, as rows of bytes: 128 integers of 0..255 a feature.
 
-OpenCV always doubles the image first, which costs four times the pixels for features below 3 px. Where these are not
-wanted, the image is halved before.
+OpenCV always doubles the image first, which costs four times the pixels for features below 3 px. Where the larger ones
+are enough, the image is halved before.
 """
 
 from __future__ import annotations
@@ -48,21 +48,21 @@ class SiftSettings(Settings):
     """Weakest extremum kept, half of Lowe's: `max_features` bounds a picture rich in contrast, and at night or in fog
     the weak ones are all there is."""
     min_features: int = Field(default=300, ge=0)
-    """An image with fewer is searched again with its contrast stretched, then doubled in size where it is small, then
-    with its contrast equalised tile by tile, until it has as many; 0 takes every image as it is. Pictures by day have
-    600 and more."""
+    """An image with fewer is searched again doubled, then with its contrast stretched, then enlarged where it is small,
+    then with its contrast equalised tile by tile, until it has as many; 0 takes every image as it is. Pictures by day
+    have 400 and more."""
     max_megapixels: float = Field(default=0.52, ge=0.001)
     """Larger images are reduced to this, half of full HD (960 x 540) as it is; points stay in px of the full image."""
-    doubled: bool = True
-    """The image is doubled first, so that the smallest features are of 1.5 px instead of 3. Without, a frame takes a
-    third of the time; by day that recognises and places as well, at night less is left to recognise."""
+    doubled: bool = False
+    """Every image is doubled first, so that the smallest features are of 1.5 px instead of 3, at three times the cost.
+    Images that have `min_features` without are recognised and placed as well by those (docs/how-it-works.md)."""
 
     def __call__(self, image: Bytes, depth_m: Float32s | None = None) -> Features:
         """Features of a grey (H, W) uint8 image; `depth_m` (H, W) float32 m registered to it is read at the points."""
         height, width = image.shape
-        pixels = self._reduced(image)
+        pixels = self._reduced(image, self.doubled)
         keypoints, descriptors = self._detect(pixels)
-        remedies = self._remedies(pixels)
+        remedies = self._remedies(image)
         while len(keypoints) < self.least_features and (better := next(remedies, None)) is not None:
             if len((found := self._detect(better))[0]) > len(keypoints):
                 pixels, (keypoints, descriptors) = better, found
@@ -88,20 +88,23 @@ class SiftSettings(Settings):
 
     @property
     def least_features(self) -> int:
-        """`min_features`, a third of it without the smallest features, and no more than are wanted."""
-        return min(self.min_features if self.doubled else self.min_features // 3, self.max_features)
+        """`min_features`, and no more than are wanted."""
+        return min(self.min_features, self.max_features)
 
-    def _reduced(self, image: Bytes) -> Bytes:
-        """The image at the size that OpenCV gets."""
+    def _reduced(self, image: Bytes, doubled: bool) -> Bytes:
+        """The image at the size that OpenCV gets, which doubles it."""
         height, width = image.shape
-        share = min(math.sqrt(self.max_megapixels * 1e6 / image.size), 1.0) * (1.0 if self.doubled else 0.5)
+        share = min(math.sqrt(self.max_megapixels * 1e6 / image.size), 1.0) * (1.0 if doubled else 0.5)
         if share == 1.0:
             return image
         smaller = (max(round(width * share), 1), max(round(height * share), 1))
         return np.asarray(cv2.resize(image, smaller, interpolation=cv2.INTER_AREA), np.uint8)
 
-    def _remedies(self, pixels: Bytes) -> Iterator[Bytes]:
-        """The picture with its contrast stretched, then doubled in size, then equalised by tiles, in turn."""
+    def _remedies(self, image: Bytes) -> Iterator[Bytes]:
+        """The picture doubled, then with its contrast stretched, then enlarged, then equalised by tiles, in turn."""
+        pixels = self._reduced(image, doubled=True)
+        if not self.doubled:
+            yield pixels
         values, (dark, bright) = pixels, np.percentile(pixels, _TAILS)
         if bright - dark < _NOISY_LEVELS:
             values = np.asarray(cv2.GaussianBlur(pixels.astype(np.float32), (0, 0), _NOISE_PX))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from vplog.data import LogInfo, Topic, Trajectory
 from vplog.errors import LogError
+from vplog.geometry import se3
 from vplog.logs.calibration_file import SidecarFiles
 from vplog.logs.cameras import BODY, body_from_camera, camera_of
 from vplog.logs.content import read_content
@@ -17,7 +18,15 @@ from vplog.logs.formats.ros2_folder import messages_unpacked
 from vplog.logs.frames import ImageReader, RecordedFrame, size_of
 from vplog.logs.masks import masks_of
 from vplog.logs.odometry_sources import PROPERTIES, is_truth
-from vplog.logs.rectification import CHECKED_FRAMES, MOST_ROWS_PX, NoPairError, Side, pair_of, row_error_px
+from vplog.logs.rectification import (
+    CHECKED_FRAMES,
+    MOST_ROWS_PX,
+    MOST_TURN_RAD,
+    NoPairError,
+    Side,
+    pair_of,
+    row_error_px,
+)
 from vplog.logs.scans import ScanReader
 from vplog.logs.stamps import rows_of
 from vplog.logs.topic_candidates import read_candidates
@@ -122,8 +131,17 @@ class RecordedLog:
         choice, body = self._choice, self._body or BODY
         if choice.cameras is not None or choice.image is not None:
             return list(choice.cameras or ())
-        known = further_cameras(self._candidates, self._selection)
-        return [c.channel.topic for c in known if self._content.tree.between(body, c.frame) is not None]
+        tree, known = self._content.tree, further_cameras(self._candidates, self._selection)
+        return [
+            c.channel.topic
+            for c, left in known
+            if tree.between(body, c.frame) is not None and (left is None or self._are_apart(left.frame, c.frame))
+        ]
+
+    def _are_apart(self, left: str, right: str) -> bool:
+        """Whether two cameras, a pair by their names, look to two sides."""
+        turned = self._content.tree.between(left, right)
+        return turned is not None and float(se3.angle(turned)) > MOST_TURN_RAD
 
     def has_depth(self) -> bool:
         return self._pair is not None or self._depth is not None
@@ -274,6 +292,8 @@ class RecordedLog:
                 raise NoPairError(f"{right.topic} has no calibration")
             other, size = self._images.first(right, content.companions["right"], self._path.name)
             camera = camera_of(right.topic, theirs, size, self._notes)
+            if other and frame and self._choice.cameras is not None and self._are_apart(frame, other):
+                return None  # the other is a camera by itself
             right_from_left = content.tree.between(other, frame) if other and frame else None
             right_from_left = self._sidecar.right_from_left(image.topic, right.topic) if known else right_from_left
             pair = pair_of(Side(left, own), Side(camera, theirs), right_from_left)

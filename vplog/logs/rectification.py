@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _BASELINES_M = (1e-3, 20.0)
 """m; endoscopes have 4 mm, stereo across a lorry's cab 2 m: anything outside is another unit, or another thing."""
-_MOST_TURN_RAD = np.radians(20.0)
+MOST_TURN_RAD = np.radians(20.0)
 """Most that the two cameras may be turned: stereo heads are parallel to a few degrees, surround views 55 apart and
 more."""
 _REMAP_PX = 2**15
@@ -163,7 +163,7 @@ def _rotation(calibration: CalibrationMessage) -> Floats:
 def _rectification(left: Side, right: Side, right_from_left: Floats) -> tuple[list[Floats], list[Floats]]:
     """Rotations and projections that put both images on common rows (Bouguet's method, cv2.stereoRectify)."""
     angle = float(se3.angle(right_from_left[:3, :3]))
-    if angle > _MOST_TURN_RAD:
+    if angle > MOST_TURN_RAD:
         raise NoPairError(f"the static transforms turn it by {np.degrees(angle):.0f} degrees against the left camera")
     shift = right_from_left[:3, 3]
     if abs(shift[1]) > abs(shift[0]) or abs(shift[2]) > 2 * abs(shift[0]):

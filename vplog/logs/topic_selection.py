@@ -6,7 +6,7 @@ its frame.
 Static transforms are those of all topics whose name ends in `static`. Of several topics that could play one of the
 other parts the first by these rules does, unless TopicChoice names another:
 - image: encodings that can be decoded first, thermal cameras last, then calibrated ones, then those that are not the
-  right one of a pair, then most messages, then name;
+  right one of a pair, then those that do not look back by their name, then most messages, then name;
 - right: the topic named like the image's with `right` for `left` (or another of _PAIRS), where no depth is used;
 - depth: with the image's frame_id first, then the longest namespace in common with it, then most messages, then name;
 - camera_info: of those whose namespace holds the image (`/cam0/camera_info` and `/cam0/image_raw/compressed`), else of
@@ -189,6 +189,8 @@ _ROLES = {"right": "image", "mask": "image"}
 _PAIRS = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("infra1", "infra2"), ("cam0", "cam1"),
           ("image_0", "image_1"), ("image_2", "image_3"), ("rgb_0", "rgb_1"))  # fmt: skip
 """Words that tell the topics of a stereo pair apart: most drivers', RealSense's, EuRoC's, KITTI's and VSLAM-LAB's."""
+_BACKWARD = re.compile(r"(?<![a-z])(back|rear)(?![a-z])", re.IGNORECASE)
+"""Words in the topics of cameras that look back."""
 
 
 def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Selection:
@@ -200,8 +202,8 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     def as_image(c: Candidate) -> tuple:
         info = _calibration(c, usable)
         sixteen_bits = c.encoding.startswith("16UC1")  # a thermal camera comes behind one that sees
-        is_right = _partner(c, usable, back=True) is not None
-        return not c.supported, sixteen_bits, not (info and info.calibrated), is_right
+        is_right, backward = _partner(c, usable, back=True) is not None, bool(_BACKWARD.search(c.channel.topic))
+        return not c.supported, sixteen_bits, not (info and info.calibrated), is_right, backward
 
     image = pick("image", "depth", as_image)
     for topic in choice.cameras or ():
@@ -246,18 +248,17 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     )
 
 
-def further_cameras(candidates: list[Candidate], used: Selection) -> list[Candidate]:
-    """Calibrated cameras beside the one in use, each by its best topic: with another frame_id than any before it, and
-    not the right one of a pair."""
+def further_cameras(candidates: list[Candidate], used: Selection) -> list[tuple[Candidate, Candidate | None]]:
+    """Calibrated cameras beside the one in use, each by its best topic: with another frame_id than any before it; and,
+    where its name is that of the right one of a pair, the left one."""
     usable = sorted((c for c in candidates if c.count), key=lambda c: (-c.count, c.channel))
     taken = {c.frame for c in usable if c.channel in (used.image, used.right)}
     found = []
     for c in usable:
         info = _calibration(c, usable) if c.role == "image" and c.supported else None
-        is_right = _partner(c, usable, back=True) is not None
-        if info and info.calibrated and c.frame and c.frame not in taken and not is_right and c.channel != used.mask:
+        if info and info.calibrated and c.frame and c.frame not in taken and c.channel != used.mask:
             taken.add(c.frame)
-            found.append(c)
+            found.append((c, _partner(c, usable, back=True)))
     return found
 
 

@@ -72,12 +72,10 @@ def null_pairs(found: Ints, settings: FalseRateSettings) -> int:
     return max(settings.null_pairs, math.ceil(_FINER * len(found) / max(int((found > 0).sum()), 1) / settings.rate))
 
 
-def mirrored_evidence(closures: Closures, rows: Ints, drive: Drive, execution: Execution) -> Ints:
-    """(R,) evidence for ledger rows of a drive (R,) whose query is mirrored: they are no closures, whatever it is."""
-    names = ("query", "match", "rank", "score", "support")
-    proposals = Proposals(**{name: getattr(closures, name)[rows] for name in names})
-    mirror = replace(drive, features=lambda row: mirrored(drive.features(row)))
-    return evidence(verify_between(proposals, mirror, drive, execution, share=0.0))
+def mirrored_evidence(proposals: Proposals, later: Drive, earlier: Drive, execution: Execution) -> Ints:
+    """(R,) evidence of proposals (R,) whose query is mirrored: they are no closures, whatever it is."""
+    mirror = replace(later, features=lambda row: mirrored(later.features(row)))
+    return evidence(verify_between(proposals, mirror, earlier, execution, share=0.0))
 
 
 def certain_pairs(positions: Floats, stops: Ints, reach_m: float, count: int) -> Proposals:

@@ -114,6 +114,8 @@ class McapExtras:
     """JPEG of a reference of the library by its number."""
     views: Mapping[int, dict[str, Any]] = field(default_factory=dict)
     """Matches, boxes and votes of a candidate closure by its row, see `closure_views.view`."""
+    thumbnails: Mapping[tuple[int, int], bytes] = field(default_factory=dict)
+    """Small JPEGs of cameras beside the first, by number of the camera and row of the keyframe."""
     pictures: Mapping[int, bytes] = field(default_factory=dict)
     """JPEG of a candidate closure by its row in the ledger."""
     gps: Gps | None = None
@@ -153,6 +155,8 @@ def write_mcap(
             start_ns = int(keyframes.stamp_ns[0])
             for number, data in sorted(extras.references.items()):
                 writer.add_attachment(start_ns, start_ns, f"reference-{number}.jpg", "image/jpeg", data)
+            for (number, row), data in sorted(extras.thumbnails.items()):
+                writer.add_attachment(start_ns, start_ns, f"camera-{number}-keyframe-{row}.jpg", "image/jpeg", data)
             if extras.views:
                 views = canonical_json({str(row): view for row, view in extras.views.items()}).encode()
                 writer.add_attachment(start_ns, start_ns, VIEWS, "application/json", views)

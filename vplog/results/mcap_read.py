@@ -49,6 +49,8 @@ class McapContent:
     references: dict[int, bytes] = field(default_factory=dict)
     """JPEG of a reference of the library by its number."""
     gps: Gps | None = None
+    thumbnails: dict[tuple[int, int], bytes] = field(default_factory=dict)
+    """Small JPEGs of cameras beside the first, by number of the camera and row of the keyframe."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +68,13 @@ class CameraPicture:
 
 def read_pictures(path: Path) -> McapContent:
     """The pictures, references and fixes of a result.mcap. Raises ResultError where it is missing or damaged."""
-    rows, pictures, references, fixes, views = [], [], {}, [], {}
+    rows, pictures, references, fixes, views, thumbnails = [], [], {}, [], {}, {}
     with _reading(path) as reader:
         for attachment in reader.iter_attachments():
             if named := re.fullmatch(r"reference-(\d{1,6})\.jpg", attachment.name):
                 references[int(named[1])] = attachment.data
+            if named := re.fullmatch(r"camera-(\d{1,6})-keyframe-(\d{1,9})\.jpg", attachment.name):
+                thumbnails[int(named[1]), int(named[2])] = attachment.data
             if attachment.name == VIEWS:
                 views = {int(row): checked(one) for row, one in json.loads(attachment.data).items()}
         for _, channel, message in reader.iter_messages(topics=[PICTURES, FIXES]):
@@ -83,7 +87,7 @@ def read_pictures(path: Path) -> McapContent:
                 rows.append(int(named[1]))
         named = list(zip(rows or _picture_rows(reader), pictures, strict=True))
     kept = {row: data for row, data in named if row is not None}
-    return McapContent(kept, views, references, _gps(fixes) if fixes else None)
+    return McapContent(kept, views, references, _gps(fixes) if fixes else None, thumbnails)
 
 
 def read_fixes(path: Path) -> Gps | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,12 +27,13 @@ from vplog.loops.false_rate import (
     null_pairs,
     with_p_false,
 )
-from vplog.loops.propose import ProposeSettings, candidate_stops
+from vplog.loops.propose import Proposals, ProposeSettings, candidate_stops
 from vplog.loops.verify import verify_between
 from vplog.run.verification import DriveFeatures, for_verification
 
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution
+    from vplog.loops.candidate import Drive
 
 _log = logging.getLogger(__name__)
 _FAR_M = 1e6
@@ -40,34 +42,51 @@ _FAR_M = 1e6
 
 @step("p_false", lambda *_: closures_codec(), items=lambda closures, *_: len(closures))
 def rate_closures(
-    closures: Closures,
-    odometry: Odometry,
-    drive: DriveFeatures,
-    settings: FalseRateSettings,
-    propose: ProposeSettings,
-    noise: NoiseSettings,
-    *,
-    execution: Execution,
-) -> Closures:
-    """The ledger with `p_false`, and with `rate` without what is likelier to be false."""
+    closures: Closures, odometry: Odometry, views: Sequence[DriveFeatures], rows: Sequence[Ints],
+    settings: FalseRateSettings, propose: ProposeSettings, noise: NoiseSettings, *, execution: Execution,
+) -> Closures:  # fmt: skip
+    """The ledger with `p_false`, and with `rate` without what is likelier to be false, by pairs of all cameras.
+
+    `views` are the pictures of each camera, the first one's at every keyframe, and `rows` the keyframes of each.
+    """
     if not len(closures):
         return closures
-    keyframes, reach_m, views = drive.keyframes, drive.settings.metric.max_distance_m, for_verification(drive)
-    ruled_out = beyond_drift(closures, keyframes, odometry, noise, reach_m, settings.sigmas)
-    left = np.flatnonzero(~ruled_out & closures.of_first_camera)
+    reach_m = views[0].settings.metric.max_distance_m
+    ruled_out = beyond_drift(closures, views[0].keyframes, odometry, noise, reach_m, settings.sigmas)
+    left = np.flatnonzero(~ruled_out)
     count = min(max(null_pairs(evidence(closures), settings) - int(ruled_out.sum()), 0), len(left))
-    rows = left[np.linspace(0, len(left) - 1, count).astype(np.int64)]
-    mirror = mirrored_evidence(closures, rows, views, execution)
+    chosen = left[np.linspace(0, len(left) - 1, count).astype(np.int64)]
+    mirror = _mirrored(closures.rows(chosen), [for_verification(view) for view in views], rows, execution)
+    # a moving camera's landmarks come from these very neighbours, so that they tell little of other closures
+    most = settings.certain_pairs // len(views) if {"depth", "stereo"} & set(closures.scale) else 0
+    certain = [_certain_pairs(view, odometry, propose, most, execution) for view in views]
+    known = [_by_odometry(one, view, noise, settings) for one, view in zip(certain, views, strict=True)]
+    closures = with_p_false(closures, ruled_out, mirror, *map(np.concatenate, zip(*known, strict=True)))
+    return closures if settings.rate is None else _admitted(closures, settings.rate, int(ruled_out.sum()), count)
+
+
+def _mirrored(closures: Closures, drives: Sequence[Drive], rows: Sequence[Ints], execution: Execution) -> Ints:
+    """Evidence (C,) of candidates whose query is mirrored, by pairs of cameras."""
+    cameras, found = np.stack([closures.query_camera, closures.match_camera]), [np.zeros(0, np.int64)]
+    for q, m in np.unique(cameras, axis=1).T.tolist():
+        of = closures.rows(np.flatnonzero((cameras == [[q], [m]]).all(axis=0)))
+        query, match = (rows[n].searchsorted(one).astype(np.int32) for n, one in ((q, of.query), (m, of.match)))
+        proposals = Proposals(query, match, of.rank, of.score, of.support)
+        found.append(mirrored_evidence(proposals, drives[q], drives[m], execution))
+    return np.concatenate(found)
+
+
+def _certain_pairs(
+    drive: DriveFeatures, odometry: Odometry, propose: ProposeSettings, most: int, execution: Execution
+) -> Closures:
+    """The ledger of at most so many pairs of neighbouring pictures of one camera."""
+    keyframes, views = drive.keyframes, for_verification(drive)
     piece = np.zeros(len(keyframes.stamp_ns))
     piece[broken_edges(odometry, keyframes.stamp_ns) + 1] = _FAR_M  # what lies behind a break is near nothing before
     positions = np.column_stack([keyframes.odom_from_body[:, :3, 3], np.cumsum(piece)])
     stops = candidate_stops(keyframes, propose)
-    # a moving camera's landmarks come from these very neighbours, so that they tell little of other closures
-    most = settings.certain_pairs if {"depth", "stereo"} & set(closures.scale) else 0
-    pairs = certain_pairs(positions, stops, reach_m, most)
-    certain = verify_between(pairs, views, views, execution, share=0.0)
-    closures = with_p_false(closures, ruled_out, mirror, *_by_odometry(certain, drive, noise, settings))
-    return closures if settings.rate is None else _admitted(closures, settings.rate, int(ruled_out.sum()), count)
+    pairs = certain_pairs(positions, stops, drive.settings.metric.max_distance_m, most)
+    return verify_between(pairs, views, views, execution, share=0.0)
 
 
 def _by_odometry(

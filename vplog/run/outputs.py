@@ -18,6 +18,7 @@ from vplog.run import provenance
 from vplog.run.back_end import Solved, about_gps, keyframe_covariances
 from vplog.run.figures.run_figures import (
     ClosureInputs,
+    camera_thumbnails,
     choose_examples,
     choose_views,
     earth_of,
@@ -90,6 +91,7 @@ def write(
     previews = picture if run.features.has_pictures else None
     extras = replace(
         mcap_extras(inputs, previews, run.closures, run.references, verify, pictures, execution),
+        thumbnails=camera_thumbnails(run.views, run.closures),
         gps=gps,
         earth=earth_of(trajectory, gps, about_gps(run.solved)),
         about={"versions": provenance.versions(), "inputs": steps.cache.hashes()},

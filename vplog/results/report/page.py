@@ -388,7 +388,13 @@ def _audit(content: Content, drawn: dict[str, Any]) -> dict[str, Any]:
         "views": views,
         "references": references,
         "questions": {str(one.rows[0]): one.rows for one in content.questions},
-        "thumbnails": {str(row): base64.b64encode(jpeg).decode() for row, jpeg in content.pictures.thumbnails.items()},
+        "thumbnails": {
+            name: base64.b64encode(jpeg).decode()
+            for name, jpeg in [
+                *((str(row), jpeg) for row, jpeg in content.pictures.thumbnails.items()),
+                *((f"{n}:{row}", jpeg) for (n, row), jpeg in content.tracks.found.thumbnails.items()),
+            ]
+        },
         "cameras": list(map(str, _list(content.record.get("cameras")))),
         "explain": "vplog explain RUN --closure ",
         "again": command,

@@ -307,21 +307,22 @@
     $("closure").hidden = selected < 0; $("hint").hidden = selected >= 0;
     if (selected < 0) return;
     const row = selected, verdict = columns.verdict[row], decision = decisions.get(pairOf(row))?.decision;
-    $("closure-title").textContent = "Closure " + columns.row[row] + ": keyframe " + columns.query[row] + " as a return to " + columns.match[row];
+    $("closure-title").textContent = "Closure " + columns.row[row] + ": keyframe " + columns.query[row] + " as a return to " + columns.match[row]
+      + (columns.query_camera ? ", " + data.cameras[columns.query_camera[row]] + " and " + data.cameras[columns.match_camera[row]] : "");
     $("closure-verdict").textContent = verdict + ". " + sentences[verdict] + (decision ? " Your decision: " + decision + "." : "")
       + (answered.length > 1 ? " An answer is for all " + answered.length + " closures of its run." : "");
     $("closure-verdict").className = isUsed(row) ? "accepted" : "rejected";
     $("closure-numbers").textContent = names.filter((name) => !["row", "verdict", "query", "match"].includes(name) && columns[name][row] !== null)
       .map((name) => name + " " + columns[name][row]).join(", ");
     $("command").value = data.explain + columns.query[row] + ":" + columns.match[row];
-    const others = ["query", "match"].map((end) => columns[end + "_camera"]?.[row] ?? 0);
+    const jpegOf = (end) => { const camera = columns[end + "_camera"]?.[row]; return thumbnails[(camera ? camera + ":" : "") + columns[end][row]]; };
     for (const end of ["query", "match"]) {
-      const jpeg = others.some(Boolean) ? "" : thumbnails[columns[end][row]];
+      const jpeg = jpegOf(end);
       $(end).hidden = !jpeg;
       if (jpeg) $(end).src = "data:image/jpeg;base64," + jpeg;
     }
-    const view = data.views[columns.row[row]], small = ["query", "match"].every((end) => thumbnails[columns[end][row]]);
-    $("no-picture").textContent = others.some(Boolean) ? "Pictures of the cameras " + others.map((one) => data.cameras[one]).join(" and ") + ", which the command below draws." : small ? view ? "" : "The page has no matches of this pair; the command below draws them." : "No thumbnails of this pair are in the page.";
+    const view = data.views[columns.row[row]], small = ["query", "match"].every(jpegOf);
+    $("no-picture").textContent = small ? view ? "" : "The page has no matches of this pair; the command below draws them." : "No thumbnails of this pair are in the page.";
     $("references").replaceChildren(...panelsOf(view));
     overlay();
   };

@@ -15,7 +15,7 @@ from vplog.results import closure_views
 from vplog.results.collage import FramePanel, ReferencePanel, collage
 from vplog.results.geo import Earth
 from vplog.results.mcap import McapExtras, ReferenceBoxes
-from vplog.results.previews import jpeg, scaled_size, shrink
+from vplog.results.previews import jpeg, scaled_size, shrink, thumbnail
 from vplog.run.figures.closure_view import find_agreement, find_boxes
 from vplog.stages import BoxState
 from vplog.storage.image_file import decode_image
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from vplog.execution.execution import Execution
     from vplog.loops.verify import VerifySettings
     from vplog.results.previews import PictureSettings
+    from vplog.run.cameras import View
     from vplog.stages import PlaceState
 
 _REFERENCE_MEGAPIXELS = 0.05
@@ -185,6 +186,22 @@ def _panels(
 
 def _strongest(features: Features) -> Features:
     return replace(features.rows(slice(_VOTING)), thumbnail=None)
+
+
+def camera_thumbnails(views: Sequence[View], closures: Closures) -> dict[tuple[int, int], bytes]:
+    """Small JPEGs of the pictures of cameras beside the first, by camera and keyframe: of closures in the solution,
+    then of the nearest misses; empty where pictures are switched off."""
+    order = np.lexsort((-closures.inliers, ~closures.of(*USED)))
+    cameras, rows = (
+        np.stack(ends, 1)[order].ravel().tolist()
+        for ends in ((closures.query_camera, closures.match_camera), (closures.query, closures.match))
+    )
+    wanted = dict.fromkeys((n, row) for n, row in zip(cameras, rows, strict=True) if n)
+    return {
+        (n, row): thumbnail(decode_image(views[n].pictures.features.picture(views[n].at(row))))
+        for n, row in list(wanted)[:_MOST_VIEWS]
+        if views[n].pictures.features.has_pictures
+    }
 
 
 def choose_views(closures: Closures) -> list[int]:
