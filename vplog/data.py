@@ -108,6 +108,21 @@ class Gps:
 
 
 @dataclass(frozen=True, eq=False)
+class Imu:
+    """Measurements of an inertial measurement unit."""
+
+    name: str
+    stamp_ns: Ints
+    """(K,) increasing."""
+    gyro: Floats
+    """(K, 3) rad/s about its axes."""
+    accel: Floats
+    """(K, 3) m/s^2 along its axes, gravity's reaction included."""
+    body_from_imu: Floats
+    """(4, 4)."""
+
+
+@dataclass(frozen=True, eq=False)
 class Lidar:
     """A lidar whose scans the log holds."""
 

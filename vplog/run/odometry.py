@@ -13,18 +13,20 @@ import numpy as np
 from vplog.cache.codecs import json_codec
 from vplog.cache.steps import Steps, step
 from vplog.data import Camera, Frame, Keyframes, Odometry
-from vplog.errors import LogError
+from vplog.errors import LogError, plural
 from vplog.geometry.masking import masked
 from vplog.logs.image_folder import PERIOD_NS
 from vplog.loops import undistort
 from vplog.run.feature_extraction import image_topics
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.run.lidar_odometry import lidar_odometry, range_of
+from vplog.run.visual_odometry.inertial import SURE, with_imu
 from vplog.run.visual_odometry.metres import in_metres
 from vplog.run.visual_odometry.visual import visual_odometry
 
 if TYPE_CHECKING:
     from vplog.cache.stage_cache import Inputs
+    from vplog.data import Imu
     from vplog.execution.execution import Execution
     from vplog.logs import TopicChoice
     from vplog.stages import EncodedFrame, Log
@@ -60,6 +62,8 @@ def read(
     Raises LogError where there is no odometry."""
     odometry = odometry_of(log, topics, steps)
     camera = camera_of(log, topics)
+    if source_of(log, topics) == "visual" and (imu := log.imu()) is not None and not _is_unknown(odometry):
+        odometry = _with_imu(odometry, imu, camera)
     if not odometry.metric:
         odometry = _with_scale(odometry, log, camera, use_gps)
     selected, warnings = select_keyframes(log.name, log.stamps(), odometry, settings)
@@ -70,6 +74,27 @@ def read(
     elif camera.matrix is None:
         _log.warning(_UNCALIBRATED, camera.name)
     return odometry, camera, selected
+
+
+def _with_imu(odometry: Odometry, imu: Imu, camera: Camera) -> Odometry:
+    """Odometry with what the IMU says, noted."""
+    found = with_imu(odometry, imu, camera)
+    if isinstance(found, str):
+        _log.warning("Visual odometry does without the IMU %s: %s.", imu.name, found)
+        return odometry
+    what = "gravity"
+    if not odometry.metric and found.odometry.metric:
+        what += f" and metres, its unit {found.scale:.3g} m with a sigma of {found.sigma:.1%}"
+    if found.bridged:
+        what += f", and goes on across {plural(found.bridged, 'break')}"
+    _log.warning("Visual odometry takes %s from the IMU %s.", what, imu.name)
+    if not found.odometry.metric:
+        sigma = f"{found.sigma:.0%}" if found.sigma < 1 else "more than its size"
+        _log.warning(
+            "The drive accelerates too little for metres by the IMU: they would have a sigma of %s, at most %.0f %% "
+            "is taken.", sigma, 100 * SURE,
+        )  # fmt: skip
+    return found.odometry
 
 
 def _with_scale(odometry: Odometry, log: Log, camera: Camera, use_gps: bool) -> Odometry:

@@ -54,7 +54,7 @@ _PART_WORDS = {
     "right_info": "calibration of the right camera",
     "odometry": "odometry",
     "gps": "satellite fixes",
-    "imu": "gyroscope, which turns the velocities",
+    "imu": "IMU of the odometry",
     "mask": "masks of the camera's images",
     "lidar": "the lidar whose scans give the odometry",
     "tf_static": "static transforms",
