@@ -100,6 +100,7 @@ def _write_log(path: Path, settings: DemoSettings, scene: Scene, execution: Exec
     """All messages in the order in which they reach the recorder."""
     messages = [*_mounting(scene), *_odometry(settings), *_fixes(settings), *_imu(settings), *_frames(scene, execution)]
     delays = np.random.default_rng([settings.seed, 5]).integers(*_DELAY_NS, len(messages), endpoint=True).tolist()
+    delays = [_DELAY_NS[0] if topic == IMU else delay for (topic, _, _), delay in zip(messages, delays, strict=True)]
     logged = sorted((stamp + delay, i) for i, ((_, stamp, _), delay) in enumerate(zip(messages, delays, strict=True)))
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)

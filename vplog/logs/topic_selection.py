@@ -48,6 +48,7 @@ OPTIONS = {
     "odometry": "odometry-topic", "gps": "gps-topic", "odometry_file": "odometry-file",
     "calibration_file": "calibration", "imu": "imu-topic", "start_s": "start", "stop_s": "stop",
     "mask": "mask-topic", "wheelbase_m": "wheelbase-m", "track_m": "track-m", "wheel_radius_m": "wheel-radius-m",
+    "camera_height_m": "camera-height-m",
 }  # fmt: skip
 """Option of the command line for each field of TopicChoice."""
 _NO_LIDAR = re.compile(r"depth|camera|stereo|radar|map|cluster|obstacle|segment|ground|filtered", re.IGNORECASE)
@@ -91,6 +92,8 @@ class TopicChoice(Settings):
     """m between left and right wheels, for wheel speeds in sensor_msgs/JointState."""
     wheel_radius_m: float | None = Field(default=None, gt=0, le=100)
     """m; for wheel speeds in sensor_msgs/JointState."""
+    camera_height_m: float | None = Field(default=None, gt=0, le=100)
+    """m of the camera over flat ground, by which the visual odometry of a single camera has metres."""
     start_s: float | None = Field(default=None, ge=0, le=1e9)
     """s after the first image, before which images are left out."""
     stop_s: float | None = Field(default=None, ge=0, le=1e9)

@@ -39,6 +39,10 @@ _UNCALIBRATED = (
 _FOCAL_LENGTH = 1.2
 """Focal length of a camera that is not calibrated as a share of the longer side of its images: COLMAP's, a field of
 view of 45 degrees; phones have some 0.8 to 1.2."""
+_BY_HEIGHT = "The camera's height of %.2f m over the ground gives visual odometry its metres."
+_NO_GROUND = (
+    "The images show no flat ground ahead of the camera often enough, so that its height of %.2f m gives no metres."
+)
 UNIT = (
     "A single camera has no metres: lengths are in a unit of its own, about a tenth of the distance of what is seen, "
     "and its scale wanders."
@@ -64,6 +68,8 @@ def read(
     camera = camera_of(log, topics)
     if source_of(log, topics) == "visual" and (imu := log.imu()) is not None and not _is_unknown(odometry):
         odometry = _with_imu(odometry, imu, camera)
+    if topics.camera_height_m is not None and (is_metric(log) or source_of(log, topics) != "visual"):
+        _log.warning("--camera-height-m has no effect: the odometry is no single camera's.")
     if not odometry.metric:
         odometry = _with_scale(odometry, log, camera, use_gps)
     selected, warnings = select_keyframes(log.name, log.stamps(), odometry, settings)
@@ -192,20 +198,23 @@ def odometry_of(log: Log, topics: TopicChoice, steps: Steps) -> Odometry:
     if source == "log" and odometry is not None:
         return odometry
     compute = by_lidar if source == "lidar" else by_images
-    return steps(compute, log, topics.odometry is None, steps.cache.inputs, image_topics(topics))
+    others = (topics.camera_height_m,) if source == "visual" else ()
+    return steps(compute, log, topics.odometry is None, steps.cache.inputs, image_topics(topics), *others)
 
 
 @step("odometry", lambda *_: json_codec(_from_plain, _plain), lambda log, *_: len(log.stamps()), ("log",))
-def by_images(log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], *, execution: Execution) -> Odometry:
-    """Visual odometry, its breaks noted. Where tracking fails from the first frame to the last: without depth a motion
-    of which nothing is known, else raises LogError."""
+def by_images(
+    log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], height_m: float | None, *, execution: Execution
+) -> Odometry:
+    """Visual odometry, its breaks noted, in metres where the height of a single camera gives them. Where tracking fails
+    from the first frame to the last: without depth a motion of which nothing is known, else raises LogError."""
     if unasked:
         _log.warning("The log has no odometry, so visual odometry of its images is used (--odometry visual).")
     stamp_ns, camera, metric = log.stamps(), log.camera(), is_metric(log)
     if camera.matrix is None:
         _log.warning(about_assumed(camera))
         camera = _assumed(camera)
-    odometry = visual_odometry(_decoded(log, stamp_ns, execution), camera, metric)
+    odometry = visual_odometry(_decoded(log, stamp_ns, execution), camera, metric, height_m)
     if odometry is None and metric:
         raise LogError(
             f"{log.name}: no two of {len(stamp_ns)} frames could be tracked: too few corners with depth, or too little "
@@ -219,6 +228,8 @@ def by_images(log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], *
             len(stamp_ns),
         )
         return _unknown(stamp_ns)
+    if height_m is not None and not metric:
+        _log.warning(_BY_HEIGHT if odometry.metric else _NO_GROUND, height_m)
     _log_breaks("Visual odometry", odometry, stamp_ns, "frames")
     return odometry
 
