@@ -109,7 +109,7 @@ def _with_scale(odometry: Odometry, log: Log, camera: Camera, use_gps: bool) -> 
     if _is_unknown(odometry):
         return odometry
     if gps is None:
-        _log.warning("%s `vplog evaluate` aligns with a scale.", UNIT)
+        _log.warning("%s `vplog evaluate` aligns with a scale; --camera-height-m gives metres over flat ground.", UNIT)
     elif not use_gps:
         _log.warning("%s --gps takes metres from the fixes.", UNIT)
     elif (found := in_metres(odometry, gps, camera)) is not None:
