@@ -16,8 +16,9 @@ from vplog.demo.record import IMU, make_drive
 from vplog.demo.settings import SMALL
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
+from vplog.graph.inertial import GRAVITY
 from vplog.logs.topic_selection import TopicChoice
-from vplog.run.visual_odometry.inertial import GRAVITY, SURE, Inertial, with_imu
+from vplog.run.visual_odometry.inertial import SURE, Inertial, with_imu
 
 MOUNT = np.array([[0, 0, 1, 1.2], [-1, 0, 0, 0.1], [0, -1, 0, 1.4], [0, 0, 0, 1.0]])
 CAMERA = Camera("camera", np.eye(3), "none", np.zeros(0), 640, 480, MOUNT)
