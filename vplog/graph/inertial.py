@@ -2,8 +2,8 @@
 
 Pre-integrated IMU factors (Forster et al. 2017) are loosely coupled: states are related by the motions of the images,
 too. The start is the linear alignment of Qin & Shen 2017 (Robust initialization of monocular visual-inertial
-estimation). The IMU is the body of the graph: as a sensor beside the body GTSAM leaves out its angular acceleration, and
-a lever of a metre turned gravity by 0.7 degrees.
+estimation). The IMU is the body of the graph: as a sensor beside the body GTSAM leaves out its angular acceleration,
+and a lever of a metre turned gravity by 0.7 degrees.
 """
 
 from __future__ import annotations
@@ -311,7 +311,7 @@ class _Covariance:
     def __init__(self, linear: gtsam.GaussianFactorGraph, count: int) -> None:
         rows, columns, values = linear.sparseJacobian_()  # keys in alphabetical order, then the right-hand side
         size = int(rows.max()), int(columns.max())
-        A = sparse.csc_matrix((values, (rows.astype(int) - 1, columns.astype(int) - 1)), size)[:, : 16 * count]
+        A: Any = sparse.csc_array((values, (rows.astype(int) - 1, columns.astype(int) - 1)), size)[:, : 16 * count]
         self._solve = sparse.linalg.splu((A.T @ A).tocsc()).solve
         self.size = 16 * count
 
