@@ -87,6 +87,8 @@ class Odometry:
     None without any."""
     metric: bool = True
     """Not where lengths are in a unit of its own, as those of one camera without depth."""
+    of_images: bool = False
+    """Where it is that of the images that closures are found in, so that they share its errors of calibration."""
 
 
 RECEIVER_SIGMA_M = 3.0

@@ -304,7 +304,10 @@ _ARRAYS = {"stamp_ns": np.int64, "odom_from_body": np.float64, "covariance": np.
 
 
 def _plain(odometry: Odometry) -> dict[str, Any]:
-    return {name: getattr(odometry, name).tolist() for name in _ARRAYS} | {"metric": odometry.metric}
+    return {name: getattr(odometry, name).tolist() for name in _ARRAYS} | {
+        "metric": odometry.metric,
+        "of_images": odometry.of_images,
+    }
 
 
 def _from_plain(tree: dict[str, Any]) -> Odometry:
@@ -312,4 +315,4 @@ def _from_plain(tree: dict[str, Any]) -> Odometry:
     count = len(arrays["stamp_ns"])
     if arrays["odom_from_body"].shape != (count, 4, 4) or arrays["covariance"].shape != (count, 6, 6):
         raise ValueError("poses and covariances do not fit the stamps")
-    return Odometry(**arrays, metric=bool(tree["metric"]))
+    return Odometry(**arrays, metric=bool(tree["metric"]), of_images=bool(tree["of_images"]))

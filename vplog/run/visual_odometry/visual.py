@@ -372,6 +372,7 @@ class _Tracker:
             covariance,
             breaks=np.array(self.breaks, np.int64),
             metric=self.sensor.metric,
+            of_images=True,
         )
         metres = None if self.height_m is None else by_height(found, self.below, self.height_m, camera)
         return metres or found
