@@ -87,6 +87,8 @@ class Odometry:
     None without any."""
     metric: bool = True
     """Not where lengths are in a unit of its own, as those of one camera without depth."""
+    of_images: bool = False
+    """Where it is that of the images that closures are found in, so that they share its errors of calibration."""
 
 
 RECEIVER_SIGMA_M = 3.0
@@ -105,6 +107,21 @@ class Gps:
     """(T, 3, 3) m^2, east-north-up; NaN where unknown."""
     antenna_m: Floats | None = None
     """(3,) position of the antenna on the body, None where the log lacks it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Imu:
+    """Measurements of an inertial measurement unit."""
+
+    name: str
+    stamp_ns: Ints
+    """(K,) increasing."""
+    gyro: Floats
+    """(K, 3) rad/s about its axes."""
+    accel: Floats
+    """(K, 3) m/s^2 along its axes, gravity's reaction included."""
+    body_from_imu: Floats
+    """(4, 4)."""
 
 
 @dataclass(frozen=True, eq=False)

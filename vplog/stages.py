@@ -73,6 +73,10 @@ class Log(Protocol):
 
     def gps(self) -> data.Gps | None: ...
 
+    def imu(self) -> data.Imu | None:
+        """The IMU beside images that give the odometry; None where there is none, or its mount is not known."""
+        ...
+
     def truth(self) -> data.Trajectory | data.Gps | None:
         """Ground truth that comes with it: poses of the body or the camera, or positions."""
         ...

@@ -8,10 +8,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from vplog.data import Frame, Odometry
+from vplog.data import EdgeKind, Frame, Odometry, PoseGraph, Solution, Trajectory
 from vplog.demo.scene import Scene, make_scene, take_picture
 from vplog.demo.settings import DemoSettings
 from vplog.geometry import se3
+from vplog.graph.refine import Refined
+from vplog.graph.variance_components import Sigmas, claimed_times
+from vplog.run.back_end import Solved, keyframe_covariances
 from vplog.run.visual_odometry.sensor import disparities, follow
 from vplog.run.visual_odometry.visual import visual_odometry
 
@@ -112,3 +115,24 @@ def test_points_without_a_counterpart_are_unknown() -> None:
     assert np.isnan(disparities(image, np.full_like(image, 90), px)).all()
     assert follow(image, image, px[:0], px[:0]).shape == (0, 2)
     np.testing.assert_allclose(follow(image, image, px, px), px, atol=1e-3)
+
+
+def test_closures_do_not_make_odometry_of_the_same_images_surer_than_it_claims() -> None:
+    """Keyframes' covariance of a drive back and forth, whose closures agree far better than the odometry claims."""
+    count, claimed = 12, np.diag([0.01**2] * 3 + [0.1**2] * 3)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 0, 3] = np.concatenate([np.arange(6.0), np.arange(6.0)[::-1]])
+    a, b = np.arange(6), np.arange(11, 5, -1)
+    edges_a, edges_b = np.concatenate([np.arange(count - 1), a]), np.concatenate([np.arange(1, count), b])
+    kind = [EdgeKind.ODOMETRY] * (count - 1) + [EdgeKind.LOOP] * 6
+    information = np.tile(np.linalg.inv(claimed), (len(edges_a), 1, 1))
+    ends = (edges_a.astype(np.int32), edges_b.astype(np.int32))
+    graph = PoseGraph(poses, *ends, se3.between(poses[edges_a], poses[edges_b]), information, kind)
+    sigmas = Sigmas(0.1, 0.1)
+    solution = Solution(poses, np.ones(len(edges_a)), 0.0, 0.0, 0, True, "")
+    refined = Refined(claimed_times(graph, sigmas), solution, sigmas, 1.0, None, np.zeros(0), None)
+    solved = Solved(None, refined, Trajectory(np.arange(count), poses), "increments", [])  # type: ignore[arg-type]
+    own, shared = (keyframe_covariances(replace(solved, of_images=of_images)) for of_images in (False, True))
+    assert own is not None and shared is not None
+    ratio = np.sqrt(np.trace(shared[5, 3:, 3:]) / np.trace(own[5, 3:, 3:]))
+    assert ratio > 3.0

@@ -250,7 +250,10 @@ def topics_of(arguments: argparse.Namespace) -> TopicChoice:
     chosen = {role.replace("-", "_"): getattr(arguments, f"{role.replace('-', '_')}_topic") for role in _ROLES}
     first, *more = chosen["image"] or [None]
     chosen |= {"image": first, "cameras": more or None}
-    others = ("odometry_file", "calibration_file", "start_s", "stop_s", "wheelbase_m", "track_m", "wheel_radius_m")
+    others = (
+        *("odometry_file", "calibration_file", "start_s", "stop_s"),
+        *("wheelbase_m", "track_m", "wheel_radius_m", "camera_height_m"),
+    )
     return TopicChoice(**chosen, masks=dict(arguments.mask), **{name: getattr(arguments, name) for name in others})
 
 
@@ -267,6 +270,8 @@ def topic_options() -> argparse.ArgumentParser:
         option(topics, names, str, "TOPIC", what, dest=f"{role.replace('-', '_')}_topic", action=action)
     for name, what in (("wheelbase", "axles"), ("track", "left and right wheels"), ("wheel-radius", "hub and road")):
         option(topics, f"--{name}-m", positive, "M", f"metres between {what}, for odometry of wheels")
+    text = "height of a single camera over the ground, which gives its visual odometry metres"
+    option(topics, "--camera-height-m", positive, "M", text)
     option(topics, "--start", not_negative, "S", "leave out images before S seconds of the log", dest="start_s")
     option(topics, "--stop", not_negative, "S", "leave out images from S seconds of the log on", dest="stop_s")
     option(topics, "--odometry-file", resolved, "FILE.tum", "use these poses as the odometry")

@@ -37,6 +37,8 @@ REAR = "/rear/image_raw/compressed"
 REAR_INFO = "/rear/camera_info"
 ODOMETRY = "/odom"
 GPS = "/gps/fix"
+IMU = "/imu/data"
+IMU_FRAME = "imu_link"
 TF_STATIC = "/tf_static"
 _IMAGE_TYPE, _CALIBRATION_TYPE = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
 TYPES = {
@@ -44,6 +46,7 @@ TYPES = {
     **dict.fromkeys((CAMERA_INFO, DEPTH_INFO, LEFT_INFO, RIGHT_INFO, REAR_INFO), _CALIBRATION_TYPE),
     ODOMETRY: "nav_msgs/msg/Odometry",
     GPS: "sensor_msgs/msg/NavSatFix",
+    IMU: "sensor_msgs/msg/Imu",
     TF_STATIC: "tf2_msgs/msg/TFMessage",
 }
 _DELAY_NS = (2_000_000, 30_000_000)
@@ -95,8 +98,9 @@ def _check_own(path: Path, mark: bytes) -> None:
 
 def _write_log(path: Path, settings: DemoSettings, scene: Scene, execution: Execution) -> None:
     """All messages in the order in which they reach the recorder."""
-    messages = [*_mounting(scene), *_odometry(settings), *_fixes(settings), *_frames(scene, execution)]
+    messages = [*_mounting(scene), *_odometry(settings), *_fixes(settings), *_imu(settings), *_frames(scene, execution)]
     delays = np.random.default_rng([settings.seed, 5]).integers(*_DELAY_NS, len(messages), endpoint=True).tolist()
+    delays = [_DELAY_NS[0] if topic == IMU else delay for (topic, _, _), delay in zip(messages, delays, strict=True)]
     logged = sorted((stamp + delay, i) for i, ((_, stamp, _), delay) in enumerate(zip(messages, delays, strict=True)))
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
@@ -143,6 +147,8 @@ def _mounting(scene: Scene) -> Iterator[tuple[str, int, Any]]:
     mounts = {CAMERA_FRAME: scene.camera.body_from_camera}
     if scene.settings.rear_camera:
         mounts[REAR_FRAME] = rear_mount(scene.camera)
+    if scene.settings.imu_rate_hz:
+        mounts[IMU_FRAME] = route.IMU_MOUNT
     stamped = [
         _message(
             "geometry_msgs/msg/TransformStamped", header=_header(route.START_NS, BODY_FRAME), child_frame_id=frame,
@@ -175,6 +181,15 @@ def _fixes(settings: DemoSettings) -> Iterator[tuple[str, int, Any]]:
     for stamp, fix in zip(stamp_ns.tolist(), fixes.tolist(), strict=True):
         fields = dict(zip(("latitude", "longitude", "altitude"), fix, strict=True))
         yield GPS, stamp, _message(TYPES[GPS], header=_header(stamp, BODY_FRAME), **known, **fields)
+
+
+def _imu(settings: DemoSettings) -> Iterator[tuple[str, int, Any]]:
+    stamp_ns = route.stamps(settings, settings.imu_rate_hz)
+    gyro, accel = route.imu(settings, stamp_ns, np.random.default_rng([settings.seed, 10]))
+    for stamp, *measured in zip(stamp_ns.tolist(), gyro.tolist(), accel.tolist(), strict=True):
+        rate, moved = (dict(zip("xyz", axes, strict=True)) for axes in measured)
+        header = _header(stamp, IMU_FRAME)
+        yield IMU, stamp, _message(TYPES[IMU], header=header, angular_velocity=rate, linear_acceleration=moved)
 
 
 def _frames(scene: Scene, execution: Execution) -> Iterator[tuple[str, int, Any]]:

@@ -30,6 +30,10 @@ _LATERAL_OFFSET_M = 0.8
 SHIFT_LENGTH_M = 10.0
 """Distance before the end of the first lap over which the car moves to its new track and the light changes."""
 
+IMU_MOUNT = pose(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([-0.4, 0.2, 0.3]))
+"""body_from_imu: x to the left."""
+GRAVITY = 9.81
+
 TURN_LENGTH_M = 18.0
 """Metres that the car would drive while it turns back on the spot."""
 
@@ -133,6 +137,22 @@ def odometry(settings: DemoSettings, rng: np.random.Generator) -> Floats:
     step[:, :3] += rng.normal(size=(len(step), 3)) * settings.odometry_turn_noise_rad
     step[:, 3:] += rng.normal(size=(len(step), 3)) * settings.odometry_step_noise_m
     return np.stack([*accumulate(exp(step), np.matmul, initial=np.eye(4))])
+
+
+def imu(settings: DemoSettings, stamp_ns: Ints, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """(K, 3) turn rates in rad/s and (K, 3) accelerations in m/s^2 about the IMU's axes, with the noise and the biases
+    of a MEMS that no one calibrated."""
+    half_ns = 2_500_000  # over 5 ms, as its own filter
+    before, here, behind = (world_from_body(settings, stamp_ns + shift) @ IMU_MOUNT for shift in (-half_ns, 0, half_ns))
+    seconds = half_ns * 1e-9
+    gyro = log(between(before, behind))[:, :3] / (2 * seconds)
+    moved = (behind + before - 2 * here)[:, :3, 3] / seconds**2 + [0, 0, GRAVITY]
+    accel = (moved[:, None] @ here[:, :3, :3])[:, 0]
+    rate = settings.imu_rate_hz
+    return tuple(
+        value + rng.normal(size=3) * bias + rng.normal(size=value.shape) * density * rate**0.5
+        for value, density, bias in ((gyro, 0.0005, 0.005), (accel, 0.006, 0.1))
+    )  # type: ignore[return-value]
 
 
 def gps(settings: DemoSettings, stamp_ns: Ints, rng: np.random.Generator) -> Floats:

@@ -48,6 +48,8 @@ class DemoSettings(Settings):
     """Standard deviation of the white noise of every odometry step, each axis."""
     odometry_turn_noise_rad: float = Field(default=0.0006, ge=0, le=1)
     """Standard deviation of the white noise of every odometry step's rotation, each axis."""
+    imu_rate_hz: float = Field(default=0.0, ge=0, le=1000)
+    """Samples of an inertial measurement unit per second; 0 writes none."""
     gps_rate_hz: float = Field(default=1.0, ge=0, le=100)
     """Satellite fixes per second; 0 writes none."""
     gps_sigma_m: float = Field(default=1.5, gt=0, le=100)

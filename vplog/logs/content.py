@@ -18,7 +18,7 @@ from vplog.logs.stamps import nearest, set_common_clock
 from vplog.logs.tf_odometry import FrameTree
 
 if TYPE_CHECKING:
-    from vplog.data import Gps, Ints, Odometry, OdometrySource
+    from vplog.data import Floats, Gps, Ints, Odometry, OdometrySource
     from vplog.logs.formats.container import Channel, Container, Contents, Place
     from vplog.logs.messages.records import CalibrationMessage
     from vplog.logs.topic_selection import Selection
@@ -49,6 +49,9 @@ class Content:
     frames: list[str]
     """Names of the odometry's frames, from the one that stands still to the body; empty names where it has none."""
     gps: Gps | None
+    imu: tuple[str, Ints, Floats] | None
+    """Frame, stamps (K,), and (K, 6) rates in rad/s and accelerations in m/s^2 of the IMU beside images that give the
+    odometry."""
     tree: FrameTree
     skew_ms: dict[str, float]
     """By topic: log time less header stamp, the median."""
@@ -143,10 +146,11 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     notes.extend(gps_notes)
     if gps is not None and read.fixes and body and (placed := tree.between(body, read.fixes.frame)) is not None:
         gps = replace(gps, antenna_m=placed[:3, 3])
+    imu = (read.imu.frame, *read.imu.finish(notes)) if chosen.imu is not None and odometry is None else None
     calibrations = read.calibrations(chosen.camera_info, "image", notes)
     right_calibration = next(iter(read.calibrations(chosen.right_info, "right", notes)), None)
     return Content(
         stamp_ns, places, read.images["image"].stream, rows, scan_ns, scan_places, companions, calibrations,
-        right_calibration, odometry, frames, gps, tree, read.skew_ms(), chosen, [source for source, _ in sources],
+        right_calibration, odometry, frames, gps, imu, tree, read.skew_ms(), chosen, [source for source, _ in sources],
         rates_hz,
     )  # fmt: skip

@@ -25,7 +25,7 @@ from vplog.logs.messages.records import (
 )
 from vplog.logs.stamps import NONE, Stamps, rate_hz
 from vplog.logs.tf_odometry import DynamicTransforms
-from vplog.logs.tracks import FixTrack, GyroTrack, PoseTrack
+from vplog.logs.tracks import FixTrack, ImuTrack, PoseTrack
 
 if TYPE_CHECKING:
     from vplog.data import Ints
@@ -148,7 +148,7 @@ class TopicCollector:
         }
         """Tracks of the topics that may be the odometry."""
         self.fixes = FixTrack(chosen.gps.topic) if chosen.gps else None
-        self.gyro = GyroTrack(chosen.imu)
+        self.imu = ImuTrack(chosen.imu)
         self._paths: dict[Channel, Message] = {}
         """The last message of each topic of paths, which holds those before it."""
         self.transforms: list[PoseMessage] = []
@@ -229,7 +229,7 @@ class TopicCollector:
     def stamps(self) -> list[tuple[str, Stamps]]:
         """Every topic that is followed over time, with its stamps."""
         images = [(one.channel.topic, one.stamps) for one in reversed(self.images.values()) if one.channel]
-        tracks = (*self.poses.values(), self.fixes, self.gyro)
+        tracks = (*self.poses.values(), self.fixes, self.imu)
         return images + [(one.topic, one.stamps) for one in tracks if one and one.topic]
 
     def every_stamps(self) -> list[Stamps]:
@@ -260,7 +260,7 @@ class TopicCollector:
                 for pose in poses:
                     self.poses[channel].add(pose, max(pose.stamp_ns + late_ns, 0), position)
             case ImuMessage() as imu:
-                self.gyro.add(imu, message.log_ns, position)
+                self.imu.add(imu, message.log_ns, position)
             case FixMessage() as fix if self.fixes:
                 self.fixes.add(fix, message.log_ns, position)
             case FixesMessage(_, fixes) if self.fixes:

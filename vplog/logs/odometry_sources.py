@@ -142,19 +142,19 @@ def _by_twists(
         return None
     moving, variances = twists[rows, :6], twists[rows, 6:]
     text = f"{track.topic}: the odometry is its velocities, integrated"
-    gyro_ns, gyro = read.gyro.finish(notes)
-    placed = tree.between(track.child or "base_link", read.gyro.frame) if len(gyro_ns) else None
+    gyro_ns, measured = read.imu.finish(notes)
+    placed = tree.between(track.child or "base_link", read.imu.frame) if len(gyro_ns) else None
     inside = np.asarray((gyro_ns >= stamp_ns[0]) & (gyro_ns <= stamp_ns[-1]))
     if inside.sum() < len(rows):
         notes.add(f"{text}.")
         return dead_reckoned(stamp_ns, moving, variances)
-    if placed is None and clean(read.gyro.frame) not in ("", track.child, "base_link"):
-        notes.add(f"{read.gyro.topic}: its frame has no static transform; it is taken to be mounted as the body is.")
+    if placed is None and clean(read.imu.frame) not in ("", track.child, "base_link"):
+        notes.add(f"{read.imu.topic}: its frame has no static transform; it is taken to be mounted as the body is.")
     body_from_imu = np.eye(4) if placed is None else placed
-    stamp_ns, turned, off = turned_by_gyro(stamp_ns, moving, gyro_ns, gyro, body_from_imu)
+    stamp_ns, turned, off = turned_by_gyro(stamp_ns, moving, gyro_ns, measured[:, :3], body_from_imu)
     bias = "its bias unknown, as the body never stands still for a second"
     bias = bias if off is None else f"less a bias of {np.degrees(off):.3f} deg/s at rest"
-    notes.add(f"{text}; it turns by the gyroscope of {read.gyro.topic}, {bias}.")
+    notes.add(f"{text}; it turns by the gyroscope of {read.imu.topic}, {bias}.")
     return dead_reckoned(stamp_ns, turned, np.full_like(turned, np.nan))
 
 

@@ -7,7 +7,9 @@ from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from vplog.data import LogInfo, Topic, Trajectory
+import numpy as np
+
+from vplog.data import Imu, LogInfo, Topic, Trajectory
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.calibration_file import SidecarFiles
@@ -164,6 +166,21 @@ class RecordedLog:
 
     def gps(self) -> Gps | None:
         return self._content.gps
+
+    def imu(self) -> Imu | None:
+        """By the static transforms; noted where they do not place it."""
+        content = self._content
+        if content.imu is None or content.chosen.imu is None or self.odometry() is not None:
+            return None
+        (camera, camera_frame), (frame, stamp_ns, values) = self._left, content.imu
+        topic, placed = content.chosen.imu.topic, content.tree.between(camera_frame, frame)
+        finite = np.isfinite(values).all(axis=1)
+        if placed is None or not finite.any():
+            why = "the static transforms do not place it beside the camera" if placed is None else "it has no numbers"
+            self._notes.add(f"{topic}: {why}; visual odometry does without its measurements.")
+            return None
+        gyro, accel = values[finite, :3], values[finite, 3:]
+        return Imu(topic, stamp_ns[finite], gyro, accel, camera.body_from_camera @ placed)
 
     def truth(self) -> Trajectory | Gps | None:
         """Ground truth of the data set, else the poses of a topic that is called ground truth."""

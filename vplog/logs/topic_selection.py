@@ -48,6 +48,7 @@ OPTIONS = {
     "odometry": "odometry-topic", "gps": "gps-topic", "odometry_file": "odometry-file",
     "calibration_file": "calibration", "imu": "imu-topic", "start_s": "start", "stop_s": "stop",
     "mask": "mask-topic", "wheelbase_m": "wheelbase-m", "track_m": "track-m", "wheel_radius_m": "wheel-radius-m",
+    "camera_height_m": "camera-height-m",
 }  # fmt: skip
 """Option of the command line for each field of TopicChoice."""
 _NO_LIDAR = re.compile(r"depth|camera|stereo|radar|map|cluster|obstacle|segment|ground|filtered", re.IGNORECASE)
@@ -83,13 +84,16 @@ class TopicChoice(Settings):
     masks: dict[str, Path] = Field(default_factory=dict)
     """By image topic, empty for that in use, the file of its mask, or a folder with one for each image."""
     imu: str | None = None
-    """Topic of the IMU whose gyroscope turns velocities that are the odometry; an empty string uses none."""
+    """Topic of the IMU whose gyroscope turns velocities that are the odometry, and whose measurements visual odometry
+    takes; an empty string uses none."""
     wheelbase_m: float | None = Field(default=None, gt=0, le=100)
     """m between the axles, for ackermann_msgs/AckermannDriveStamped."""
     track_m: float | None = Field(default=None, gt=0, le=100)
     """m between left and right wheels, for wheel speeds in sensor_msgs/JointState."""
     wheel_radius_m: float | None = Field(default=None, gt=0, le=100)
     """m; for wheel speeds in sensor_msgs/JointState."""
+    camera_height_m: float | None = Field(default=None, gt=0, le=100)
+    """m of the camera over flat ground, by which the visual odometry of a single camera has metres."""
     start_s: float | None = Field(default=None, ge=0, le=1e9)
     """s after the first image, before which images are left out."""
     stop_s: float | None = Field(default=None, ge=0, le=1e9)
@@ -144,7 +148,7 @@ class Selection:
     right: Channel | None = None
     right_info: Channel | None = None
     imu: Channel | None = None
-    """The IMU whose gyroscope turns velocities, where these are the odometry."""
+    """The IMU whose gyroscope turns velocities, where these are the odometry, or which visual odometry takes."""
     mask: Channel | None = None
     lidar: Channel | None = None
     """The lidar that gives the odometry, where no topic does."""
@@ -233,7 +237,8 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     geometry = {c.channel: factors for c in candidates if (factors := _geometry(c, choice))}
     sources = _sources(usable, kind, requested, geometry)
     turned = kind == "twist" or all(short_type(c.channel.type) in (*TWISTS, *GEOMETRY) for c in sources)
-    imu = pick("imu") if sources and turned else None
+    computed = image is not None and choice.odometry_file is None and (kind == "visual" or not (sources or kind))
+    imu = pick("imu") if (sources and turned) or computed else None
     gps = pick("gps", key=lambda c: short_type(c.channel.type) == NMEA)
     lidar = None
     if kind == "lidar" or (not kind and all(c.role == "tf" for c in sources)):

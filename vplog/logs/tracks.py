@@ -170,26 +170,26 @@ def _is_set(covariance: Floats) -> np.ndarray:
     return np.asarray((np.abs(covariance) < _LARGEST).all((1, 2)) & (variances >= 0).all(1) & covariance.any((1, 2)))
 
 
-class GyroTrack:
-    """Collects the turn rates of an IMU."""
+class ImuTrack:
+    """Collects the measurements of an IMU."""
 
     def __init__(self, channel: Channel | None) -> None:
         self.topic = channel.topic if channel else ""
         self.stamps = Stamps()
         self.frame = ""
         """Frame of the IMU, by the first message."""
-        self._rates = array("d")
+        self._values = array("d")
 
     def add(self, message: ImuMessage, log_ns: int, position: int | None = None) -> None:
         self.frame = self.frame or message.frame
         if all(map(math.isfinite, message.gyro)):
             self.stamps.add(message.stamp_ns, log_ns, position)
-            self._rates.extend(message.gyro)
+            self._values.extend((*message.gyro, *message.accel))
 
     def finish(self, notes: Notes) -> tuple[Ints, Floats]:
-        """Increasing stamps (K,) and rates (K, 3) in rad/s about the axes of the IMU's frame."""
+        """Increasing stamps (K,), and (K, 6) rates in rad/s about the axes of its frame, accelerations in m/s^2."""
         stamp_ns, rows = self.stamps.order(self.topic, notes)
-        return stamp_ns, np.frombuffer(self._rates).reshape(-1, 3)[rows]
+        return stamp_ns, np.frombuffer(self._values).reshape(-1, 6)[rows]
 
 
 class FixTrack:

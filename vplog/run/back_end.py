@@ -38,7 +38,7 @@ from vplog.graph.noise import NoiseSettings, broken_edges, edge_covariance
 from vplog.graph.pieces import pieces_placed
 from vplog.graph.refine import Refined, RefineSettings, Scale, refine, rescaled
 from vplog.graph.solve import Decision, OptimiserSettings, decided
-from vplog.graph.variance_components import Sigmas
+from vplog.graph.variance_components import Sigmas, claimed_times
 from vplog.loops.false_rate import log_odds_false
 
 _log = logging.getLogger(__name__)
@@ -66,6 +66,8 @@ class Solved:
     noise_source: str
     """Source of the odometry's noise, as `edge_covariance` names it."""
     warnings: list[str]
+    of_images: bool = False
+    """Whether the odometry is that of the images."""
 
 
 @step("solve")
@@ -98,7 +100,9 @@ def solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps
     for warning in warnings:
         _log.warning(warning)
     trajectory = correct_trajectory.correct_trajectory(odometry, keyframes, refined.solution.world_from_body)
-    return Solved(judged_ledger(closures, graph, refined, rows), refined, trajectory, source, warnings)
+    return Solved(
+        judged_ledger(closures, graph, refined, rows), refined, trajectory, source, warnings, odometry.of_images
+    )
 
 
 def _apart(broken: Ints, keyframes: Keyframes, graph: PoseGraph, solution: Solution) -> list[str]:
@@ -166,9 +170,13 @@ def about_gps(solved: Solved) -> dict[str, Any] | None:
 
 def keyframe_covariances(solved: Solved) -> Floats | None:
     """(N, 6, 6) of the keyframes as the graph has them in the end, with the noise as estimated, the GPS fixes kept and
-    the scales that are not known; None where edges and fixes do not determine them."""
+    the scales that are not known; None where edges and fixes do not determine them. Closures do not show odometry of
+    the same images to be better than it claims: what calibration makes wrong is wrong alike in both."""
     refined, fixes = solved.refined, solved.refined.fixes
-    factors, poses, weight = Factors.of(refined.graph), refined.solution.world_from_body, refined.solution.weight
+    graph, sigmas = refined.graph, refined.sigmas
+    if solved.of_images:
+        graph = claimed_times(graph, Sigmas(*(1.0 / min(one, 1.0) for one in sigmas[:2])))
+    factors, poses, weight = Factors.of(graph), refined.solution.world_from_body, refined.solution.weight
     objective = Objective(factors, weight)
     if fixes is not None and refined.inlier.any():
         objective = with_fixes(factors, weight, poses, fixes, refined.inlier)

@@ -13,18 +13,20 @@ import numpy as np
 from vplog.cache.codecs import json_codec
 from vplog.cache.steps import Steps, step
 from vplog.data import Camera, Frame, Keyframes, Odometry
-from vplog.errors import LogError
+from vplog.errors import LogError, plural
 from vplog.geometry.masking import masked
 from vplog.logs.image_folder import PERIOD_NS
 from vplog.loops import undistort
 from vplog.run.feature_extraction import image_topics
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.run.lidar_odometry import lidar_odometry, range_of
+from vplog.run.visual_odometry.inertial import SURE, with_imu
 from vplog.run.visual_odometry.metres import in_metres
 from vplog.run.visual_odometry.visual import visual_odometry
 
 if TYPE_CHECKING:
     from vplog.cache.stage_cache import Inputs
+    from vplog.data import Imu
     from vplog.execution.execution import Execution
     from vplog.logs import TopicChoice
     from vplog.stages import EncodedFrame, Log
@@ -37,6 +39,10 @@ _UNCALIBRATED = (
 _FOCAL_LENGTH = 1.2
 """Focal length of a camera that is not calibrated as a share of the longer side of its images: COLMAP's, a field of
 view of 45 degrees; phones have some 0.8 to 1.2."""
+_BY_HEIGHT = "The camera's height of %.2f m over the ground gives visual odometry its metres."
+_NO_GROUND = (
+    "The images show no flat ground ahead of the camera often enough, so that its height of %.2f m gives no metres."
+)
 UNIT = (
     "A single camera has no metres: lengths are in a unit of its own, about a tenth of the distance of what is seen, "
     "and its scale wanders."
@@ -60,6 +66,10 @@ def read(
     Raises LogError where there is no odometry."""
     odometry = odometry_of(log, topics, steps)
     camera = camera_of(log, topics)
+    if source_of(log, topics) == "visual" and (imu := log.imu()) is not None and not _is_unknown(odometry):
+        odometry = _with_imu(odometry, imu, camera)
+    if topics.camera_height_m is not None and (is_metric(log) or source_of(log, topics) != "visual"):
+        _log.warning("--camera-height-m has no effect: the odometry is no single camera's.")
     if not odometry.metric:
         odometry = _with_scale(odometry, log, camera, use_gps)
     selected, warnings = select_keyframes(log.name, log.stamps(), odometry, settings)
@@ -72,13 +82,34 @@ def read(
     return odometry, camera, selected
 
 
+def _with_imu(odometry: Odometry, imu: Imu, camera: Camera) -> Odometry:
+    """Odometry with what the IMU says, noted."""
+    found = with_imu(odometry, imu, camera)
+    if isinstance(found, str):
+        _log.warning("Visual odometry does without the IMU %s: %s.", imu.name, found)
+        return odometry
+    what = "gravity"
+    if not odometry.metric and found.odometry.metric:
+        what += f" and metres, its unit {found.scale:.3g} m with a sigma of {found.sigma:.1%}"
+    if found.bridged:
+        what += f", and goes on across {plural(found.bridged, 'break')}"
+    _log.warning("Visual odometry takes %s from the IMU %s.", what, imu.name)
+    if not found.odometry.metric:
+        sigma = f"{found.sigma:.0%}" if found.sigma < 1 else "more than its size"
+        _log.warning(
+            "The drive accelerates too little for metres by the IMU: they would have a sigma of %s, at most %.0f %% "
+            "is taken.", sigma, 100 * SURE,
+        )  # fmt: skip
+    return found.odometry
+
+
 def _with_scale(odometry: Odometry, log: Log, camera: Camera, use_gps: bool) -> Odometry:
     """Odometry in units of its own, in metres by fixes where that can be."""
     gps = log.gps()
     if _is_unknown(odometry):
         return odometry
     if gps is None:
-        _log.warning("%s `vplog evaluate` aligns with a scale.", UNIT)
+        _log.warning("%s `vplog evaluate` aligns with a scale; --camera-height-m gives metres over flat ground.", UNIT)
     elif not use_gps:
         _log.warning("%s --gps takes metres from the fixes.", UNIT)
     elif (found := in_metres(odometry, gps, camera)) is not None:
@@ -167,20 +198,23 @@ def odometry_of(log: Log, topics: TopicChoice, steps: Steps) -> Odometry:
     if source == "log" and odometry is not None:
         return odometry
     compute = by_lidar if source == "lidar" else by_images
-    return steps(compute, log, topics.odometry is None, steps.cache.inputs, image_topics(topics))
+    others = (topics.camera_height_m,) if source == "visual" else ()
+    return steps(compute, log, topics.odometry is None, steps.cache.inputs, image_topics(topics), *others)
 
 
 @step("odometry", lambda *_: json_codec(_from_plain, _plain), lambda log, *_: len(log.stamps()), ("log",))
-def by_images(log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], *, execution: Execution) -> Odometry:
-    """Visual odometry, its breaks noted. Where tracking fails from the first frame to the last: without depth a motion
-    of which nothing is known, else raises LogError."""
+def by_images(
+    log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], height_m: float | None, *, execution: Execution
+) -> Odometry:
+    """Visual odometry, its breaks noted, in metres where the height of a single camera gives them. Where tracking fails
+    from the first frame to the last: without depth a motion of which nothing is known, else raises LogError."""
     if unasked:
         _log.warning("The log has no odometry, so visual odometry of its images is used (--odometry visual).")
     stamp_ns, camera, metric = log.stamps(), log.camera(), is_metric(log)
     if camera.matrix is None:
         _log.warning(about_assumed(camera))
         camera = _assumed(camera)
-    odometry = visual_odometry(_decoded(log, stamp_ns, execution), camera, metric)
+    odometry = visual_odometry(_decoded(log, stamp_ns, execution), camera, metric, height_m)
     if odometry is None and metric:
         raise LogError(
             f"{log.name}: no two of {len(stamp_ns)} frames could be tracked: too few corners with depth, or too little "
@@ -194,6 +228,8 @@ def by_images(log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], *
             len(stamp_ns),
         )
         return _unknown(stamp_ns)
+    if height_m is not None and not metric:
+        _log.warning(_BY_HEIGHT if odometry.metric else _NO_GROUND, height_m)
     _log_breaks("Visual odometry", odometry, stamp_ns, "frames")
     return odometry
 
@@ -268,7 +304,10 @@ _ARRAYS = {"stamp_ns": np.int64, "odom_from_body": np.float64, "covariance": np.
 
 
 def _plain(odometry: Odometry) -> dict[str, Any]:
-    return {name: getattr(odometry, name).tolist() for name in _ARRAYS} | {"metric": odometry.metric}
+    return {name: getattr(odometry, name).tolist() for name in _ARRAYS} | {
+        "metric": odometry.metric,
+        "of_images": odometry.of_images,
+    }
 
 
 def _from_plain(tree: dict[str, Any]) -> Odometry:
@@ -276,4 +315,4 @@ def _from_plain(tree: dict[str, Any]) -> Odometry:
     count = len(arrays["stamp_ns"])
     if arrays["odom_from_body"].shape != (count, 4, 4) or arrays["covariance"].shape != (count, 6, 6):
         raise ValueError("poses and covariances do not fit the stamps")
-    return Odometry(**arrays, metric=bool(tree["metric"]))
+    return Odometry(**arrays, metric=bool(tree["metric"]), of_images=bool(tree["of_images"]))

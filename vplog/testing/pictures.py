@@ -9,7 +9,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from vplog.data import Bytes, Camera, Frame, Gps, Ints, Lidar, LogInfo, Odometry, Reference, Scan, Trajectory
+from vplog.data import Bytes, Camera, Frame, Gps, Imu, Ints, Lidar, LogInfo, Odometry, Reference, Scan, Trajectory
 from vplog.features.sift import SiftSettings
 
 WIDTH, HEIGHT = 320, 200
@@ -96,6 +96,9 @@ class Drive:
         yield from ()
 
     def gps(self) -> Gps | None:
+        return None
+
+    def imu(self) -> Imu | None:
         return None
 
     def truth(self) -> Trajectory | Gps | None:

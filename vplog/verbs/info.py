@@ -54,7 +54,7 @@ _PART_WORDS = {
     "right_info": "calibration of the right camera",
     "odometry": "odometry",
     "gps": "satellite fixes",
-    "imu": "gyroscope, which turns the velocities",
+    "imu": "IMU of the odometry",
     "mask": "masks of the camera's images",
     "lidar": "the lidar whose scans give the odometry",
     "tf_static": "static transforms",
@@ -144,7 +144,7 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
         "visual_odometry": _use(computed == "visual", camera is not None and gives_visual(log)),
         "lidar_odometry": _use(computed == "lidar", any(one.role == "lidar" and one.count for one in found.topics)),
         "gps": _about_gps(gps, found),
-        "scale": _scale(camera, found, computed, gps),
+        "scale": _scale(camera, found, computed, gps, topics),
         "visual_scale": "metric" if metric else "unknown",
         "gaps": _gaps(found, stamp_ns, odometry, gps),
         "losses": [asdict(loss) for loss in getattr(log, "losses", [])],
@@ -273,7 +273,7 @@ def _why(topic: Topic, found: LogInfo, topics: TopicChoice) -> str:
             f"--odometry-topic {topic.name} takes it"
         )
     if topic.role == "imu":
-        return "its gyroscope would turn velocities, which are not the odometry"
+        return "the odometry is neither velocities nor that of the images, which would take it"
     if topic.role == "lidar":
         return f"its scans are not the odometry; --odometry {topic.name} takes it from them"
     if topic.role in ("tf", "tf_static"):
@@ -342,7 +342,9 @@ def _about_gps(gps: Gps | None, found: LogInfo) -> dict[str, Any] | None:
     }
 
 
-def _scale(camera: Camera | None, found: LogInfo, computed: str, gps: Gps | None) -> dict[str, str]:
+def _scale(
+    camera: Camera | None, found: LogInfo, computed: str, gps: Gps | None, topics: TopicChoice
+) -> dict[str, str]:
     """Source of the metres of a closure."""
     if camera is None:
         return {"source": "none", "why": "The log has no camera images."}
@@ -357,8 +359,14 @@ def _scale(camera: Camera | None, found: LogInfo, computed: str, gps: Gps | None
     if not unused and any(topic.part == "depth" for topic in found.topics):
         return {"source": "depth", "why": "Depth images come with the camera's."}
     if computed == "visual":
-        given = "nothing gives them; `vplog evaluate` aligns with a scale" if gps is None else "--gps takes them"
-        return {"source": "unknown", "why": f"{UNIT} {given[0].upper()}{given[1:]}."}
+        imu = next((topic.name for topic in found.topics if topic.part == "imu"), None)
+        if topics.camera_height_m is not None:
+            why = f"Metres come from the camera's height of {topics.camera_height_m:g} m, where it sees flat ground."
+            return {"source": "camera_height", "why": why}
+        given = [] if imu is None else [f"{imu} gives them where the drive accelerates enough"]
+        given += [] if gps is None else ["--gps takes them"]
+        given += ["--camera-height-m gives them where flat ground is seen"]
+        return {"source": "unknown", "why": f"{UNIT} {'; '.join(given)}."}
     return {"source": "odometry", "why": "A single camera has no scale: its metres are the odometry's."}
 
 

@@ -148,7 +148,11 @@ def imu_stream(topic: str, table: Path) -> Stream:
     rows = rows_of(table, 7)
     stamp_ns, values = stamps_ns(table, [row[0] for row in rows], 1), numbers_of(table, rows, 1, 6)
     channel = Channel(topic, "sensor_msgs/Imu", "ros1")
-    return Stream(channel, stamp_ns, lambda row: ImuMessage(int(stamp_ns[row]), BODY, values[row, :3].tolist()))
+
+    def message(row: int) -> ImuMessage:
+        return ImuMessage(int(stamp_ns[row]), BODY, *values[row].reshape(2, 3).tolist())
+
+    return Stream(channel, stamp_ns, message)
 
 
 def fix_stream(topic: str, gps: Gps) -> Stream:

@@ -92,6 +92,8 @@ class ImuMessage(NamedTuple):
     frame: str
     gyro: Sequence[float]
     """rad/s about the axes of `frame`."""
+    accel: Sequence[float]
+    """m/s^2 along them."""
 
 
 @dataclass(frozen=True, eq=False)

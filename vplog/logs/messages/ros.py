@@ -226,7 +226,7 @@ def _path(fields: _Fields) -> Record:
 
 def _imu(fields: _Fields) -> Record:
     (stamp_ns, frame), numbers = fields.header(), fields.numbers("37d")
-    return ImuMessage(stamp_ns, frame, numbers[13:16])
+    return ImuMessage(stamp_ns, frame, numbers[13:16], numbers[25:28])
 
 
 def _px4(fields: _Fields) -> Record:

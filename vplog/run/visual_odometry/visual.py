@@ -18,6 +18,7 @@ import numpy as np
 from vplog.data import Odometry
 from vplog.geometry import se3
 from vplog.graph.bundle import Observations, adjust
+from vplog.run.visual_odometry.ground import below, by_height
 from vplog.run.visual_odometry.sensor import Sensor, follow
 from vplog.run.visual_odometry.tracking import Reference, cloud, corners, solve, track
 from vplog.run.visual_odometry.two_views import CERTAINTY, rho_of, rho_variance, two_views
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from vplog.data import Camera, Float32s, Floats, Frame
+    from vplog.run.visual_odometry.ground import Below
     from vplog.run.visual_odometry.sensor import Points
     from vplog.run.visual_odometry.tracking import Motion
 
@@ -93,6 +95,10 @@ class _Tracker:
     """State while the frames pass."""
 
     sensor: Sensor
+    height_m: float | None = None
+    """Of the camera over the ground, where it gives a camera without depth its metres."""
+    below: list[Below] = field(default_factory=list)
+    """Landmarks below the camera in each view, where its height is known."""
     stamp_ns: list[int] = field(default_factory=list)
     view: list[int] = field(default_factory=list)
     """The reference of each frame with a pose."""
@@ -307,7 +313,12 @@ class _Tracker:
         front = ~(at[:, 2] <= 0)
         at, ids, points = at[front], ids[front], points.rows(front)
         if not self.sensor.metric:
-            return Reference(frame, ids, self._estimated(ids, points, at), self._free())
+            estimated = self._estimated(ids, points, at)
+            if self.height_m is not None:
+                sure = estimated.rho > CERTAINTY * np.sqrt(estimated.variance)
+                found = below(self.views[view].row, cloud(estimated.rows(np.flatnonzero(sure))), self.sensor.camera)
+                self.below.append(found)
+            return Reference(frame, ids, estimated, self._free())
         shown = np.concatenate([other for _, other, _ in self.window])
         times = (np.sort(shown).searchsorted(ids, "right") - np.sort(shown).searchsorted(ids, "left")).clip(1)
         own = np.where(np.isfinite(points.variance), points.variance, np.nanmedian(points.variance))
@@ -355,13 +366,16 @@ class _Tracker:
         covariance = self._increments()
         moved = se3.adjoint(camera.body_from_camera)
         covariance = moved @ covariance @ moved.T
-        return Odometry(
+        found = Odometry(
             np.array(self.stamp_ns, np.int64),
             odom_from_body,
             covariance,
             breaks=np.array(self.breaks, np.int64),
             metric=self.sensor.metric,
+            of_images=True,
         )
+        metres = None if self.height_m is None else by_height(found, self.below, self.height_m, camera)
+        return metres or found
 
     def _increments(self) -> Floats:
         """(T, 6, 6) of the motion since the frame before, in the camera: that between two references in equal parts,
@@ -379,11 +393,14 @@ class _Tracker:
         return result
 
 
-def visual_odometry(frames: Iterable[Frame], camera: Camera, metric: bool = True) -> Odometry | None:
+def visual_odometry(
+    frames: Iterable[Frame], camera: Camera, metric: bool = True, height_m: float | None = None
+) -> Odometry | None:
     """The motion of the body by the images of a calibrated camera, `metric` where it has depth or is that of a stereo
     pair; None where fewer than two frames have a pose. Frames that are lost have none. The covariance is that of each
-    frame's motion since the one before it, by the bundle adjustment's marginals."""
-    tracker = _Tracker(Sensor(camera, metric))
+    frame's motion since the one before it, by the bundle adjustment's marginals. The height of a camera without depth
+    over the ground gives metres where its images show the ground."""
+    tracker = _Tracker(Sensor(camera, metric), None if metric else height_m)
     for frame in frames:
         tracker.add(frame)
     return tracker.odometry()

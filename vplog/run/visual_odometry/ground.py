@@ -1,0 +1,114 @@
+"""Metres for odometry in units of its own, by the known height of the camera over the ground.
+
+Landmarks before the vehicle and below the camera are of the road, or of what stands on it: the ground is where the
+lowest agree. Its slope to the camera's mount is one for the drive, its height one for each view (Song & Chandraker 2014
+say how such heights hold a monocular scale).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from vplog.run.visual_odometry.metres import scaled
+
+if TYPE_CHECKING:
+    from vplog.data import Camera, Floats, Ints, Odometry
+
+_DEPRESSION = np.sin(np.radians(4.0))
+"""Sine of the angle below the horizon: what is farther is low by a small error of the pitch alone."""
+_LATERAL = 1.5
+"""Heights to either side: a lane of 5 m from a car; beyond are kerbs and houses."""
+_LEAST = 5
+"""Landmarks of a view that give a height."""
+_LEAST_VIEWS = 5
+"""Views that show the ground, and their least share of all."""
+_LEAST_SHARE = 0.2
+_SPREAD = 0.15
+"""Most relative deviation of landmarks below the ground, and of its height from view to view: more is no ground."""
+_TUNING = 3.0
+"""Sigmas beyond which a landmark is none of the ground (Tukey)."""
+_FINEST = 0.01
+"""Least relative deviation that is told from zero."""
+_ROUNDS = 40
+_WANDER = 0.01
+"""Standard deviation of the log of the scale after a unit, growing as the root of the way."""
+_ACROSS = 1.0
+"""That across a break."""
+_HUBER = 2.0
+
+
+class Below(NamedTuple):
+    """Landmarks below the camera in one view."""
+
+    row: int
+    """Of the frame in the odometry."""
+    points: Floats
+    """(K, 3) below, ahead, left of the camera in the axes of the body, in units."""
+
+
+def below(row: int, points: Floats, camera: Camera) -> Below:
+    """Those of the landmarks (K, 3) in the camera that may be of the ground."""
+    axes = camera.body_from_camera[[2, 0, 1], :3] * np.array([[-1.0], [1.0], [1.0]])
+    found = points @ axes.T
+    low = found[:, 0] > _DEPRESSION * np.linalg.norm(found, axis=1)
+    return Below(row, found[low & (np.abs(found[:, 2]) < _LATERAL * found[:, 0]) & (found[:, 1] > 0)])
+
+
+def by_height(odometry: Odometry, views: list[Below], height_m: float, camera: Camera) -> Odometry | None:
+    """The odometry in metres, its scale as it wanders; None where the views do not show a ground."""
+    known = [view for view in views if len(view.points) >= _LEAST]
+    if len(known) < max(_LEAST_VIEWS, _LEAST_SHARE * len(views)):
+        return None
+    heights, spread = _heights(known)
+    if spread > _SPREAD or not (heights > 0).all():
+        return None
+    rows = np.array([view.row for view in known])
+    log_scale, left = _smoothed(odometry, rows, np.log(height_m / heights), spread)
+    if left > _SPREAD:
+        return None
+    since = odometry.stamp_ns - odometry.stamp_ns[0]
+    return replace(scaled(odometry, np.exp(np.interp(since, since[rows], log_scale)), camera), metric=True)
+
+
+def _heights(views: list[Below]) -> tuple[Floats, float]:
+    """(V,) of the camera over the ground in each view, and the relative deviation of landmarks of the ground. What
+    stands on it is above, so that those below it tell their noise."""
+    view = np.repeat(np.arange(len(views)), [len(one.points) for one in views])
+    points = np.concatenate([one.points for one in views])
+    height = np.array([np.median(one.points[:, 0]) for one in views])
+    slope, spread = np.zeros(2), 0.0
+    for _ in range(_ROUNDS):
+        off = (points[:, 0] + points[:, 1:] @ slope) / height[view] - 1.0
+        lower = off[off > 0]
+        spread = max(1.4826 * float(np.median(lower)), _FINEST) if len(lower) else _FINEST
+        weight = np.maximum(1.0 - (off / (_TUNING * spread)) ** 2, 0.0) ** 2 + 1e-6
+        total = np.bincount(view, weight)
+        mean = np.stack([np.bincount(view, weight * column) / total for column in points.T], axis=1)
+        rest = (points - mean[view]) / height[view, None]
+        A, b = rest[:, 1:] * weight[:, None], rest[:, 0]
+        slope = -np.linalg.solve(A.T @ rest[:, 1:] + 1e-9 * np.eye(2), A.T @ b)
+        height = np.maximum(mean[:, 0] + mean[:, 1:] @ slope, 1e-6)
+    return height / np.sqrt(1.0 + slope @ slope), spread
+
+
+def _smoothed(odometry: Odometry, rows: Ints, measured: Floats, spread: float) -> tuple[Floats, float]:
+    """(V,) logs of a scale that wanders slowly, by those measured, and the deviation of these from it."""
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(odometry.odom_from_body[:, :3, 3], axis=0), axis=1))])
+    sigma = _WANDER * np.sqrt(np.diff(way[rows]) + 1e-6)
+    if odometry.breaks is not None:
+        pieces = np.searchsorted(odometry.breaks, rows, "right")
+        sigma[np.diff(pieces) > 0] = _ACROSS
+    count = len(rows)
+    smooth = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(count - 1, count)).tocsr()
+    smooth = sparse.diags_array(1.0 / sigma) @ smooth
+    x, left = np.full(count, float(np.median(measured))), spread
+    for _ in range(_ROUNDS):
+        weight = np.sqrt(np.minimum(1.0, _HUBER * left / np.maximum(np.abs(measured - x), 1e-9))) / left
+        A = sparse.vstack([sparse.diags_array(weight), smooth])
+        x = sparse.linalg.spsolve((A.T @ A).tocsc(), weight**2 * measured)
+        left = max(1.4826 * float(np.median(np.abs(measured - x))), _FINEST)
+    return x, left
