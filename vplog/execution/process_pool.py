@@ -1,7 +1,7 @@
 """Processes of this machine for one drive each: its memory is given back, and one that dies takes no other along.
 
 pebble's pool starts a new process for each task, kills them all on Ctrl-C and reports which task's process died. They
-are forks of multiprocessing's server, which has the modules loaded: that takes three seconds. On macOS, whose libraries
+are forks of multiprocessing's server, which has the modules loaded: that takes a CPU second. On macOS, whose libraries
 do not survive a fork, each is spawned; with one more process than jobs, one always has its modules when a drive ends.
 
 multiprocessing has such a process import the main module of its parent, since what it is to call may be there: a script
