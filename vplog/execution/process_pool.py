@@ -27,6 +27,13 @@ from pebble import ProcessExpired, ProcessPool
 
 from vplog.errors import SettingsError
 
+if sys.platform == "darwin":
+    from multiprocessing.context import SpawnContext as _Context
+    from multiprocessing.context import SpawnProcess as _Process
+else:
+    from multiprocessing.context import ForkServerContext as _Context
+    from multiprocessing.context import ForkServerProcess as _Process
+
 if TYPE_CHECKING:
     T = TypeVar("T")
 
@@ -36,10 +43,7 @@ _WORK = "vplog.batch.worker"
 """Module that the server, or else every process, imports first."""
 
 
-_METHOD: Any = multiprocessing.get_context("spawn" if sys.platform == "darwin" else "forkserver")
-
-
-class Process(_METHOD.Process):
+class Process(_Process):
     """One of a function of this package."""
 
     _starting = threading.Lock()
@@ -52,7 +56,7 @@ class Process(_METHOD.Process):
             try:
                 if sys.platform != "darwin":
                     _start_server()
-                return _METHOD.Process._Popen(process_obj)
+                return _Process._Popen(process_obj)
             finally:
                 sys.modules["__main__"] = main
 
@@ -69,7 +73,7 @@ def _start_server() -> None:
         os.environ |= {} if before is None else {"PYTHONPATH": before}
 
 
-class _Context(type(_METHOD)):
+class _Processes(_Context):
     """Its locks keep their names as long as the pool: pebble drops them before it ends processes that look for them."""
 
     Process = Process
@@ -104,7 +108,7 @@ class OwnProcesses:
         resource_tracker.ensure_running()
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            self._pool = ProcessPool(self._count, 1, _load, [_WORK, dict(os.environ)], _Context())
+            self._pool = ProcessPool(self._count, 1, _load, [_WORK, dict(os.environ)], _Processes())
             self._pool.active  # noqa: B018 (starts it)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)  # where a Ctrl-C that waited is raised
