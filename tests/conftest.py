@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import json
 import os
 import shutil
@@ -15,6 +16,7 @@ import pytest
 from hypothesis import settings
 
 from tests import durations
+from tests.remembered import remember
 from vplog.cli import main, progress
 from vplog.demo import SMALL, make_drive
 from vplog.execution.execution import Execution
@@ -57,6 +59,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if functions.get(item.nodeid.partition("[")[0], 0.0) > durations.SLOW_S:
             item.add_marker("slow")
     items.sort(key=lambda item: -files[item.nodeid.partition("::")[0]])
+
+
+def pytest_collection_finish() -> None:
+    """Modules and tests are no garbage: looking through them again and again takes a twelfth of all time."""
+    gc.freeze()
+    gc.set_threshold(50_000)
 
 
 @dataclass(frozen=True)
@@ -128,6 +136,23 @@ def own_processes(in_process: pytest.MonkeyPatch) -> Iterator[None]:
     in_process.setattr(OwnProcesses, "submit", instead)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def remembered(shared_folder: Path) -> Iterator[pytest.MonkeyPatch]:
+    """Features of a frame and the index of a library are computed once by all workers together."""
+    (folder := shared_folder / "remembered").mkdir(exist_ok=True)
+    with pytest.MonkeyPatch.context() as patch:
+        remember(patch, folder)
+        yield patch
+
+
+@pytest.fixture
+def computed_anew(remembered: pytest.MonkeyPatch, shared_folder: Path) -> Iterator[None]:
+    """Features and indices are computed each time, as users have it."""
+    remembered.undo()
+    yield
+    remember(remembered, shared_folder / "remembered")
+
+
 @pytest.fixture
 def verb(capfd: pytest.CaptureFixture[str]) -> Callable[..., Said]:
     """Run a verb in this process; what native libraries print counts too."""
@@ -144,14 +169,19 @@ def verb(capfd: pytest.CaptureFixture[str]) -> Callable[..., Said]:
 
 
 @pytest.fixture(scope="session")
-def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], object]], Path]:
-    """A folder by its name, filled by the first process of the tests that asks for it; the others wait for that."""
+def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of all workers of this session, in which each has one of its own."""
     base = tmp_path_factory.getbasetemp()
-    top = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base  # each worker has a folder of its own there
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
+@pytest.fixture(scope="session")
+def made_once(shared_folder: Path) -> Callable[[str, Callable[[Path], object]], Path]:
+    """A folder by its name, filled by the first process of the tests that asks for it; the others wait for that."""
 
     def made(name: str, fill: Callable[[Path], object]) -> Path:
-        folder, filled = top / f"once-{name}", top / f"once-{name}.filled"
-        with (top / f"once-{name}.lock").open("w") as lock:
+        folder, filled = shared_folder / f"once-{name}", shared_folder / f"once-{name}.filled"
+        with (shared_folder / f"once-{name}.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not filled.exists():
                 shutil.rmtree(folder, ignore_errors=True)

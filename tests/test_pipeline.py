@@ -107,6 +107,7 @@ def test_settings_of_a_run_give_the_run_again(finished: Path, tmp_path: Path) ->
     assert load_pipeline(str(file)) == load_pipeline("default")
 
 
+@pytest.mark.usefixtures("computed_anew")
 def test_the_same_bytes_from_any_number_of_threads_and_over_an_old_run(
     drive: Drive, finished: Path, tiny: Drive, tmp_path: Path
 ) -> None:

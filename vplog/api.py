@@ -6,7 +6,7 @@ import logging
 import os
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from vplog.batch.worker import Drive
     from vplog.benchmark.compare import Comparison
     from vplog.data import Camera
-    from vplog.execution.process_pool import OwnProcesses
     from vplog.logs import TopicChoice
     from vplog.maps.localization.localize import LocalizedPicture
     from vplog.pipeline import Pipeline
@@ -394,7 +393,7 @@ def batch(
             f"--odometry-file {parts.odometry_file} is of one drive, and {len(inputs)} logs are given. "
             "Give each drive its own in the column odometry_file of a manifest, drives.csv."
         )
-    with limited(threads), drive_processes(engine, jobs, len(inputs)) as processes, ExitStack() as stack:
+    with limited(threads), ExitStack() as stack:
         from vplog.batch.batch import run_batch, settings_for
         from vplog.batch.engine import BatchOptions
 
@@ -409,22 +408,9 @@ def batch(
 
             return plan(inputs, root, chosen, references, parts, Execution(threads, progress), cost_per_cpu_hour)
         options = BatchOptions(
-            jobs, engine, address, retries, drive_timeout_s, drive_memory_mb, processes, join, keep_cache, on_drive
+            jobs, engine, address, retries, drive_timeout_s, drive_memory_mb, join, keep_cache, on_drive
         )
         return run_batch(inputs, root, chosen, references, parts, Execution(threads, progress), options)
-
-
-@contextmanager
-def drive_processes(engine: str, jobs: int | None, drives: int | None = None) -> Iterator[OwnProcesses | None]:
-    """The processes of the drives of a batch; None where another engine computes."""
-    if engine != "local":
-        yield None
-        return
-    from vplog.execution.process_pool import OwnProcesses
-
-    count = (jobs or 1) + 1
-    with OwnProcesses(count if drives is None else min(count, drives)) as processes:
-        yield processes  # begun by the first drive: what is refused before starts none
 
 
 def open_map(map: Place) -> Map:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, cast
 import duckdb
 import pytest
 
+from tests.forked import VPLOG, Forked
 from tests.joined import rewritten
 from vplog.batch import batch
 from vplog.batch.batch import run_batch
@@ -30,7 +31,6 @@ from vplog.batch.plan import DriveInput, PlannedDrive, absolute_log, name_of
 from vplog.batch.worker import Drive, Outcome, Task, compute_drive
 from vplog.demo.record import IMAGE
 from vplog.errors import LibraryError, LogError, ResultError, SettingsError
-from vplog.execution import process_pool
 from vplog.execution.process_pool import OwnProcesses, ProcessExpired
 from vplog.logs import TopicChoice
 from vplog.maps.storage import map_store
@@ -231,13 +231,13 @@ def test_another_library_or_writer_is_refused(whole: Path, logs: list[Path], tmp
 def test_a_killed_batch_leaves_finished_drives_and_goes_on(whole: Path, logs: list[Path], tmp_path: Path) -> None:
     """Killed while the first drive runs, then once it is in; what is there is whole, and the end is the same."""
     root, reference = tmp_path / "map", tables(whole)
-    command = [sys.executable, "-m", "vplog", "batch", *map(str, logs), "-o", str(root), "--jobs", "1", *OPTIONS]
     for until in (root / ".staging", root / "runs" / "drive=drive"):
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as batch:
-            while batch.poll() is None and not until.exists():
-                time.sleep(0.02)
-            time.sleep(random.Random(until.name).uniform(0, 1))
-            os.kill(batch.pid, signal.SIGKILL)
+        batch = Forked(VPLOG, "batch", *logs, "-o", root, "--jobs", 1, *OPTIONS)
+        while batch.poll() is None and not until.exists():
+            time.sleep(0.02)
+        time.sleep(random.Random(until.name).uniform(0, 1))
+        batch.send(signal.SIGKILL)
+        batch.ended()
         finished = {folder.name for folder in root.glob("runs/*")}
         for name, digest in tables(root).items():
             assert ".staging" in name or digest == reference[name]
@@ -348,7 +348,6 @@ def test_a_drive_over_its_limit_ends(
 
 
 def test_a_process_that_dies_takes_no_other_along(monkeypatch: pytest.MonkeyPatch, own_processes: None) -> None:
-    monkeypatch.setattr(process_pool, "_WORK", "vplog.errors")  # soon loaded
     with OwnProcesses(2) as processes:
         dying, living = processes.submit(signal.raise_signal, signal.SIGKILL), processes.submit(os.getpid)
         with pytest.raises(ProcessExpired):
@@ -374,10 +373,7 @@ def computed_by(
     return outcome
 
 
-def test_processes_that_are_begun_are_those_of_the_first_tasks_or_end(
-    monkeypatch: pytest.MonkeyPatch, own_processes: None
-) -> None:
-    monkeypatch.setattr(process_pool, "_WORK", "vplog.errors")
+def test_processes_that_are_begun_are_those_of_the_first_tasks_or_end(own_processes: None) -> None:
     with OwnProcesses(1) as processes:
         processes.begin()
         [ahead] = multiprocessing.active_children()

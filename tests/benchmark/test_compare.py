@@ -132,6 +132,7 @@ def test_frames_keep_their_numbers_where_others_are_damaged(
         extract_traversal(logs.open(folder), SIFT, store, np.array([1]))
 
 
+@pytest.mark.usefixtures("computed_anew")
 def test_threads_and_scratch_change_nothing(day: Traversal, tmp_path: Path) -> None:
     """A drive against itself: frames 4 older or more, of which those 4 to 6 older are called true."""
     stops = candidate_stops(day.frames, day.frames, 4)
@@ -287,6 +288,7 @@ def test_the_log_tells_its_own_truth(verb: Verb, drive: Drive) -> None:
         assert 5 < found["positives"] < found["queries"]
 
 
+@pytest.mark.usefixtures("computed_anew")
 def test_files_are_the_same_every_time(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
     day, dusk = traversals
     (tmp_path / "truth.csv").write_text("query,match\n" + "".join(f"{i},{i}\n" for i in range(FRAMES)))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import resource
 import shutil
 import signal
 import subprocess
@@ -18,6 +17,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 import vplog
+from tests.forked import VPLOG, Forked
 from tests.joined import rewritten
 from vplog.demo.record import GPS, IMAGE, ODOMETRY, TYPES
 from vplog.results.run_record import read_run_json
@@ -73,12 +73,6 @@ def with_position(value: Callable[[int, float], float]) -> Change:
 
 def record_of(folder: Path) -> dict[str, Any]:
     return read_run_json(folder / "run.json")
-
-
-def started(*arguments: object, **options: Any) -> subprocess.Popen[str]:
-    """`vplog` in a process of its own."""
-    command = [sys.executable, "-m", "vplog", *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
 
 
 # What every verb has in common
@@ -372,10 +366,10 @@ def test_set_changes_one_setting_and_keeps_the_method(verb: Verb) -> None:
 
 
 def test_the_command_runs_in_a_process_of_its_own(drive: Drive) -> None:
-    process = started("info", drive.log, "--json")
-    out, err = process.communicate(timeout=600)
-    assert (process.returncode, err) == (0, "")
-    assert json.loads(out)["kind"] == "mcap"
+    command = [sys.executable, "-m", "vplog", "info", drive.log, "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout)["kind"] == "mcap"
 
 
 def test_debug_shows_the_traceback(capfd: pytest.CaptureFixture[str]) -> None:
@@ -694,22 +688,16 @@ def test_standing_still_all_the_time_is_said(verb: Verb, tiny: Drive, tmp_path: 
 # Runs that are cut short
 
 
-def begun(tiny: Drive, out: Path) -> subprocess.Popen[str]:
+def begun(tiny: Drive, out: Path) -> Forked:
     """A run that has begun to keep what it comes to."""
-    code = """
-import signal
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell that starts the tests in the background ignores it
-from vplog.cli import main
+    code = f"""
 from vplog.run import feature_extraction as parts
 parts.PART_KEYFRAMES = 4  # the first is soon there
-main.main()
+{VPLOG}
 """
-    told = ["run", str(tiny.log), "-o", str(out), *QUICK, "--threads", "1"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, *told], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    process = Forked(code, "run", tiny.log, "-o", out, *QUICK, "--threads", 1)
     while not list(out.glob(".cache/*.stage")):
-        assert process.poll() is None, process.communicate()
+        assert process.poll() is None, process.ended()
         time.sleep(0.01)
     return process
 
@@ -717,9 +705,9 @@ main.main()
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_interrupted_in_the_middle(tiny: Drive, tmp_path: Path, sent: signal.Signals, code: int) -> None:
     process = begun(tiny, tmp_path / "run")
-    process.send_signal(sent)
-    out, err = process.communicate(timeout=600)
-    assert (process.returncode, out) == (code, "")
+    process.send(sent)
+    status, out, err = process.ended()
+    assert (status, out) == (code, "")
     assert err.startswith("vplog: interrupted")
     assert len(err.splitlines()) == 1, err
     assert err.endswith(f"Go on with: vplog run --resume -o {tmp_path / 'run'}\n")
@@ -731,8 +719,8 @@ def test_interrupted_in_the_middle(tiny: Drive, tmp_path: Path, sent: signal.Sig
 
 def test_killed_in_the_middle_and_run_again(verb: Verb, tiny: Drive, tmp_path: Path) -> None:
     process = begun(tiny, tmp_path / "run")
-    process.kill()
-    process.communicate(timeout=600)
+    process.send(signal.SIGKILL)
+    assert process.ended()[0] == -signal.SIGKILL
     assert "did not finish" in verb("evaluate", tmp_path / "run", "--truth", tiny.truth).error
     assert run_quick(verb, tiny.log, tmp_path / "run")["finished"] is True
     assert [path.name for path in (tmp_path / "run").rglob(".*")] == [".cache"]
@@ -742,13 +730,9 @@ def test_killed_in_the_middle_and_run_again(verb: Verb, tiny: Drive, tmp_path: P
 @pytest.mark.parametrize("limit", [2_000, 100_000])
 def test_a_full_disk_is_one_line(tiny: Drive, tmp_path: Path, limit: int) -> None:
     """A limit on the size of a file stands in for the disk: too small for run.json, or for the features."""
-
-    def small_files() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-
-    process = started("run", tiny.log, "-o", tmp_path / "run", *QUICK, preexec_fn=small_files)
-    out, err = process.communicate(timeout=600)
-    assert (process.returncode, out) == (1, "")
+    code = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit})); {VPLOG}"
+    status, out, err = Forked(code, "run", tiny.log, "-o", tmp_path / "run", *QUICK).ended()
+    assert (status, out) == (1, "")
     assert err.startswith("vplog: error: Cannot")
     assert len(err.splitlines()) == 1, err
     assert not (tmp_path / "run").exists()

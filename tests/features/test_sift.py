@@ -11,6 +11,8 @@ import pytest
 from vplog.errors import SettingsError
 from vplog.features.sift import SiftSettings
 
+pytestmark = pytest.mark.usefixtures("computed_anew")
+
 
 def texture(seed: int, width: int = 320, height: int = 200) -> np.ndarray:
     rng = np.random.default_rng(seed)

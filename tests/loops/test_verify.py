@@ -160,6 +160,7 @@ def test_other_places_are_rejected_and_carry_no_pose() -> None:
 
 
 @pytest.mark.parametrize("calibrated", [True, False])
+@pytest.mark.usefixtures("computed_anew")
 def test_threads_and_order_change_no_byte(calibrated: bool) -> None:
     lens, frames, _, seen = drive(False)
     lens = lens if calibrated else replace(lens, matrix=None)

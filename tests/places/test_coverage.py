@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from vplog.data import Bytes, Features
     from vplog.places.bobb_paper import PaperBobbState
 
+pytestmark = pytest.mark.usefixtures("computed_anew")
+
 
 @pytest.fixture(scope="module")
 def state(references: list[Reference]) -> PaperBobbState:

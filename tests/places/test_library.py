@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from vplog.data import Reference
     from vplog.places.bobb_paper import PaperBobbState
 
+pytestmark = pytest.mark.usefixtures("computed_anew")
+
 
 def _lists(words: lib.Words) -> list[list[int]]:
     return [words.values[a:b].tolist() for a, b in zip(words.start[:-1], words.start[1:], strict=True)]

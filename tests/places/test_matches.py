@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
     from vplog.data import Reference
 
+pytestmark = pytest.mark.usefixtures("computed_anew")
+
 
 def test_threads_that_ask_at_once_get_one_value() -> None:
     made, begun = [], threading.Barrier(4)

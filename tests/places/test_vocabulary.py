@@ -10,6 +10,8 @@ from vplog.errors import LibraryError
 from vplog.execution.execution import Execution
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary, root_sift
 
+pytestmark = pytest.mark.usefixtures("computed_anew")
+
 
 def _blobs(blobs: int, each: int, seed: int = 0) -> np.ndarray:
     """(blobs * each, 128) descriptors around far-apart means."""

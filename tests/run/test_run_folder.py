@@ -7,8 +7,6 @@ import os
 import random
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.cli.test_main import no_images, no_messages, no_odometry, wrong_magic
+from tests.forked import VPLOG, Forked
 from tests.verbs.test_resume import OPTIONS, QUICK
 from vplog.errors import LogError, ResultError, SettingsError
 from vplog.pipeline import Pipeline, load_pipeline
@@ -405,19 +404,6 @@ def test_a_drive_may_be_called_library() -> None:
     assert names == ["library-2", "a", "a-2", "library-3"]
 
 
-def started(*told: object) -> subprocess.Popen[str]:
-    code = """
-import signal
-signal.signal(signal.SIGINT, signal.default_int_handler)
-from vplog.cli import main
-from vplog.run import feature_extraction as parts
-parts.PART_KEYFRAMES = 4
-main.main()
-"""
-    command = [sys.executable, "-c", code, *map(str, told)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
 def test_a_run_over_that_of_another_log_is_interrupted_killed_and_gone_on_with(
     tiny: Drive, tiny_drives: list[Path], tmp_path: Path, verb: Callable[..., Said]
 ) -> None:
@@ -429,16 +415,18 @@ def test_a_run_over_that_of_another_log_is_interrupted_killed_and_gone_on_with(
     before = tree(out)
     assert f"{out} is the run of {tiny.log}" in verb("run", other, "-o", out, *OPTIONS).error
     told: list[object] = [other, "--force", *OPTIONS]
-    for sent, code in ((signal.SIGINT, 130), (signal.SIGKILL, -9), (signal.SIGTERM, 143)):
-        process, stages = started("run", "-o", out, "--json", "--threads", 1, *told), set(out.glob(".cache/*.stage"))
+    code = f"from vplog.run import feature_extraction as parts; parts.PART_KEYFRAMES = 4; {VPLOG}"
+    for sent, status in ((signal.SIGINT, 130), (signal.SIGKILL, -9), (signal.SIGTERM, 143)):
+        stages = set(out.glob(".cache/*.stage"))
+        process = Forked(code, "run", "-o", out, "--json", "--threads", 1, *told)
         for _ in range(chance.randint(1, 2) * 100_000):
             if process.poll() is not None or set(out.glob(".cache/*.stage")) - stages:
                 break
             time.sleep(0.01)
-        assert process.poll() is None, process.communicate()
-        process.send_signal(sent)
-        said, error = process.communicate(timeout=600)
-        assert (process.returncode, said) == (code, "")
+        assert process.poll() is None, process.ended()
+        process.send(sent)
+        ended, said, error = process.ended()
+        assert (ended, said) == (status, "")
         if sent != signal.SIGKILL:
             assert error.startswith("vplog: interrupted; ")
             assert error.endswith(f"are kept in {out}/.cache. Go on with: vplog run --resume -o {out}\n")

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import random
 import shutil
-import subprocess
-import sys
 from functools import partial
 from http.server import ThreadingHTTPServer
 from threading import Thread
@@ -14,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from tests.forked import VPLOG, Forked
 from tests.storage.test_remote_path import QUICK, RangeHandler
 from vplog.cache.input_hashes import hash_inputs, stat_signature
 from vplog.errors import SettingsError
@@ -251,6 +250,6 @@ def test_logs_that_differ_in_their_queries_are_two(monkeypatch: pytest.MonkeyPat
 
 def test_a_traceback_is_shown_without_secrets(tmp_path: Path) -> None:
     words = ["info", f"http://127.0.0.1:1/a?b c={QUERY} {SECRET}", "--debug"]
-    done = subprocess.run([sys.executable, "-m", "vplog", *words], capture_output=True, text=True, check=False)
-    assert "Traceback" in done.stderr
-    assert SECRET not in done.stdout + done.stderr
+    _, out, err = Forked(VPLOG, *words).ended()
+    assert "Traceback" in err
+    assert SECRET not in out + err

@@ -7,8 +7,7 @@ import json
 import os
 import random
 import shutil
-import subprocess
-import sys
+import signal
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +18,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.forked import Forked
 from tests.logs import drives
 from tests.logs.drives import ros_messages, write_raw, write_ros2
 from tests.logs.messages.test_video import messages, packets
@@ -149,8 +149,8 @@ def test_a_killed_run_is_gone_on_with_to_the_same_bytes(
     command = ["run", "-o", str(out), "--threads", "2"]
     for after, told in ((chance.randint(4, 6), [str(log), *OPTIONS]), (chance.randint(4, 14), ["--resume", str(log)])):
         code = KILLED.format(part=PART, after=after, before=chance.random() < 0.5)
-        killed = subprocess.run([sys.executable, "-c", code, *command, *told], capture_output=True, check=False)
-        assert killed.returncode == -9, killed.stderr
+        status, _, error = Forked(code, *command, *told).ended()
+        assert status == -signal.SIGKILL, error
         assert read_run_json(out / ".cache" / "run.json")["finished"] is False
         assert not (out / "run.json").exists()
     done = list((out / ".cache").glob("extract-*"))

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -42,8 +42,6 @@ class BatchOptions:
     """Longest time of an attempt at a drive; it fails, and is not tried again. Of local processes alone."""
     drive_memory_mb: float | None = None
     """Largest resident memory of a drive's process, in MB (10^6 bytes), as `drive_timeout_s`."""
-    processes: OwnProcesses | None = None
-    """Pool of processes on this machine that the caller has started; else one of `jobs` + 1."""
     join: bool = True
     """Whether closures join what the map has at the end."""
     keep_cache: bool = False
@@ -68,9 +66,8 @@ def open_engine(options: BatchOptions, threads: int, folder: Path | None = None)
         return
     if options.address is not None:
         raise SettingsError(f"--address {options.address} is that of a Ray cluster. Add --engine ray.")
-    processes = options.processes
-    with nullcontext(processes) if processes is not None else OwnProcesses((options.jobs or 1) + 1) as own:
-        yield LocalEngine(own, threads)
+    with OwnProcesses((options.jobs or 1) + 1) as processes:
+        yield LocalEngine(processes, threads)
 
 
 def as_completed(engine: Engine, tasks: Sequence[Task], options: BatchOptions) -> Iterator[tuple[Task, Outcome, int]]:

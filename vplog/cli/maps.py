@@ -106,12 +106,12 @@ def condense_map(arguments: argparse.Namespace) -> None:
 
 def redescribe_map(arguments: argparse.Namespace) -> None:
     """Copy a map to another, its drives described with another library; their logs are read again."""
-    with api.drive_processes(arguments.engine, arguments.jobs) as processes, Progress(arguments) as progress:
+    with Progress(arguments) as progress:
         from vplog.batch.engine import BatchOptions
         from vplog.batch.redescribe import redescribe_map as redescribe
 
         execution = Execution(arguments.threads, progress)
-        options = call(BatchOptions, arguments, processes=processes)
+        options = call(BatchOptions, arguments)
         found = redescribe(arguments.map, arguments.library, arguments.target, execution, options)
     wrong = f"{found['failed']} of {plural(len(found['drives']), 'drive')} missing in {found['map']}."
     _end(arguments, found, printing.print_redescribed, wrong)

@@ -1,10 +1,11 @@
 """Processes of this machine for one drive each: its memory is given back, and one that dies takes no other along.
 
-pebble's pool starts a new process for each task, kills them all on Ctrl-C and reports which task's process died. With
-one more process than jobs, one always has its modules loaded, which takes two seconds, when a drive ends.
+pebble's pool starts a new process for each task, kills them all on Ctrl-C and reports which task's process died. They
+are forks of multiprocessing's server, which has the modules loaded: that takes a CPU second. On macOS, whose libraries
+do not survive a fork, each is spawned; with one more process than jobs, one always has its modules when a drive ends.
 
-multiprocessing has a spawned process import the main module of its parent, since what it is to call may be there: a
-script without `if __name__ == "__main__"` would run again in each. Tasks are functions of this package alone, so these
+multiprocessing has such a process import the main module of its parent, since what it is to call may be there: a script
+without `if __name__ == "__main__"` would run again in each. Tasks are functions of this package alone, so these
 processes are started without.
 """
 
@@ -18,8 +19,7 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
-from multiprocessing import resource_tracker
-from multiprocessing.context import SpawnContext, SpawnProcess
+from multiprocessing import forkserver, resource_tracker
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
@@ -27,33 +27,56 @@ from pebble import ProcessExpired, ProcessPool
 
 from vplog.errors import SettingsError
 
+if sys.platform == "darwin":
+    from multiprocessing.context import SpawnContext as _Context
+    from multiprocessing.context import SpawnProcess as _Process
+else:
+    from multiprocessing.context import ForkServerContext as _Context
+    from multiprocessing.context import ForkServerProcess as _Process
+
 if TYPE_CHECKING:
     T = TypeVar("T")
 
-__all__ = ["OwnProcesses", "ProcessExpired"]
+__all__ = ["OwnProcesses", "Process", "ProcessExpired"]
 
 _WORK = "vplog.batch.worker"
-"""Module that every process imports first."""
+"""Module that the server, or else every process, imports first."""
 
 
-class _Process(SpawnProcess):
+class Process(_Process):
+    """One of a function of this package."""
+
     _starting = threading.Lock()
 
     @staticmethod
     def _Popen(process_obj: Any) -> Any:  # noqa: N802 (multiprocessing's name)
-        with _Process._starting:
+        with Process._starting:
             main = sys.modules["__main__"]
             sys.modules["__main__"] = ModuleType("__main__")  # of no file, so that there is none to import
             try:
-                return SpawnProcess._Popen(process_obj)
+                if sys.platform != "darwin":
+                    _start_server()
+                return _Process._Popen(process_obj)
             finally:
                 sys.modules["__main__"] = main
 
 
-class _Spawn(SpawnContext):
+def _start_server() -> None:
+    """Start the process that is forked, where none is running. Before Python 3.12.7 it does not get `sys.path`."""
+    multiprocessing.set_forkserver_preload([_WORK])
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)
+    try:
+        forkserver.ensure_running()
+    finally:
+        del os.environ["PYTHONPATH"]
+        os.environ |= {} if before is None else {"PYTHONPATH": before}
+
+
+class _Processes(_Context):
     """Its locks keep their names as long as the pool: pebble drops them before it ends processes that look for them."""
 
-    Process = _Process
+    Process = Process
 
     def __init__(self) -> None:
         self._locks: list[Any] = []
@@ -85,7 +108,7 @@ class OwnProcesses:
         resource_tracker.ensure_running()
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            self._pool = ProcessPool(self._count, 1, _load, [_WORK], _Spawn())
+            self._pool = ProcessPool(self._count, 1, _load, [_WORK, dict(os.environ)], _Processes())
             self._pool.active  # noqa: B018 (starts it)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)  # where a Ctrl-C that waited is raised
@@ -108,8 +131,11 @@ class OwnProcesses:
             self._pool = None
 
 
-def _load(module: str) -> None:
-    """Import the code of a drive, and watch for the end of the batch: a worker must not go on beside the next one."""
+def _load(module: str, environment: dict[str, str]) -> None:
+    """Import the code of a drive, and watch for the end of the batch: a worker must not go on beside the next one. The
+    environment is that of the batch, which may have changed since the server began."""
+    os.environ.clear()
+    os.environ.update(environment)
     parent = multiprocessing.parent_process()
 
     def watch() -> None:

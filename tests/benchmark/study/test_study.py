@@ -135,6 +135,7 @@ def find(rows: list[dict[str, Any]], method: str, query: str) -> dict[str, Any]:
     return next(row for row in rows if (row["method"], row["query"]) == (method, query))
 
 
+@pytest.mark.usefixtures("computed_anew")
 def test_bytes_do_not_depend_on_threads_and_the_interrupted_goes_on(
     verb: Verb, traversals: tuple[Path, Path], tmp_path: Path
 ) -> None:
