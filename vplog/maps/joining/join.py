@@ -57,6 +57,8 @@ class _Work:
     pipeline: Pipeline
     execution: Execution
     executor: Executor | None
+    whole: bool
+    """Whether components that have grown are solved again as a whole."""
 
     @property
     def quiet(self) -> Execution:
@@ -77,6 +79,7 @@ def load_places(library: Path, pipeline: Pipeline, execution: Execution = Execut
 def join(
     store: Store, pipeline: Pipeline, execution: Execution = Execution(), executor: Executor | None = None,
     places: Callable[[], PlaceState] | None = None, urls: Mapping[str, str] = MappingProxyType({}),
+    *, whole: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Verify the pairs of drives that are new or changed, solve the groups that have them, and return the record.
     `urls` open the logs of drives given now: a map stores URLs without their queries.
@@ -96,7 +99,7 @@ def join(
             store.mirror.rest()
         drives = read_drives(store, urls)
         new = [at for at in range(len(drives.members)) if not _is_up_to_date(store, drives, at, pipeline)]
-        return _join(_Work(store, drives, new, pipeline, execution, executor), places)
+        return _join(_Work(store, drives, new, pipeline, execution, executor, whole), places)
 
     def attempt() -> dict[str, Any]:
         if store.mirror is not None:
@@ -111,13 +114,14 @@ def join(
     return attempt()
 
 
-def join_map(root: Path, execution: Execution = Execution()) -> dict[str, Any]:
-    """`join` of a map as it is, with the settings of its last batch. Raises VplogError."""
+def join_map(root: Path, execution: Execution = Execution(), *, whole: bool = False) -> dict[str, Any]:
+    """`join` of a map as it is, with the settings of its last batch; `whole`: joint graphs to which drives were added
+    are solved again as a whole. Raises VplogError."""
     with reading(root) as store:  # not a map: nothing is made
         head = store.head()
     pipeline = Pipeline.read(head.settings, f"{root}/map.json")
     with writing(root) as store:
-        return {"map": str(root), **join(store, pipeline, execution)}
+        return {"map": str(root), **join(store, pipeline, execution, whole=whole)}
 
 
 def _join(work: _Work, places: Callable[[], PlaceState] | None) -> dict[str, Any]:
@@ -129,10 +133,12 @@ def _join(work: _Work, places: Callable[[], PlaceState] | None) -> dict[str, Any
         _record_pairs(work, wanted, reasons)
     with watch.stage("solve"), limited(work.execution.threads):
         pair_ledgers = _current_ledgers(store, drives)
-        record = solve_groups(store, drives, pair_ledgers, pipeline, work.execution)
+        record = solve_groups(store, drives, pair_ledgers, pipeline, work.execution, whole=work.whole)
     unjoined = [f"{later} and {earlier} were not verified. {reason}" for (later, earlier), reason in reasons.items()]
     for group in record["groups"]:
-        unjoined += [f"{', '.join(group['drives'])} cannot be solved. {group['reason']}"] if "reason" in group else []
+        if "reason" in group:
+            of_all = "" if group["components"] else f"{', '.join(group['drives'])} cannot be solved. "
+            unjoined.append(of_all + group["reason"])
         unjoined += [
             f"Closures of {one['query_drive']} to {one['match_drive']} were not enough to join them. {one['reason']}"
             for one in group["apart"]
