@@ -57,6 +57,20 @@ class Placed:
     """Reason, by Anchored, that not enough of its closures were kept."""
 
 
+def turned_round(one: Between) -> Between:
+    """The closures with the earlier drive's keyframes as queries."""
+    turn = se3.adjoint(se3.inverse(one.match_from_query))
+    return replace(
+        one,
+        later=one.earlier,
+        earlier=one.later,
+        query=one.match,
+        match=one.query,
+        match_from_query=se3.inverse(one.match_from_query),
+        information=np.swapaxes(turn, 1, 2) @ one.information @ turn,
+    )
+
+
 def place(drive: Drive, anchored: Sequence[Anchored], solve: Optimiser, settings: JoinSettings) -> Placed:
     """The drive in the world of drives that it has closures with. Raises GraphError where it cannot be solved.
 

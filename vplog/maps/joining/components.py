@@ -224,20 +224,19 @@ def _grown(
     """The group as joint.json has it, its new drives placed in the components `before`, and the keys of those that are
     not tried again."""
     header = tables.TableMetadata(_settings(pipeline), library)
-    pairs = {(one.later, one.earlier): partial(_ledger, one) for one in group.pair_ledgers}
-    earlier: dict[str, list[str]] = {drive: [] for drive in group.drives}
-    for one in group.pair_ledgers:
-        if one.verified:
-            earlier[one.later].append(one.earlier)
+    pairs = {(one.later, one.earlier): partial(_ledger, one) for one in group.pair_ledgers if one.verified}
     inside, known = set(group.drives), [one for other in before.get("groups", []) for one in other["components"]]
     known = [one for one in known if inside & set(one["drives"]) and _has_folders(store.root / "joint", one)]
-    lost = set[str]()
+    stayed, lost = before.get("judged", {}), set[str]()
+    if not known:
+        seed = _first_of(group, pipeline)
+        known, stayed = _solved(store, seed, pipeline, library)["components"], {one: judged[one] for one in seed.drives}
     while True:
-        stays = [one for one in group.drives if before.get("judged", {}).get(one) == judged[one] and one not in lost]
+        stays = [one for one in group.drives if stayed.get(one) == judged[one] and one not in lost]
         try:
             growth = Growth(store, pipeline, header, judged, known, stays, pairs)
-            for drive in sorted(inside - set(stays), key=group.drives.index):
-                growth.add(drive, earlier[drive])
+            there = set(stays)
+            growth.add([one for one in group.drives if one not in there])
             if whole:
                 growth.solve_all()
             break
@@ -251,6 +250,23 @@ def _grown(
     if growth.reasons:
         record["reason"] = " ".join(growth.reasons)
     return record, {drive: key for drive, key in judged.items() if drive not in growth.failed}
+
+
+def _first_of(group: Group, pipeline: Pipeline) -> Group:
+    """The drives of a group that are nearest to its first one by closures, as many as are judged together."""
+    near: dict[str, list[str]] = {drive: [] for drive in group.drives}
+    for one in group.pair_ledgers:
+        if one.verified >= pipeline.join.least_closures:
+            near[one.later].append(one.earlier)
+            near[one.earlier].append(one.later)
+    found = [group.drives[0]]
+    for drive in found:
+        found += [one for one in dict.fromkeys(near[drive]) if one not in found]
+        if len(found) >= pipeline.join.judged_anew:
+            break
+    chosen = set(found[: pipeline.join.judged_anew])
+    ledgers = tuple(one for one in group.pair_ledgers if {one.later, one.earlier} <= chosen)
+    return Group(tuple(one for one in group.drives if one in chosen), ledgers, key_of([group.key, sorted(chosen)]))
 
 
 def folders_of(component: Mapping[str, Any]) -> set[str]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from vplog.errors import GraphError, ResultError
 from vplog.geometry import se3
-from vplog.graph.growth import Anchored, place, solve_again
+from vplog.graph.growth import Anchored, place, solve_again, turned_round
 from vplog.graph.joint import middle
 from vplog.maps.joining.joint_graph import (
     SolvedDrive,
@@ -43,6 +43,10 @@ if TYPE_CHECKING:
     from vplog.graph.refine import Refined
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
+
+
+def _other(pair: tuple[str, str], drive: str) -> str:
+    return pair[pair[0] == drive]
 
 
 class LostPosesError(ResultError):
@@ -87,6 +91,10 @@ class Growth:
         self.reasons: list[str] = []
         self.failed: set[str] = set()
         """Drives that are tried again."""
+        self._met: dict[str, list[tuple[str, str]]] = {}
+        for pair in pairs:
+            for one in pair:
+                self._met.setdefault(one, []).append(pair)
         self._part: dict[str, Part] = {}
         left = set(stays)
         for one in known:
@@ -106,30 +114,45 @@ class Growth:
         """The components as joint.json has them, in order of their first drives."""
         return sorted((one.record for one in self.parts()), key=lambda one: one["drives"][0])
 
-    def add(self, drive: str, earlier: Sequence[str]) -> None:
-        """Place a drive by its ledgers in earlier ones, and put together what it joins. Raises GraphError, ResultError
-        and DamagedDriveError."""
-        own, meets = self._drive(drive), dict[int, list[str]]()
-        for one in earlier:
-            meets.setdefault(id(self._part[one]), []).append(one)
+    def add(self, drives: Iterable[str]) -> None:
+        """Place drives one after the other; what was alone is tried again when one that it has closures with is joined.
+        Raises ResultError and DamagedDriveError."""
+        waiting = dict.fromkeys(drives)
+        while waiting:
+            drive = next(iter(waiting))
+            del waiting[drive]
+            self._part[drive] = Part({drive: ""})
+            if self._placed(drive):
+                others = {one for pair in self._met[drive] for one in pair if one in self._part}
+                waiting |= dict.fromkeys(sorted(one for one in others if len(self._part[one].folders) == 1))
+
+    def _placed(self, drive: str) -> bool:
+        """Place a drive by its closures with those that are there, and put together what it joins."""
+        own, meets = self._drive(drive), dict[int, list[tuple[str, str]]]()
+        for pair in self._met[drive]:
+            if (part := self._part.get(_other(pair, drive))) is not None:
+                meets.setdefault(id(part), []).append(pair)
+        by_size = sorted(meets.values(), key=lambda pairs: -len(self._part[_other(pairs[0], drive)].folders))
         home, moved, ledgers = Part({drive: ""}), dict[str, "Floats"](), dict[tuple[str, str], "Closures"]()
-        for these in sorted(meets.values(), key=lambda these: -len(self._part[these[0]].folders)):
-            part, found = self._part[these[0]], {one: self._pairs[drive, one]() for one in sorted(these)}
+        for pairs in by_size:
+            part, found = self._part[_other(pairs[0], drive)], {pair: self._pairs[pair]() for pair in pairs}
             between = [verified_closures(1, 0, ledger) for ledger in found.values()]
-            anchored = [
-                Anchored(one, self._keyframes(other)[1][one.match]) for other, one in zip(these, between, strict=True)
-            ]
+            between = [one if pair[0] == drive else turned_round(one) for pair, one in zip(pairs, between, strict=True)]
+            poses = [self._keyframes(_other(pair, drive))[1] for pair in pairs]
+            anchored = [Anchored(one, at[one.match]) for one, at in zip(between, poses, strict=True)]
             try:
                 placed = place(own.graph, anchored, self._pipeline.solve, self._pipeline.join)
             except GraphError as error:
-                self.reasons.append(f"{drive} cannot be placed among {', '.join(these)}. {error}")
+                self.reasons.append(f"{drive} cannot be placed. {error}")
                 self.failed.add(drive)
                 continue
-            self.apart |= {(drive, these[at]): reason for at, reason in placed.apart.items()}
+            self.apart |= {pairs[at]: reason for at, reason in placed.apart.items()}
             if placed.world_from_body is None:
                 continue
-            for at, other in enumerate(these):
-                ledgers[drive, other] = with_solve(found[other], placed.weight[at], placed.residual[at])
+            for at, pair in enumerate(pairs):
+                ledgers[pair] = with_solve(found[pair], placed.weight[at], placed.residual[at])
+                if at not in placed.apart:
+                    self.apart.pop(pair, None)
             if not moved:
                 home.folders, home.placed = {**part.folders, drive: ""}, set(part.placed)
                 moved = {one: self._keyframes(one)[1] for one, folder in part.folders.items() if not folder}
@@ -139,13 +162,15 @@ class Growth:
                 shift = middle(moved[drive][rows] @ se3.inverse(placed.world_from_body[rows]))
                 moved |= {one: shift @ self._keyframes(one)[1] for one in part.folders}
                 home.folders |= part.folders
-        if moved:
-            folder = self._write([self._judged[drive], home.folders, sorted(moved)], moved, {drive: own}, ledgers)
-            home.folders |= dict.fromkeys(moved, folder)
-            home.placed |= moved.keys()
+        if not moved:
+            return False
+        folder = self._write([self._judged[drive], home.folders, sorted(moved)], moved, {drive: own}, ledgers)
+        home.folders |= dict.fromkeys(moved, folder)
+        home.placed |= moved.keys()
         self._part |= dict.fromkeys(home.folders, home)
         if len(home.placed) > self._pipeline.join.grown_share * (len(home.folders) - len(home.placed)):
             self._solve(home)
+        return True
 
     def solve_all(self) -> None:
         """Solve every component again that has grown."""
