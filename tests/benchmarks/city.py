@@ -2,8 +2,8 @@
 
 Streets are 100 m long and driven six times in each direction, whatever the number of drives: the city grows with them.
 Where others drove before in the same direction, the last two are met, with a closure every 20 m, of which one in fifty
-of those that are judged is false. Noise of the odometry is 2 cm and 0.1 degrees for each 2 m, of closures 5 cm and 0.3 degrees. Only what is
-solved is there: tables of drives and ledgers of pairs, as a batch leaves them.
+of those that are judged is false. Noise of the odometry is 2 cm and 0.1 degrees for each 2 m, of closures 5 cm and 0.3
+degrees. Only what is solved is there: tables of drives and ledgers of pairs, as a batch leaves them.
 """
 
 from __future__ import annotations

@@ -34,8 +34,8 @@ from vplog.maps.joining.joint_graph import (
     write_drive,
     write_ledgers,
 )
-from vplog.maps.joining.joint_record import read_joint, write_joint
-from vplog.maps.storage.damage import DamagedDriveError, damaged_table
+from vplog.maps.joining.joint_record import is_whole, read_joint, write_joint
+from vplog.maps.storage.damage import DamagedDriveError
 from vplog.maps.storage.layout import folder_name
 from vplog.results import g2o, run_record, tables
 from vplog.storage.json_records import key_of
@@ -180,7 +180,7 @@ def solve_groups(
         if len(group.drives) > pipeline.join.judged_anew:
             if components is None or whole or not all(map(partial(_has_folders, folder), components)):
                 known[group.key], keys = _grown(store, group, pipeline, drives.library, before, keys, whole)
-        elif components is None or not all(_is_whole(folder / one["folder"], one["drives"]) for one in components):
+        elif components is None or not all(is_whole(folder / one["folder"], one["drives"]) for one in components):
             known[group.key] = _solved(store, group, pipeline, drives.library)
         judged |= keys if known[group.key]["key"] else {}
         solved.append(known[group.key])
@@ -278,16 +278,6 @@ def _has_folders(joint: Path, component: Mapping[str, Any]) -> bool:
     return all((joint / one / "component.json").is_file() for one in folders_of(component))
 
 
-def _is_whole(component: Path, drives: Sequence[str]) -> bool:
-    """Whether the record and the tables of a component are there, as they were written."""
-    names = [f"{folder_name(drive)}/{table}" for drive in drives for table in ("keyframes", "trajectory")]
-    try:
-        run_record.read_run_json(component / "component.json")
-    except ResultError:
-        return False
-    return not any(damaged_table(component / f"{name}.parquet") for name in ("joins", *names))
-
-
 def _solved(store: Store, group: Group, pipeline: Pipeline, library: str) -> dict[str, Any]:
     staging = store.staging / "joint"
     shutil.rmtree(staging, ignore_errors=True)
@@ -300,7 +290,7 @@ def _solved(store: Store, group: Group, pipeline: Pipeline, library: str) -> dic
         return {"key": "", "drives": list(group.drives), "components": [], "apart": [], "reason": str(error)}
     for component in record["components"]:
         place = store.root / "joint" / component["folder"]
-        if _is_whole(place, component["drives"]):  # of a join that was killed; its name says that it is the same
+        if is_whole(place, component["drives"]):  # of a join that was killed; its name says that it is the same
             continue
         place.parent.mkdir(exist_ok=True)
         shutil.rmtree(place, ignore_errors=True)

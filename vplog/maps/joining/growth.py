@@ -30,6 +30,7 @@ from vplog.maps.joining.joint_graph import (
     write_drive,
     write_ledgers,
 )
+from vplog.maps.joining.joint_record import is_whole
 from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.layout import folder_name
 from vplog.results import run_record, tables
@@ -161,6 +162,7 @@ class Growth:
                 rows = np.concatenate([one.query[kept > 0.5] for one, kept in zip(between, placed.weight, strict=True)])
                 shift = middle(moved[drive][rows] @ se3.inverse(placed.world_from_body[rows]))
                 moved |= {one: shift @ self._keyframes(one)[1] for one in part.folders}
+                ledgers |= self._ledgers(part)
                 home.folders |= part.folders
         if not moved:
             return False
@@ -215,7 +217,7 @@ class Growth:
         """The verified closures of all pairs of a component, as they were decided; of pairs whose drives were not in
         one component then, as rejected."""
         found = dict[tuple[str, str], "Closures"]()
-        for folder in sorted({*part.folders.values()}):
+        for folder in sorted({*part.folders.values()} - {""}):
             found |= tables.read_joins(self._store.root / "joint" / folder / "joins.parquet")
         pairs = [pair for pair in self._pairs if pair[0] in part.folders and pair[1] in part.folders]
         known = {pair: found[pair] if pair in found else self._pairs[pair]() for pair in pairs}
@@ -228,7 +230,7 @@ class Growth:
         """Write a folder of MAP/joint for these drives, and return its name."""
         name = f"component={key_of(made_from)[:16]}"
         made, place = self._store.staging / "joint" / name, self._store.root / "joint" / name
-        if (place / "component.json").exists():  # of a join that was killed; its name says that it is the same
+        if is_whole(place, list(poses)):  # of a join that was killed; its name says that it is the same
             return name
         shutil.rmtree(made, ignore_errors=True)
         drives = {drive: known.get(drive) or self._drive(drive) for drive in poses}

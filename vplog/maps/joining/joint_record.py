@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from vplog.errors import ResultError
-from vplog.maps.storage.damage import reading_drive
+from vplog.maps.storage.damage import damaged_table, reading_drive
 from vplog.maps.storage.layout import folder_name, write_changed
 from vplog.results import run_record, tables
 from vplog.storage.folders import is_below
@@ -63,6 +63,16 @@ def _is_component(record: Any) -> bool:
         and isinstance(grown, dict)
         and all(map(is_below, (record.get("folder"), *grown.values())))
     )
+
+
+def is_whole(component: Path, drives: Sequence[str]) -> bool:
+    """Whether the record and the tables of a component are there, as they were written."""
+    names = [f"{folder_name(drive)}/{table}" for drive in drives for table in ("keyframes", "trajectory")]
+    try:
+        run_record.read_run_json(component / "component.json")
+    except ResultError:
+        return False
+    return not any(damaged_table(component / f"{name}.parquet") for name in ("joins", *names))
 
 
 def components_in(store: Store) -> list[dict[str, Any]] | None:
