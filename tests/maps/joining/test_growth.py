@@ -158,3 +158,15 @@ def test_damaged_poses_are_made_again(city: City) -> None:
     joint = joint_components(store)
     assert len(component(city.root)["drives"]) == COUNT
     assert len(keyframe_poses(store, joint, met[0])) == 200
+
+
+def test_a_damaged_ledger_is_left_out_and_made_again_by_the_next_join(city: City) -> None:
+    [ledger, *_] = [one for one in city.drives[COUNT - 1].ledgers]
+    data = bytearray(ledger.path.read_bytes())
+    data[len(data) // 2] ^= 4
+    ledger.path.write_bytes(data)
+    record = Cost().solve(city, COUNT, PIPELINE)
+    [reason] = [group["reason"] for group in record["groups"] if "reason" in group]
+    assert str(ledger.path) in reason
+    assert "made again by the next join" in reason
+    assert not ledger.path.exists()

@@ -25,6 +25,7 @@ from vplog.cache.code_hash import code_of
 from vplog.data import Closures
 from vplog.errors import NewerError, ResultError, VplogError
 from vplog.graph.build import parts
+from vplog.loops.verify import no_closures
 from vplog.maps.joining.growth import Growth, LostPosesError
 from vplog.maps.joining.joint_graph import (
     pair_record,
@@ -165,6 +166,16 @@ def _ledger(entry: PairLedger) -> Closures:
     return ledger
 
 
+def _sound_ledger(entry: PairLedger, gone: list[str]) -> Closures:
+    """The ledger; of a damaged one, which the next join makes again, no closures and a line in `gone`."""
+    try:
+        return _ledger(entry)
+    except ResultError as error:
+        entry.path.unlink(missing_ok=True)
+        gone.append(f"{error} It is left out, and made again by the next join.")
+        return no_closures()
+
+
 def solve_groups(
     store: Store, drives: Drives, pair_ledgers: Sequence[PairLedger], pipeline: Pipeline, execution: Execution,
     *, whole: bool = False,
@@ -224,7 +235,8 @@ def _grown(
     """The group as joint.json has it, its new drives placed in the components `before`, and the keys of those that are
     not tried again."""
     header = tables.TableMetadata(_settings(pipeline), library)
-    pairs = {(one.later, one.earlier): partial(_ledger, one) for one in group.pair_ledgers if one.verified}
+    gone = list[str]()
+    pairs = {(one.later, one.earlier): partial(_sound_ledger, one, gone) for one in group.pair_ledgers if one.verified}
     inside, known = set(group.drives), [one for other in before.get("groups", []) for one in other["components"]]
     known = [one for one in known if inside & set(one["drives"]) and _has_folders(store.root / "joint", one)]
     stayed, lost = before.get("judged", {}), set[str]()
@@ -247,8 +259,8 @@ def _grown(
         for (later, earlier), why in growth.apart.items()
     ]
     record = {"key": group.key, "drives": list(group.drives), "components": growth.records(), "apart": apart}
-    if growth.reasons:
-        record["reason"] = " ".join(growth.reasons)
+    if growth.reasons or gone:
+        record["reason"] = " ".join([*growth.reasons, *dict.fromkeys(gone)])
     return record, {drive: key for drive, key in judged.items() if drive not in growth.failed}
 
 

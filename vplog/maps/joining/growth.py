@@ -135,9 +135,12 @@ class Growth:
                 meets.setdefault(id(part), []).append(pair)
         by_size = sorted(meets.values(), key=lambda pairs: -len(self._part[_other(pairs[0], drive)].folders))
         home, moved, ledgers = Part({drive: ""}), dict[str, "Floats"](), dict[tuple[str, str], "Closures"]()
-        for pairs in by_size:
-            part, found = self._part[_other(pairs[0], drive)], {pair: self._pairs[pair]() for pair in pairs}
-            between = [verified_closures(1, 0, ledger) for ledger in found.values()]
+        for met in by_size:
+            part, found = self._part[_other(met[0], drive)], {pair: self._pairs[pair]() for pair in met}
+            pairs = [pair for pair in met if len(verified(found[pair]))]
+            if not pairs:
+                continue
+            between = [verified_closures(1, 0, found[pair]) for pair in pairs]
             between = [one if pair[0] == drive else turned_round(one) for pair, one in zip(pairs, between, strict=True)]
             poses = [self._keyframes(_other(pair, drive))[1] for pair in pairs]
             anchored = [Anchored(one, at[one.match]) for one, at in zip(between, poses, strict=True)]

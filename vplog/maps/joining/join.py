@@ -132,7 +132,7 @@ def _join(work: _Work, places: Callable[[], PlaceState] | None) -> dict[str, Any
         computed, reasons = _verify(work, wanted)
         _record_pairs(work, wanted, reasons)
     with watch.stage("solve"), limited(work.execution.threads):
-        pair_ledgers = _current_ledgers(store, drives)
+        pair_ledgers = _current_ledgers(work)
         record = solve_groups(store, drives, pair_ledgers, pipeline, work.execution, whole=work.whole)
     unjoined = [f"{later} and {earlier} were not verified. {reason}" for (later, earlier), reason in reasons.items()]
     for group in record["groups"]:
@@ -143,11 +143,12 @@ def _join(work: _Work, places: Callable[[], PlaceState] | None) -> dict[str, Any
             f"Closures of {one['query_drive']} to {one['match_drive']} were not enough to join them. {one['reason']}"
             for one in group["apart"]
         ]
-    cameras = [(member.drive, drive_pairs.known_camera(store, member, pipeline)) for member in drives.members]
+    searched = [drives.members[at] for at in work.new]
+    cameras = [(member.drive, drive_pairs.known_camera(store, member, pipeline)) for member in searched]
     if uncalibrated := [drive for drive, known in cameras if known is not None and known.camera["matrix"] is None]:
         unjoined.append(f"No camera calibration, so no metric closure joins these drives: {', '.join(uncalibrated)}.")
     return {
-        "searched": [drives.members[at].drive for at in work.new],
+        "searched": [member.drive for member in searched],
         "pairs": len(pair_ledgers),
         "pairs_computed": computed,
         "components": [component for group in record["groups"] for component in group["components"]],
@@ -188,14 +189,20 @@ def read_drives(store: Store, urls: Mapping[str, str]) -> Drives:
 
 
 def _is_up_to_date(store: Store, drives: Drives, at: int, pipeline: Pipeline) -> bool:
-    """Whether a drive need not be searched again: a drive that is gone has taken candidates that others might have."""
+    """Whether a drive need not be searched again: a drive that is gone has taken candidates that others might have. Of
+    many drives no ledger is read for that: of joint graphs that grow, one that is damaged is made again once it is."""
     member, joins = drives.members[at], drives.joins[at]
+    few = len(drives.members) <= pipeline.join.judged_anew
     return joins.made_from == drive_pairs.search_key(member, pipeline) and all(
         drives.counts(at, pair)
         and pair["ledger"]
-        and not damaged_table(drive_pairs.ledger_path(store, member.drive, pair["match"]))
+        and _is_there(drive_pairs.ledger_path(store, member.drive, pair["match"]), whole=few)
         for pair in joins.pairs
     )
+
+
+def _is_there(ledger: Path, *, whole: bool) -> bool:
+    return not damaged_table(ledger) if whole else ledger.is_file()
 
 
 def _search(work: _Work, places: Callable[[], PlaceState] | None) -> list[DrivePair]:
@@ -286,17 +293,18 @@ def _record_pairs(work: _Work, wanted: Sequence[DrivePair], reasons: dict[tuple[
         drive_pairs.put_joins(store, member.drive, drives.joins[at])
 
 
-def _current_ledgers(store: Store, drives: Drives) -> list[PairLedger]:
+def _current_ledgers(work: _Work) -> list[PairLedger]:
     """The pairs that count; the ledgers of others, as of drives that are gone, are removed."""
-    pair_ledgers = []
+    store, drives, new, pair_ledgers = work.store, work.drives, set(work.new), []
     for at, (member, joins) in enumerate(zip(drives.members, drives.joins, strict=True)):
         held = [pair for pair in joins.pairs if pair["ledger"] and drives.counts(at, pair)]
-        drive_pairs.remove_stale_ledgers(store, member.drive, {pair["match"] for pair in held})
+        if at in new:
+            drive_pairs.remove_stale_ledgers(store, member.drive, {pair["match"] for pair in held})
         for pair in held:
             path = drive_pairs.ledger_path(store, member.drive, pair["match"])
             if pair["candidates"]:
                 pair_ledgers.append(PairLedger(member.drive, pair["match"], path, pair["ledger"], pair["verified"]))
-    known = {folder_name(drive) for drive in [*store.drives(), *store.damaged]}
+    known = {folder_name(drive) for drive in [*drives.keys, *store.damaged]}
     for folder in store.root.glob("joins/drive=*"):
         if folder.name not in known:
             shutil.rmtree(folder, ignore_errors=True)
