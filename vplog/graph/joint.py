@@ -216,7 +216,9 @@ def as_one(
     return graph, of_odometry, starts, rows
 
 
-def _placed(drives: Sequence[Drive], members: Sequence[int], between: Sequence[Between]) -> dict[int, Floats]:
+def _placed(
+    drives: Sequence[Drive] | Mapping[int, Drive], members: Sequence[int], between: Sequence[Between]
+) -> dict[int, Floats]:
     """(4, 4) map_from_drive of each, a start for the solve: by what most closures of a pair say, pair after pair."""
     placed = {members[0]: np.eye(4)}
     while len(placed) < len(members):

@@ -11,7 +11,7 @@ import pytest
 
 from tests.benchmarks.city import City, Cost, errors, undecided, with_join
 from vplog.maps.joining import components
-from vplog.maps.joining.joint_record import joint_components, keyframe_poses, read_joint
+from vplog.maps.joining.joint_record import joint_components, keyframe_poses, read_joint, write_joint
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import load_pipeline
 from vplog.results import tables
@@ -170,3 +170,12 @@ def test_a_damaged_ledger_is_left_out_and_made_again_by_the_next_join(city: City
     assert str(ledger.path) in reason
     assert "made again by the next join" in reason
     assert not ledger.path.exists()
+
+
+def test_a_record_of_before_is_begun_anew(city: City) -> None:
+    """One that does not say by what closures were decided."""
+    record = read_joint(city.root)
+    del record["judged"]
+    write_joint(city.root, {name: value for name, value in record.items() if name != "format"})
+    Cost().solve(city, COUNT, PIPELINE)
+    assert len(component(city.root)["drives"]) == COUNT

@@ -240,7 +240,7 @@ def _grown(
     inside, known = set(group.drives), [one for other in before.get("groups", []) for one in other["components"]]
     known = [one for one in known if inside & set(one["drives"]) and _has_folders(store.root / "joint", one)]
     stayed, lost = before.get("judged", {}), set[str]()
-    if not known:
+    if not known or all(stayed.get(one) != judged[one] for one in group.drives):
         seed = _first_of(group, pipeline)
         known, stayed = _solved(store, seed, pipeline, library)["components"], {one: judged[one] for one in seed.drives}
     while True:
