@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,7 +50,9 @@ def city(made: City, tmp_path: Path) -> City:
 def at(made: City, root: Path) -> City:
     """The city with its map in another folder."""
     copy = City(root, COUNT)
-    copy.drives = made.drives
+    for one in made.drives:
+        ledgers = [replace(ledger, path=root / ledger.path.relative_to(made.root)) for ledger in one.ledgers]
+        copy.drives.append(replace(one, ledgers=ledgers))
     return copy
 
 

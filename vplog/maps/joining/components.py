@@ -12,6 +12,8 @@ KEY stands for all that the folder is made from, so one that a new drive does no
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -91,8 +93,13 @@ class Group:
     """IDs in the map's order."""
     pair_ledgers: tuple[PairLedger, ...]
     """Ledgers of all pairs of them, those of few closures too."""
-    key: str
-    """sha256 over all that the solve depends on."""
+    judged: dict[str, str]
+    """sha256 over what the closures of each drive in earlier ones are decided by."""
+
+    @property
+    def key(self) -> str:
+        """sha256 over all that the solve depends on."""
+        return hashlib.sha256(json.dumps(self.judged).encode()).hexdigest()
 
 
 def _settings(pipeline: Pipeline) -> dict[str, Any]:
@@ -108,19 +115,18 @@ def groups_of(every: Drives, pair_ledgers: Sequence[PairLedger], pipeline: Pipel
     a, b = (np.array([at[getattr(one, end)] for one in good], np.int64) for end in ("earlier", "later"))
     number = parts(len(order), a, b)
     code = code_of("vplog.maps.joining.components", type(pipeline.solve).__module__)["code"]
-    found = []
+    common, found = key_of([_settings(pipeline), code]), list[Group]()
     for one in np.flatnonzero(np.bincount(number, minlength=1) > 1).tolist():
         drives = tuple(order[row] for row in np.flatnonzero(number == one).tolist())
         inside = set(drives)
         between = [entry for entry in pair_ledgers if {entry.later, entry.earlier} <= inside]
         own = tuple(sorted(between, key=lambda entry: (at[entry.later], at[entry.earlier])))
-        made_from = {
-            "drives": [[drive, every.keys[drive]] for drive in drives],
-            "ledgers": [[entry.later, entry.earlier, entry.key] for entry in own],
-            "settings": _settings(pipeline),
-            "code": code,
-        }
-        found.append(Group(drives, own, key_of(made_from)))
+        met: dict[str, list[list[str]]] = {drive: [] for drive in drives}
+        for entry in own:
+            met[entry.later].append([entry.earlier, entry.key])
+        made_from = {drive: json.dumps([common, every.keys[drive], pairs]) for drive, pairs in met.items()}
+        judged = {drive: hashlib.sha256(text.encode()).hexdigest()[:16] for drive, text in made_from.items()}
+        found.append(Group(drives, own, judged))
     return found
 
 
@@ -187,10 +193,10 @@ def solve_groups(
     folder, solved, judged = store.root / "joint", list[dict[str, Any]](), dict[str, str]()
     for done, group in enumerate(groups):
         execution.progress("solve together", done, len(groups))
-        components, keys = known.get(group.key, {}).get("components"), _judged_by(group, drives, pipeline)
+        components, keys = known.get(group.key, {}).get("components"), group.judged
         if len(group.drives) > pipeline.join.judged_anew:
             if components is None or whole or not all(map(partial(_has_folders, folder), components)):
-                known[group.key], keys = _grown(store, group, pipeline, drives.library, before, keys, whole)
+                known[group.key], keys = _grown(store, group, pipeline, drives.library, before, whole)
         elif components is None or not all(is_whole(folder / one["folder"], one["drives"]) for one in components):
             known[group.key] = _solved(store, group, pipeline, drives.library)
         judged |= keys if known[group.key]["key"] else {}
@@ -218,23 +224,12 @@ def _joint(store: Store) -> dict[str, Any]:
         return {}
 
 
-def _judged_by(group: Group, every: Drives, pipeline: Pipeline) -> dict[str, str]:
-    """A key of what the closures of each drive in earlier ones are decided by."""
-    code = code_of("vplog.maps.joining.growth", type(pipeline.solve).__module__)["code"]
-    met: dict[str, list[list[str]]] = {drive: [] for drive in group.drives}
-    for entry in group.pair_ledgers:
-        met[entry.later].append([entry.earlier, entry.key])
-    common = [_settings(pipeline), code]
-    return {drive: key_of([common, every.keys[drive], pairs])[:16] for drive, pairs in met.items()}
-
-
 def _grown(
-    store: Store, group: Group, pipeline: Pipeline, library: str, before: Mapping[str, Any], judged: dict[str, str],
-    whole: bool,
+    store: Store, group: Group, pipeline: Pipeline, library: str, before: Mapping[str, Any], whole: bool
 ) -> tuple[dict[str, Any], dict[str, str]]:  # fmt: skip
     """The group as joint.json has it, its new drives placed in the components `before`, and the keys of those that are
     not tried again."""
-    header = tables.TableMetadata(_settings(pipeline), library)
+    header, judged = tables.TableMetadata(_settings(pipeline), library), group.judged
     gone = list[str]()
     pairs = {(one.later, one.earlier): partial(_sound_ledger, one, gone) for one in group.pair_ledgers if one.verified}
     inside, known = set(group.drives), [one for other in before.get("groups", []) for one in other["components"]]
@@ -278,7 +273,8 @@ def _first_of(group: Group, pipeline: Pipeline) -> Group:
             break
     chosen = set(found[: pipeline.join.judged_anew])
     ledgers = tuple(one for one in group.pair_ledgers if {one.later, one.earlier} <= chosen)
-    return Group(tuple(one for one in group.drives if one in chosen), ledgers, key_of([group.key, sorted(chosen)]))
+    drives = tuple(one for one in group.drives if one in chosen)
+    return Group(drives, ledgers, {one: group.judged[one] for one in drives})
 
 
 def folders_of(component: Mapping[str, Any]) -> set[str]:
