@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 from tests.benchmarks import backend
 from tests.benchmarks.ask import ask
 from tests.benchmarks.batch import PARTS, batch
+from tests.benchmarks.city import city
 from tests.benchmarks.compaction import compaction
 from tests.benchmarks.condense import condense
 from tests.benchmarks.discovery import discovery
@@ -51,7 +52,7 @@ DISCOVERY_BAR = 1000.0
 SEARCH_BARS = (4.0, 40.0)
 """Times faster than a scan of binary codes, and of vectors of floats."""
 SIZES = (10_000, 100_000, 1_000_000, 10_000_000)
-LONG = {"large", "batch", "localize", "condense", "compaction", "ask", "serve"}
+LONG = {"large", "batch", "localize", "condense", "compaction", "ask", "serve", "city"}
 """What is measured where it is named."""
 LARGEST_NEEDS_GB = 12.0
 """Memory that must be free for the largest map: the places, the index, and what the system needs beside."""
@@ -92,6 +93,7 @@ def _arguments() -> argparse.Namespace:
         "condense",
         "compaction",
         "ask",
+        "city",
     )
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     named = f"of {', '.join(kinds)}; where none is named all but {', '.join(sorted(LONG))}. Or backend (its own --help)"
@@ -101,6 +103,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--images", type=int, default=20, help="images of each drive")
     parser.add_argument("--seeds", type=int, default=3, help="of the false closures put into pose graphs")
     parser.add_argument("--poses", type=int, nargs="+", default=[100_000, 1_000_000], help="of the large pose graphs")
+    parser.add_argument("--drives", type=int, nargs="+", default=[300, 1000], help="of the joined cities")
     parser.add_argument("--places", type=int, default=1_000_000, help="size of the map that is searched")
     parser.add_argument(
         "--folder",
@@ -166,6 +169,8 @@ def _long(arguments: argparse.Namespace) -> Iterator[Figure]:
             yield from serve(arguments.places, arguments.folder or Path(made))
     if "compaction" in arguments.what:
         yield from compaction()
+    if "city" in arguments.what:
+        yield from city(arguments.drives)
     if "ask" in arguments.what:
         yield from ask(arguments.questions, arguments.seeds, arguments.runs)
     if "localize" in arguments.what:

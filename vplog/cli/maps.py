@@ -44,7 +44,7 @@ def join_map(arguments: argparse.Namespace) -> None:
     from vplog.maps.joining.join import join_map as join
 
     with Progress(arguments) as progress:
-        found = join(arguments.map, Execution(arguments.threads, progress))
+        found = join(arguments.map, Execution(arguments.threads, progress), whole=arguments.whole)
     print_result(arguments, found, printing.print_joined)
 
 
@@ -250,7 +250,8 @@ def add_maps(
     option(sub, "maps", place, "MAP|FILE.parquet", "maps, or places that `map export` wrote", nargs="+")
     option(sub, "--drive", str, "ID", "only this drive; repeatable", action="append", default=[])
     option(sub, "-o --target", place, "MAP", "target map", required=True)
-    verb("join", join_map, "find closures between the drives of a map and solve them together", threads)
+    sub = verb("join", join_map, "find closures between the drives of a map and solve them together", threads)
+    flag(sub, "--whole", "solve joint graphs to which drives were added again as a whole")
     sub = verb("remove", remove_drives, "remove drives")
     option(sub, "drives", str, "DRIVE", "as `map info` names them", nargs="+")
     verb("log", show_log, "the last changes of a map on an object store")

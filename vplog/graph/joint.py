@@ -17,7 +17,7 @@ from vplog.graph.solve import decided
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from vplog.data import Bools, Floats, Ints
     from vplog.graph.refine import Refined
@@ -45,6 +45,12 @@ class JoinSettings(Settings):
     """Keyframes either side of one whose best candidate in another drive is of the same place by geometry, of which
     all candidates there are verified: half the window of `sequence.length`. Elsewhere the best alone is; so it is where
     one of the drives has no calibration, for then no candidate can join them."""
+    judged_anew: int = Field(default=32, ge=2)
+    """Drives of a joint graph up to which a new one has all closures judged again and all poses solved. In a larger one
+    it is placed among the poses that are there, by the closures that it has with them."""
+    grown_share: float = Field(default=0.02, gt=0)
+    """Drives placed so, as a share of those solved as a whole, beyond which the whole is solved again: the error that
+    is left by then is a few percent, and what a drive costs for it stays the same."""
     keep_features: bool = True
     """Whether a map keeps the features of its keyframes that verification looks at, 0.1 MB each, so that a new drive
     needs neither the logs of those before it nor to extract from them again."""
@@ -110,13 +116,13 @@ def join(
     Drives joined by enough closures are solved as one, with all closures between them. Pairs with too few inliers are
     separated and the rest is solved again, until every pair has enough; other drives keep their own poses.
     """
-    joined = [_places(one, settings.spacing) >= settings.least_closures for one in between]
+    joined = [places(one, settings.spacing) >= settings.least_closures for one in between]
     weight = [np.zeros(len(one.query)) for one in between]
     residual = [np.full(len(one.query), np.nan) for one in between]
     poses = [drive.graph.world_from_body for drive in drives]
     solved: dict[tuple[int, ...], Refined] = {}
     apart: dict[int, str] = {}
-    while pending := [map_ for map_ in _maps(len(drives), between, joined) if len(map_) > 1 and map_ not in solved]:
+    while pending := [map_ for map_ in maps_of(len(drives), between, joined) if len(map_) > 1 and map_ not in solved]:
         members = pending[0]
         inside = set(members)
         ties = [
@@ -124,13 +130,13 @@ def join(
             for at, one in enumerate(between)
             if at not in apart and len(one.query) and one.later in inside and one.earlier in inside
         ]
-        graph, of_odometry, starts, rows = _as_one(drives, members, [between[at] for at in ties])
+        graph, of_odometry, starts, rows = as_one(drives, members, [between[at] for at in ties])
         decision = decided(graph, solve)
         weights = decision.solution.weight
         loose = [
             at
             for at, part in zip(ties, rows, strict=True)
-            if joined[at] and _places(between[at], settings.spacing, weights[part]) < settings.least_closures
+            if joined[at] and places(between[at], settings.spacing, weights[part]) < settings.least_closures
         ]
         if loose:
             for at in loose:
@@ -145,10 +151,10 @@ def join(
         for member, start in zip(members, starts, strict=True):
             count = len(drives[member].graph.world_from_body)
             poses[member] = refined.solution.world_from_body[start : start + count]
-    return Joined(_maps(len(drives), between, joined), poses, solved, weight, residual, apart)
+    return Joined(maps_of(len(drives), between, joined), poses, solved, weight, residual, apart)
 
 
-def _places(one: Between, spacing: int, weight: Floats | None = None) -> int:
+def places(one: Between, spacing: int, weight: Floats | None = None) -> int:
     """Places of the drive that has fewer, of closures with weight (L,): keyframes so far from one to the next."""
     accepted = slice(None) if weight is None else weight > 0.5
     return min(spaced_apart(one.query[accepted], spacing), spaced_apart(one.match[accepted], spacing))
@@ -163,23 +169,26 @@ def spaced_apart(keyframes: Ints, spacing: int) -> int:
     return count
 
 
-def _maps(count: int, between: Sequence[Between], joined: Sequence[bool]) -> list[tuple[int, ...]]:
+def maps_of(count: int, between: Sequence[Between], joined: Sequence[bool]) -> list[tuple[int, ...]]:
     """The drives of each map, in order of their first ones."""
     ties = [one for one, good in zip(between, joined, strict=True) if good]
     number = parts(count, np.array([t.earlier for t in ties], np.int64), np.array([t.later for t in ties], np.int64))
     return [tuple(np.flatnonzero(number == one).tolist()) for one in range(int(number.max()) + 1)]
 
 
-def _as_one(
-    drives: Sequence[Drive], members: Sequence[int], between: Sequence[Between]
+def as_one(
+    drives: Sequence[Drive] | Mapping[int, Drive],
+    members: Sequence[int],
+    between: Sequence[Between],
+    placed: Mapping[int, Floats] | None = None,
 ) -> tuple[PoseGraph, Bools, list[int], list[slice]]:
     """One graph of some drives and the closures between them: with it, which edges have the odometry's metres, where
-    each drive's poses start, and where each Between's edges are."""
+    each drive's poses start, and where each Between's edges are. `placed` are (4, 4) map_from_drive, if known."""
     counts = [len(drives[member].graph.world_from_body) for member in members]
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]]).tolist()
     start_of = dict(zip(members, starts, strict=True))
     own = [drives[member].graph for member in members]
-    placed = _placed(drives, members, between)
+    placed = placed or _placed(drives, members, between)
     first = sum(len(graph.a) for graph in own)
     rows = []
     for one in between:
@@ -207,7 +216,9 @@ def _as_one(
     return graph, of_odometry, starts, rows
 
 
-def _placed(drives: Sequence[Drive], members: Sequence[int], between: Sequence[Between]) -> dict[int, Floats]:
+def _placed(
+    drives: Sequence[Drive] | Mapping[int, Drive], members: Sequence[int], between: Sequence[Between]
+) -> dict[int, Floats]:
     """(4, 4) map_from_drive of each, a start for the solve: by what most closures of a pair say, pair after pair."""
     placed = {members[0]: np.eye(4)}
     while len(placed) < len(members):
@@ -218,15 +229,15 @@ def _placed(drives: Sequence[Drive], members: Sequence[int], between: Sequence[B
             match = drives[one.earlier].graph.world_from_body[one.match]
             query = drives[one.later].graph.world_from_body[one.query]
             earlier_from_later = match @ one.match_from_query @ se3.inverse(query)
-            middle = _middle(earlier_from_later)
+            typical = middle(earlier_from_later)
             if known[1]:
-                placed[one.later] = placed[one.earlier] @ middle
+                placed[one.later] = placed[one.earlier] @ typical
             else:
-                placed[one.earlier] = placed[one.later] @ se3.inverse(middle)
+                placed[one.earlier] = placed[one.later] @ se3.inverse(typical)
     return placed
 
 
-def _middle(poses: Floats) -> Floats:
+def middle(poses: Floats) -> Floats:
     """The one of the poses (L, 4, 4) with the least sum of distances to the others, a rad counting as 10 m; of many,
     among 500 evenly spread."""
     poses = poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 500)).astype(int))]

@@ -70,8 +70,7 @@ def drives_to_search(
     searched: dict[int, Container[int]] = {number: range(number) for number in later}
     if max(later) <= most or not isinstance(state, CodedState) or store.mirror is not None:
         return searched
-    about = store.drives()
-    parts, _ = update_index(store, {one.drive: about[one.drive] for one in members}, state, execution)
+    parts, _ = update_index(store, {one.drive: store.record(one.drive) for one in members}, state, execution)
     for number, views in later.items():
         if number <= most:
             continue

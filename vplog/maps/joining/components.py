@@ -12,22 +12,33 @@ KEY stands for all that the folder is made from, so one that a new drive does no
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vplog.cache.code_hash import code_of
-from vplog.data import Closures, Odometry
+from vplog.data import Closures
 from vplog.errors import NewerError, ResultError, VplogError
 from vplog.graph.build import parts
-from vplog.graph.refine import Refined, about_odometry
-from vplog.maps.joining.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
-from vplog.maps.joining.joint_record import read_joint, write_joint
-from vplog.maps.storage.damage import DamagedDriveError, damaged_table, reading_drive
+from vplog.loops.verify import no_closures
+from vplog.maps.joining.growth import Growth, LostPosesError
+from vplog.maps.joining.joint_graph import (
+    pair_record,
+    read_drive,
+    solution_record,
+    solve_drives,
+    write_drive,
+    write_ledgers,
+)
+from vplog.maps.joining.joint_record import is_whole, read_joint, write_joint
+from vplog.maps.storage.damage import DamagedDriveError
 from vplog.maps.storage.layout import folder_name
 from vplog.results import g2o, run_record, tables
 from vplog.storage.json_records import key_of
@@ -82,8 +93,13 @@ class Group:
     """IDs in the map's order."""
     pair_ledgers: tuple[PairLedger, ...]
     """Ledgers of all pairs of them, those of few closures too."""
-    key: str
-    """sha256 over all that the solve depends on."""
+    judged: dict[str, str]
+    """sha256 over what the closures of each drive in earlier ones are decided by."""
+
+    @property
+    def key(self) -> str:
+        """sha256 over all that the solve depends on."""
+        return hashlib.sha256(json.dumps(self.judged).encode()).hexdigest()
 
 
 def _settings(pipeline: Pipeline) -> dict[str, Any]:
@@ -99,19 +115,18 @@ def groups_of(every: Drives, pair_ledgers: Sequence[PairLedger], pipeline: Pipel
     a, b = (np.array([at[getattr(one, end)] for one in good], np.int64) for end in ("earlier", "later"))
     number = parts(len(order), a, b)
     code = code_of("vplog.maps.joining.components", type(pipeline.solve).__module__)["code"]
-    found = []
+    common, found = key_of([_settings(pipeline), code]), list[Group]()
     for one in np.flatnonzero(np.bincount(number, minlength=1) > 1).tolist():
         drives = tuple(order[row] for row in np.flatnonzero(number == one).tolist())
         inside = set(drives)
         between = [entry for entry in pair_ledgers if {entry.later, entry.earlier} <= inside]
         own = tuple(sorted(between, key=lambda entry: (at[entry.later], at[entry.earlier])))
-        made_from = {
-            "drives": [[drive, every.keys[drive]] for drive in drives],
-            "ledgers": [[entry.later, entry.earlier, entry.key] for entry in own],
-            "settings": _settings(pipeline),
-            "code": code,
-        }
-        found.append(Group(drives, own, key_of(made_from)))
+        met: dict[str, list[list[str]]] = {drive: [] for drive in drives}
+        for entry in own:
+            met[entry.later].append([entry.earlier, entry.key])
+        made_from = {drive: json.dumps([common, every.keys[drive], pairs]) for drive, pairs in met.items()}
+        judged = {drive: hashlib.sha256(text.encode()).hexdigest()[:16] for drive, text in made_from.items()}
+        found.append(Group(drives, own, judged))
     return found
 
 
@@ -121,7 +136,7 @@ def solve_group(group: Group, runs: Sequence[Path], pipeline: Pipeline, library:
     Returns the group as joint.json has it: `components`, and the pairs kept `apart` with reasons. Raises GraphError
     where it cannot be solved, and ResultError where a drive's folder is damaged.
     """
-    drives = list(map(_drive, group.drives, runs))
+    drives = list(map(read_drive, group.drives, runs))
     at = {drive: number for number, drive in enumerate(group.drives)}
     ledgers = {(at[entry.later], at[entry.earlier]): _ledger(entry) for entry in group.pair_ledgers}
     joined, ledgers = solve_drives(drives, ledgers, pipeline)
@@ -136,28 +151,16 @@ def solve_group(group: Group, runs: Sequence[Path], pipeline: Pipeline, library:
             (made / folder_name(name)).mkdir(exist_ok=True)
             write_drive(made / folder_name(name), "", drives[member], joined.world_from_body[member], header)
         inside = {pair: ledger for pair, ledger in ledgers.items() if set(pair) <= set(members)}
-        write_ledgers(made / "joins.parquet", drives, inside, header)
+        write_ledgers(made / "joins.parquet", [one.keyframes for one in drives], inside, header)
         joins = [pair_record(group.drives[pair[0]], group.drives[pair[1]], one) for pair, one in inside.items()]
-        run_record.write_run_json(made / "component.json", _record(group, names, joins, refined))  # last: it is whole
+        record = {**solution_record(names, joins, refined), "made_from": group.key}
+        run_record.write_run_json(made / "component.json", record)  # last: it is whole
         components.append({"folder": folder, "drives": names})
     pairs = [(group.pair_ledgers[pair], reason) for pair, reason in sorted(joined.apart.items())]
     apart = [
         {"query_drive": pair.later, "match_drive": pair.earlier, "reason": reason.strip()} for pair, reason in pairs
     ]
     return {"key": group.key, "drives": list(group.drives), "components": components, "apart": apart}
-
-
-def _drive(name: str, run: Path) -> SolvedDrive:
-    with reading_drive(name):
-        keyframes, poses = tables.read_keyframes(run / "keyframes.parquet")
-        graph, weight, _ = tables.read_edges(run / "edges.parquet", poses)
-        own = own_drive(graph, weight, tables.read_closures(run / "closures.parquet"))
-
-    def read_odometry() -> Odometry:
-        with reading_drive(name):
-            return tables.read_trajectory(run / "trajectory.parquet")[1]
-
-    return SolvedDrive(keyframes, own, read_odometry)
 
 
 def _ledger(entry: PairLedger) -> Closures:
@@ -169,39 +172,43 @@ def _ledger(entry: PairLedger) -> Closures:
     return ledger
 
 
-def _record(group: Group, drives: Sequence[str], joins: Sequence[dict[str, Any]], refined: Refined) -> dict[str, Any]:
-    """component.json."""
-    names = ("error_before", "error_after", "iterations", "converged", "reason")
-    return {
-        "drives": drives,
-        "joins": joins,
-        "solution": {name: getattr(refined.solution, name) for name in names},
-        "odometry": about_odometry(refined),
-        "made_from": group.key,
-    }
+def _sound_ledger(entry: PairLedger, gone: list[str]) -> Closures:
+    """The ledger; of a damaged one, which the next join makes again, no closures and a line in `gone`."""
+    try:
+        return _ledger(entry)
+    except ResultError as error:
+        entry.path.unlink(missing_ok=True)
+        gone.append(f"{error} It is left out, and made again by the next join.")
+        return no_closures()
 
 
 def solve_groups(
-    store: Store, drives: Drives, pair_ledgers: Sequence[PairLedger], pipeline: Pipeline, execution: Execution
-) -> dict[str, Any]:
-    """Solve the groups that are not solved yet, write joint.json, and remove the folders of other groups."""
-    groups = groups_of(drives, pair_ledgers, pipeline)
-    known = {group["key"]: group for group in _joint(store).get("groups", [])}
-    folder, solved = store.root / "joint", []
+    store: Store, drives: Drives, pair_ledgers: Sequence[PairLedger], pipeline: Pipeline, execution: Execution,
+    *, whole: bool = False,
+) -> dict[str, Any]:  # fmt: skip
+    """Solve the groups that are not solved yet, write joint.json, and remove the folders of other groups. Drives are
+    placed in groups of more than `join.judged_anew`; `whole`: which are then solved as a whole."""
+    groups, before = groups_of(drives, pair_ledgers, pipeline), _joint(store)
+    known = {group["key"]: group for group in before.get("groups", [])}
+    folder, solved, judged = store.root / "joint", list[dict[str, Any]](), dict[str, str]()
     for done, group in enumerate(groups):
         execution.progress("solve together", done, len(groups))
-        components = known.get(group.key, {}).get("components")
-        if components is None or not all(_is_whole(folder / one["folder"], one["drives"]) for one in components):
+        components, keys = known.get(group.key, {}).get("components"), group.judged
+        if len(group.drives) > pipeline.join.judged_anew:
+            if components is None or whole or not all(map(partial(_has_folders, folder), components)):
+                known[group.key], keys = _grown(store, group, pipeline, drives.library, before, whole)
+        elif components is None or not all(is_whole(folder / one["folder"], one["drives"]) for one in components):
             known[group.key] = _solved(store, group, pipeline, drives.library)
+        judged |= keys if known[group.key]["key"] else {}
         solved.append(known[group.key])
     execution.progress("solve together", len(groups), len(groups))
     together = {drive for group in solved for component in group["components"] for drive in component["drives"]}
     alone = sorted([*(one.drive for one in drives.members if one.drive not in together), *drives.excluded])
     keys = {drive: drives.keys[drive] for drive in sorted(together)}
-    record = {"groups": solved, "alone": alone, "apart": drives.excluded, "keys": keys}
+    record = {"groups": solved, "alone": alone, "apart": drives.excluded, "keys": keys, "judged": judged}
     if solved or (store.root / "joint.json").exists():
         write_joint(store.root, record)
-    named = {component["folder"] for group in solved for component in group["components"]}
+    named = {name for group in solved for component in group["components"] for name in folders_of(component)}
     for path in folder.glob("component=*"):
         if path.name not in named:
             shutil.rmtree(path, ignore_errors=True)
@@ -217,14 +224,66 @@ def _joint(store: Store) -> dict[str, Any]:
         return {}
 
 
-def _is_whole(component: Path, drives: Sequence[str]) -> bool:
-    """Whether the record and the tables of a component are there, as they were written."""
-    names = [f"{folder_name(drive)}/{table}" for drive in drives for table in ("keyframes", "trajectory")]
-    try:
-        run_record.read_run_json(component / "component.json")
-    except ResultError:
-        return False
-    return not any(damaged_table(component / f"{name}.parquet") for name in ("joins", *names))
+def _grown(
+    store: Store, group: Group, pipeline: Pipeline, library: str, before: Mapping[str, Any], whole: bool
+) -> tuple[dict[str, Any], dict[str, str]]:  # fmt: skip
+    """The group as joint.json has it, its new drives placed in the components `before`, and the keys of those that are
+    not tried again."""
+    header, judged = tables.TableMetadata(_settings(pipeline), library), group.judged
+    gone = list[str]()
+    pairs = {(one.later, one.earlier): partial(_sound_ledger, one, gone) for one in group.pair_ledgers if one.verified}
+    inside, known = set(group.drives), [one for other in before.get("groups", []) for one in other["components"]]
+    known = [one for one in known if inside & set(one["drives"]) and _has_folders(store.root / "joint", one)]
+    stayed, lost = before.get("judged", {}), set[str]()
+    if not known or all(stayed.get(one) != judged[one] for one in group.drives):
+        seed = _first_of(group, pipeline)
+        known, stayed = _solved(store, seed, pipeline, library)["components"], {one: judged[one] for one in seed.drives}
+    while True:
+        stays = [one for one in group.drives if stayed.get(one) == judged[one] and one not in lost]
+        try:
+            growth = Growth(store, pipeline, header, judged, known, stays, pairs)
+            there = set(stays)
+            growth.add([one for one in group.drives if one not in there])
+            if whole:
+                growth.solve_all()
+            break
+        except LostPosesError as error:
+            lost.add(error.drive)
+    apart = [
+        {"query_drive": later, "match_drive": earlier, "reason": why.strip()}
+        for (later, earlier), why in growth.apart.items()
+    ]
+    record = {"key": group.key, "drives": list(group.drives), "components": growth.records(), "apart": apart}
+    if growth.reasons or gone:
+        record["reason"] = " ".join([*growth.reasons, *dict.fromkeys(gone)])
+    return record, {drive: key for drive, key in judged.items() if drive not in growth.failed}
+
+
+def _first_of(group: Group, pipeline: Pipeline) -> Group:
+    """The drives of a group that are nearest to its first one by closures, as many as are judged together."""
+    near: dict[str, list[str]] = {drive: [] for drive in group.drives}
+    for one in group.pair_ledgers:
+        if one.verified >= pipeline.join.least_closures:
+            near[one.later].append(one.earlier)
+            near[one.earlier].append(one.later)
+    found = [group.drives[0]]
+    for drive in found:
+        found += [one for one in dict.fromkeys(near[drive]) if one not in found]
+        if len(found) >= pipeline.join.judged_anew:
+            break
+    chosen = set(found[: pipeline.join.judged_anew])
+    ledgers = tuple(one for one in group.pair_ledgers if {one.later, one.earlier} <= chosen)
+    drives = tuple(one for one in group.drives if one in chosen)
+    return Group(drives, ledgers, {one: group.judged[one] for one in drives})
+
+
+def folders_of(component: Mapping[str, Any]) -> set[str]:
+    """Folders in MAP/joint that a component is in."""
+    return {component["folder"], *component.get("grown", {}).values()}
+
+
+def _has_folders(joint: Path, component: Mapping[str, Any]) -> bool:
+    return all((joint / one / "component.json").is_file() for one in folders_of(component))
 
 
 def _solved(store: Store, group: Group, pipeline: Pipeline, library: str) -> dict[str, Any]:
@@ -239,7 +298,7 @@ def _solved(store: Store, group: Group, pipeline: Pipeline, library: str) -> dic
         return {"key": "", "drives": list(group.drives), "components": [], "apart": [], "reason": str(error)}
     for component in record["components"]:
         place = store.root / "joint" / component["folder"]
-        if _is_whole(place, component["drives"]):  # of a join that was killed; its name says that it is the same
+        if is_whole(place, component["drives"]):  # of a join that was killed; its name says that it is the same
             continue
         place.parent.mkdir(exist_ok=True)
         shutil.rmtree(place, ignore_errors=True)

@@ -71,7 +71,7 @@ class PairTask:
 def depends(pipeline: Pipeline) -> dict[str, Any]:
     """The settings and the code that the closures between two drives depend on, beside the drives."""
     settings = {name: getattr(pipeline, name).model_dump(mode="json") for name in ("propose", "sequence", "verify")}
-    settings["join"] = pipeline.join.model_dump(mode="json", exclude={"keep_features"})
+    settings["join"] = pipeline.join.model_dump(mode="json", exclude={"keep_features", "judged_anew", "grown_share"})
     return {"settings": settings, "code": code_of(*_CODE)["code"]}
 
 

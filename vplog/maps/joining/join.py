@@ -57,6 +57,8 @@ class _Work:
     pipeline: Pipeline
     execution: Execution
     executor: Executor | None
+    whole: bool
+    """Whether components that have grown are solved again as a whole."""
 
     @property
     def quiet(self) -> Execution:
@@ -77,6 +79,7 @@ def load_places(library: Path, pipeline: Pipeline, execution: Execution = Execut
 def join(
     store: Store, pipeline: Pipeline, execution: Execution = Execution(), executor: Executor | None = None,
     places: Callable[[], PlaceState] | None = None, urls: Mapping[str, str] = MappingProxyType({}),
+    *, whole: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Verify the pairs of drives that are new or changed, solve the groups that have them, and return the record.
     `urls` open the logs of drives given now: a map stores URLs without their queries.
@@ -96,7 +99,7 @@ def join(
             store.mirror.rest()
         drives = read_drives(store, urls)
         new = [at for at in range(len(drives.members)) if not _is_up_to_date(store, drives, at, pipeline)]
-        return _join(_Work(store, drives, new, pipeline, execution, executor), places)
+        return _join(_Work(store, drives, new, pipeline, execution, executor, whole), places)
 
     def attempt() -> dict[str, Any]:
         if store.mirror is not None:
@@ -111,13 +114,14 @@ def join(
     return attempt()
 
 
-def join_map(root: Path, execution: Execution = Execution()) -> dict[str, Any]:
-    """`join` of a map as it is, with the settings of its last batch. Raises VplogError."""
+def join_map(root: Path, execution: Execution = Execution(), *, whole: bool = False) -> dict[str, Any]:
+    """`join` of a map as it is, with the settings of its last batch; `whole`: joint graphs to which drives were added
+    are solved again as a whole. Raises VplogError."""
     with reading(root) as store:  # not a map: nothing is made
         head = store.head()
     pipeline = Pipeline.read(head.settings, f"{root}/map.json")
     with writing(root) as store:
-        return {"map": str(root), **join(store, pipeline, execution)}
+        return {"map": str(root), **join(store, pipeline, execution, whole=whole)}
 
 
 def _join(work: _Work, places: Callable[[], PlaceState] | None) -> dict[str, Any]:
@@ -128,20 +132,23 @@ def _join(work: _Work, places: Callable[[], PlaceState] | None) -> dict[str, Any
         computed, reasons = _verify(work, wanted)
         _record_pairs(work, wanted, reasons)
     with watch.stage("solve"), limited(work.execution.threads):
-        pair_ledgers = _current_ledgers(store, drives)
-        record = solve_groups(store, drives, pair_ledgers, pipeline, work.execution)
+        pair_ledgers = _current_ledgers(work)
+        record = solve_groups(store, drives, pair_ledgers, pipeline, work.execution, whole=work.whole)
     unjoined = [f"{later} and {earlier} were not verified. {reason}" for (later, earlier), reason in reasons.items()]
     for group in record["groups"]:
-        unjoined += [f"{', '.join(group['drives'])} cannot be solved. {group['reason']}"] if "reason" in group else []
+        if "reason" in group:
+            of_all = "" if group["components"] else f"{', '.join(group['drives'])} cannot be solved. "
+            unjoined.append(of_all + group["reason"])
         unjoined += [
             f"Closures of {one['query_drive']} to {one['match_drive']} were not enough to join them. {one['reason']}"
             for one in group["apart"]
         ]
-    cameras = [(member.drive, drive_pairs.known_camera(store, member, pipeline)) for member in drives.members]
+    searched = [drives.members[at] for at in work.new]
+    cameras = [(member.drive, drive_pairs.known_camera(store, member, pipeline)) for member in searched]
     if uncalibrated := [drive for drive, known in cameras if known is not None and known.camera["matrix"] is None]:
         unjoined.append(f"No camera calibration, so no metric closure joins these drives: {', '.join(uncalibrated)}.")
     return {
-        "searched": [drives.members[at].drive for at in work.new],
+        "searched": [member.drive for member in searched],
         "pairs": len(pair_ledgers),
         "pairs_computed": computed,
         "components": [component for group in record["groups"] for component in group["components"]],
@@ -182,14 +189,20 @@ def read_drives(store: Store, urls: Mapping[str, str]) -> Drives:
 
 
 def _is_up_to_date(store: Store, drives: Drives, at: int, pipeline: Pipeline) -> bool:
-    """Whether a drive need not be searched again: a drive that is gone has taken candidates that others might have."""
+    """Whether a drive need not be searched again: a drive that is gone has taken candidates that others might have. Of
+    many drives no ledger is read for that: of joint graphs that grow, one that is damaged is made again once it is."""
     member, joins = drives.members[at], drives.joins[at]
+    few = len(drives.members) <= pipeline.join.judged_anew
     return joins.made_from == drive_pairs.search_key(member, pipeline) and all(
         drives.counts(at, pair)
         and pair["ledger"]
-        and not damaged_table(drive_pairs.ledger_path(store, member.drive, pair["match"]))
+        and _is_there(drive_pairs.ledger_path(store, member.drive, pair["match"]), whole=few)
         for pair in joins.pairs
     )
+
+
+def _is_there(ledger: Path, *, whole: bool) -> bool:
+    return not damaged_table(ledger) if whole else ledger.is_file()
 
 
 def _search(work: _Work, places: Callable[[], PlaceState] | None) -> list[DrivePair]:
@@ -280,17 +293,18 @@ def _record_pairs(work: _Work, wanted: Sequence[DrivePair], reasons: dict[tuple[
         drive_pairs.put_joins(store, member.drive, drives.joins[at])
 
 
-def _current_ledgers(store: Store, drives: Drives) -> list[PairLedger]:
+def _current_ledgers(work: _Work) -> list[PairLedger]:
     """The pairs that count; the ledgers of others, as of drives that are gone, are removed."""
-    pair_ledgers = []
+    store, drives, new, pair_ledgers = work.store, work.drives, set(work.new), []
     for at, (member, joins) in enumerate(zip(drives.members, drives.joins, strict=True)):
         held = [pair for pair in joins.pairs if pair["ledger"] and drives.counts(at, pair)]
-        drive_pairs.remove_stale_ledgers(store, member.drive, {pair["match"] for pair in held})
+        if at in new:
+            drive_pairs.remove_stale_ledgers(store, member.drive, {pair["match"] for pair in held})
         for pair in held:
             path = drive_pairs.ledger_path(store, member.drive, pair["match"])
             if pair["candidates"]:
                 pair_ledgers.append(PairLedger(member.drive, pair["match"], path, pair["ledger"], pair["verified"]))
-    known = {folder_name(drive) for drive in [*store.drives(), *store.damaged]}
+    known = {folder_name(drive) for drive in [*drives.keys, *store.damaged]}
     for folder in store.root.glob("joins/drive=*"):
         if folder.name not in known:
             shutil.rmtree(folder, ignore_errors=True)

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Closures, Floats, Keyframes, Odometry, PoseGraph, Trajectory, Verdict
+from vplog.data import Closures, Floats, Ints, Keyframes, Odometry, PoseGraph, Trajectory, Verdict
 from vplog.graph import joint as graph_joint
 from vplog.graph.build import busier
 from vplog.graph.correct_trajectory import correct_trajectory
+from vplog.graph.refine import Refined, about_odometry
+from vplog.maps.storage.damage import reading_drive
 from vplog.results import tables
 from vplog.run.back_end import by_odometry
 
@@ -38,10 +40,10 @@ def solve_drives(
 ) -> tuple[graph_joint.Joined, dict[tuple[int, int], Closures]]:
     """The joint graphs of connected drives, and the ledgers with weights, residuals and verdicts of the solve. Raises
     GraphError where a graph cannot be solved."""
-    between = [_verified_closures(*pair, ledger) for pair, ledger in ledgers.items()]
+    between = [verified_closures(*pair, ledger) for pair, ledger in ledgers.items()]
     graphs = [drive.graph for drive in drives]
     joined = graph_joint.join(graphs, between, pipeline.solve, pipeline.join, pipeline.refine)
-    judged = map(_with_solve, ledgers.values(), joined.weight, joined.residual)
+    judged = map(with_solve, ledgers.values(), joined.weight, joined.residual)
     return joined, dict(zip(ledgers, judged, strict=True))
 
 
@@ -63,6 +65,20 @@ def own_drive(graph: PoseGraph, weight: Floats, closures: Closures) -> graph_joi
     return graph_joint.Drive(own, of_odometry[edges])
 
 
+def read_drive(name: str, run: Path) -> SolvedDrive:
+    """A drive by the tables of its run folder. Raises DamagedDriveError."""
+    with reading_drive(name):
+        keyframes, poses = tables.read_keyframes(run / "keyframes.parquet")
+        graph, weight, _ = tables.read_edges(run / "edges.parquet", poses)
+        own = own_drive(graph, weight, tables.read_closures(run / "closures.parquet"))
+
+    def read_odometry() -> Odometry:
+        with reading_drive(name):
+            return tables.read_trajectory(run / "trajectory.parquet")[1]
+
+    return SolvedDrive(keyframes, own, read_odometry)
+
+
 def pair_record(query_drive: str, match_drive: str, ledger: Closures) -> dict[str, Any]:
     """A pair of drives as run.json and component.json have it."""
     inliers = int(np.nansum(ledger.weight))
@@ -76,11 +92,20 @@ def pair_record(query_drive: str, match_drive: str, ledger: Closures) -> dict[st
     }
 
 
-def write_ledgers(path: Path, drives: Sequence[SolvedDrive], ledgers: Ledgers, header: tables.TableMetadata) -> None:
+def solution_record(drives: Sequence[str], joins: Sequence[dict[str, Any]], refined: Refined) -> dict[str, Any]:
+    """component.json of a solution."""
+    names = ("error_before", "error_after", "iterations", "converged", "reason")
+    return {
+        "drives": drives,
+        "joins": joins,
+        "solution": {name: getattr(refined.solution, name) for name in names},
+        "odometry": about_odometry(refined),
+    }
+
+
+def write_ledgers(path: Path, drives: Sequence[Keyframes], ledgers: Ledgers, header: tables.TableMetadata) -> None:
     """The table of the candidates of all pairs."""
-    rows = [
-        (drives[later].keyframes, drives[earlier].keyframes, ledger) for (later, earlier), ledger in ledgers.items()
-    ]
+    rows = [(drives[later], drives[earlier], ledger) for (later, earlier), ledger in ledgers.items()]
     tables.write_joins(path, rows, header)
 
 
@@ -95,8 +120,14 @@ def write_drive(
     return trajectory
 
 
-def _verified_closures(later: int, earlier: int, ledger: Closures) -> graph_joint.Between:
-    rows = np.flatnonzero(ledger.accepted)
+def verified(ledger: Closures) -> Ints:
+    """Rows of the closures that geometry has verified, whatever a solve has said of them since."""
+    return np.flatnonzero(ledger.accepted | np.isfinite(ledger.weight))
+
+
+def verified_closures(later: int, earlier: int, ledger: Closures) -> graph_joint.Between:
+    """The verified rows of a ledger for a joint graph."""
+    rows = verified(ledger)
     shared = busier(ledger.match[rows], ledger.query[rows])
     return graph_joint.Between(
         later,
@@ -109,11 +140,14 @@ def _verified_closures(later: int, earlier: int, ledger: Closures) -> graph_join
     )
 
 
-def _with_solve(ledger: Closures, weight: Floats, residual: Floats) -> Closures:
+def with_solve(ledger: Closures, weight: Floats, residual: Floats) -> Closures:
     """The ledger with weights and residuals (L,) of its verified rows from the joint solve."""
-    rows = np.flatnonzero(ledger.accepted)
+    rows = verified(ledger)
     weights, residuals, verdict = np.full(len(ledger), np.nan), np.full(len(ledger), np.nan), list(ledger.verdict)
     weights[rows], residuals[rows] = weight, residual
-    for row in rows[weight < 0.5].tolist():
-        verdict[row] = Verdict.REJECTED_BY_SOLVER
+    for row, one in zip(rows.tolist(), weight.tolist(), strict=True):
+        if one < 0.5:
+            verdict[row] = Verdict.REJECTED_BY_SOLVER
+        elif verdict[row] is Verdict.REJECTED_BY_SOLVER:  # of an earlier solve
+            verdict[row] = Verdict.ACCEPTED
     return replace(ledger, weight=weights, residual_after=residuals, verdict=verdict)

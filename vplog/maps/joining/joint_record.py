@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from vplog.errors import ResultError
-from vplog.maps.storage.damage import reading_drive
+from vplog.maps.storage.damage import damaged_table, reading_drive
 from vplog.maps.storage.layout import folder_name, write_changed
 from vplog.results import run_record, tables
 from vplog.storage.folders import is_below
@@ -19,19 +19,21 @@ if TYPE_CHECKING:
 
 
 class Component(NamedTuple):
-    """Drives that closures join."""
+    """Drives that closures join, as one of them is among them."""
 
     folder: Path
+    """Where the drive's poses are."""
     drives: Sequence[str]
-    """In the map's order; the frame is that of the first."""
+    """The frame is that of the first."""
 
 
 def read_joint(root: Path) -> dict[str, Any]:
     """joint.json as plain values; empty where nothing was joined yet. Raises ResultError where it is damaged.
 
     `groups` are the drives that verified closures join, each with the `components` that came of it (`folder` in
-    MAP/joint, `drives`) and the pairs kept `apart`; `alone` are the drives in no component, `apart` says of some why;
-    `keys` are those that the drives of components had in their drive.json.
+    MAP/joint, `drives`, and `grown`: the folders of those that came since the whole was solved) and the pairs kept
+    `apart`; `alone` are the drives in no component, `apart` says of some why; `keys` are those that the drives of
+    components had in their drive.json, `judged` those of what the closures of each drive were decided by.
     """
     path = root / "joint.json"
     if not path.is_file():
@@ -52,8 +54,25 @@ def read_joint(root: Path) -> dict[str, Any]:
 
 
 def _is_component(record: Any) -> bool:
-    drives = record.get("drives") if isinstance(record, dict) else None
-    return isinstance(drives, list) and is_below(record.get("folder")) and all(isinstance(one, str) for one in drives)
+    if not isinstance(record, dict):
+        return False
+    drives, grown = record.get("drives"), record.get("grown", {})
+    return (
+        isinstance(drives, list)
+        and all(isinstance(one, str) for one in drives)
+        and isinstance(grown, dict)
+        and all(map(is_below, (record.get("folder"), *grown.values())))
+    )
+
+
+def is_whole(component: Path, drives: Sequence[str]) -> bool:
+    """Whether the record and the tables of a component are there, as they were written."""
+    names = [f"{folder_name(drive)}/{table}" for drive in drives for table in ("keyframes", "trajectory")]
+    try:
+        run_record.read_run_json(component / "component.json")
+    except ResultError:
+        return False
+    return not any(damaged_table(component / f"{name}.parquet") for name in ("joins", *names))
 
 
 def components_in(store: Store) -> list[dict[str, Any]] | None:
@@ -67,8 +86,11 @@ def components_in(store: Store) -> list[dict[str, Any]] | None:
 
 def joint_components(store: Store) -> dict[str, Component]:
     """The component of each drive that is in one. Raises ResultError where their record is damaged."""
-    found = [Component(store.root / "joint" / one["folder"], one["drives"]) for one in components_in(store) or []]
-    return {drive: one for one in found for drive in one.drives}
+    joint, found = store.root / "joint", dict[str, Component]()
+    for one in components_in(store) or []:
+        grown = one.get("grown", {})
+        found |= {drive: Component(joint / grown.get(drive, one["folder"]), one["drives"]) for drive in one["drives"]}
+    return found
 
 
 def keyframe_poses(store: Store, joint: Mapping[str, Component], drive: str) -> Floats:

@@ -94,7 +94,7 @@ def run_joint(
             joined, ledgers = solve_drives([drive_run.solved for drive_run in drives], ledgers, pipeline)
         with watch.stage("write"):
             header = tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash)
-            write_ledgers(made / "joins.parquet", [drive_run.solved for drive_run in drives], ledgers, header)
+            write_ledgers(made / "joins.parquet", [one.solved.keyframes for one in drives], ledgers, header)
             _write_maps(made, drives, joined, header)
         record = {
             **head,

@@ -1,0 +1,268 @@
+"""Components of many drives: a new one is placed among them, and the whole is solved again as they grow.
+
+A component in joint.json then has, beside the folder of the last solve of the whole, the folders of drives that came or
+moved since, `grown`. Each holds the tables of its drives in the frame of the component, the ledgers by which they were
+placed, and no more. What is decided of a drive's closures stays while the drive, those that it met and the ledgers are
+what they were: its entry in `judged`.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vplog.errors import GraphError, ResultError
+from vplog.geometry import se3
+from vplog.graph.growth import Anchored, place, solve_again, turned_round
+from vplog.graph.joint import middle
+from vplog.maps.joining.joint_graph import (
+    SolvedDrive,
+    pair_record,
+    read_drive,
+    solution_record,
+    verified,
+    verified_closures,
+    with_solve,
+    write_drive,
+    write_ledgers,
+)
+from vplog.maps.joining.joint_record import is_whole
+from vplog.maps.storage.damage import reading_drive
+from vplog.maps.storage.layout import folder_name
+from vplog.results import run_record, tables
+from vplog.storage.json_records import key_of
+from vplog.storage.scratch import put_in_place
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from vplog.data import Closures, Floats, Keyframes
+    from vplog.graph.refine import Refined
+    from vplog.maps.storage.map_store import Store
+    from vplog.pipeline import Pipeline
+
+
+def _other(pair: tuple[str, str], drive: str) -> str:
+    return pair[pair[0] == drive]
+
+
+class LostPosesError(ResultError):
+    """The poses of a drive in its component cannot be read."""
+
+    def __init__(self, drive: str, why: str) -> None:
+        super().__init__(why)
+        self.drive = drive
+
+
+@dataclass
+class Part:
+    """A component as it grows."""
+
+    folders: dict[str, str]
+    """Folder in MAP/joint of each drive, the one whose frame it is first; empty for one that is alone, in its own."""
+    placed: set[str] = field(default_factory=set)
+    """Drives that came or moved since the whole was solved."""
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The component in joint.json."""
+        rest = [folder for drive, folder in self.folders.items() if drive not in self.placed]
+        grown = {drive: self.folders[drive] for drive in self.folders if drive in self.placed}
+        main = rest[0] if rest else next(iter(self.folders.values()))
+        return {"folder": main, "drives": list(self.folders), **({"grown": grown} if grown else {})}
+
+
+class Growth:
+    """The components of a group of drives, drive after drive."""
+
+    def __init__(
+        self, store: Store, pipeline: Pipeline, header: tables.TableMetadata, judged: Mapping[str, str],
+        known: Iterable[Mapping[str, Any]], stays: Sequence[str],
+        pairs: Mapping[tuple[str, str], Callable[[], Closures]],
+    ) -> None:  # fmt: skip
+        """`known` are components of joint.json, of whose drives those of `stays` are as they were; `judged` are keys of
+        all that a drive's closures are decided by, and `pairs` read the ledger of each pair as geometry has left it.
+        """
+        self._store, self._pipeline, self._header, self._judged, self._pairs = store, pipeline, header, judged, pairs
+        self.apart: dict[tuple[str, str], str] = {}
+        self.reasons: list[str] = []
+        self.failed: set[str] = set()
+        """Drives that are tried again."""
+        self._met: dict[str, list[tuple[str, str]]] = {}
+        for pair in pairs:
+            for one in pair:
+                self._met.setdefault(one, []).append(pair)
+        self._part: dict[str, Part] = {}
+        left = set(stays)
+        for one in known:
+            grown = one.get("grown", {})
+            there = {drive: grown.get(drive, one["folder"]) for drive in one["drives"] if drive in left}
+            part = Part(there, set(grown) & set(there))
+            self._part |= dict.fromkeys(there, part)
+            if there and len(there) < len(one["drives"]):  # what held the others together may be gone
+                self._solve(part)
+        self._part |= {drive: Part({drive: ""}) for drive in stays if drive not in self._part}
+
+    def parts(self) -> list[Part]:
+        """The components, of more than one drive."""
+        return [one for one in {id(part): part for part in self._part.values()}.values() if len(one.folders) > 1]
+
+    def records(self) -> list[dict[str, Any]]:
+        """The components as joint.json has them, in order of their first drives."""
+        return sorted((one.record for one in self.parts()), key=lambda one: one["drives"][0])
+
+    def add(self, drives: Iterable[str]) -> None:
+        """Place drives one after the other; what was alone is tried again when one that it has closures with is joined.
+        Raises ResultError and DamagedDriveError."""
+        waiting = dict.fromkeys(drives)
+        while waiting:
+            drive = next(iter(waiting))
+            del waiting[drive]
+            self._part[drive] = Part({drive: ""})
+            if self._placed(drive):
+                others = {one for pair in self._met[drive] for one in pair if one in self._part}
+                waiting |= dict.fromkeys(sorted(one for one in others if len(self._part[one].folders) == 1))
+
+    def _placed(self, drive: str) -> bool:
+        """Place a drive by its closures with those that are there, and put together what it joins."""
+        own, meets = self._drive(drive), dict[int, list[tuple[str, str]]]()
+        for pair in self._met[drive]:
+            if (part := self._part.get(_other(pair, drive))) is not None:
+                meets.setdefault(id(part), []).append(pair)
+        by_size = sorted(meets.values(), key=lambda pairs: -len(self._part[_other(pairs[0], drive)].folders))
+        home, moved, ledgers = Part({drive: ""}), dict[str, "Floats"](), dict[tuple[str, str], "Closures"]()
+        for met in by_size:
+            part, found = self._part[_other(met[0], drive)], {pair: self._pairs[pair]() for pair in met}
+            pairs = [pair for pair in met if len(verified(found[pair]))]
+            if not pairs:
+                continue
+            between = [verified_closures(1, 0, found[pair]) for pair in pairs]
+            between = [one if pair[0] == drive else turned_round(one) for pair, one in zip(pairs, between, strict=True)]
+            poses = [self._keyframes(_other(pair, drive))[1] for pair in pairs]
+            anchored = [Anchored(one, at[one.match]) for one, at in zip(between, poses, strict=True)]
+            try:
+                placed = place(own.graph, anchored, self._pipeline.solve, self._pipeline.join)
+            except GraphError as error:
+                self.reasons.append(f"{drive} cannot be placed. {error}")
+                self.failed.add(drive)
+                continue
+            self.apart |= {pairs[at]: reason for at, reason in placed.apart.items()}
+            if placed.world_from_body is None:
+                continue
+            for at, pair in enumerate(pairs):
+                ledgers[pair] = with_solve(found[pair], placed.weight[at], placed.residual[at])
+                if at not in placed.apart:
+                    self.apart.pop(pair, None)
+            if not moved:
+                home.folders, home.placed = {**part.folders, drive: ""}, set(part.placed)
+                moved = {one: self._keyframes(one)[1] for one, folder in part.folders.items() if not folder}
+                moved[drive] = placed.world_from_body
+            else:  # a component more comes along as it is
+                rows = np.concatenate([one.query[kept > 0.5] for one, kept in zip(between, placed.weight, strict=True)])
+                shift = middle(moved[drive][rows] @ se3.inverse(placed.world_from_body[rows]))
+                moved |= {one: shift @ self._keyframes(one)[1] for one in part.folders}
+                ledgers |= self._ledgers(part)
+                home.folders |= part.folders
+        if not moved:
+            return False
+        folder = self._write([self._judged[drive], home.folders, sorted(moved)], moved, {drive: own}, ledgers)
+        home.folders |= dict.fromkeys(moved, folder)
+        home.placed |= moved.keys()
+        self._part |= dict.fromkeys(home.folders, home)
+        if len(home.placed) > self._pipeline.join.grown_share * (len(home.folders) - len(home.placed)):
+            self._solve(home)
+        return True
+
+    def solve_all(self) -> None:
+        """Solve every component again that has grown."""
+        for part in self.parts():
+            if part.placed:
+                self._solve(part)
+
+    def _solve(self, part: Part) -> None:
+        """Solve a component as a whole; what no closures hold together any more is parted."""
+        names = list(part.folders)
+        number = {drive: at for at, drive in enumerate(names)}
+        own = [self._drive(drive) for drive in names]
+        poses = [self._keyframes(drive)[1] for drive in names]
+        graphs = [
+            replace(one.graph, graph=replace(one.graph.graph, world_from_body=at))
+            for one, at in zip(own, poses, strict=True)
+        ]
+        known = self._ledgers(part)
+        between = [verified_closures(number[later], number[earlier], one) for (later, earlier), one in known.items()]
+        weight = [np.nan_to_num(one.weight[verified(one)]) for one in known.values()]
+        try:
+            joined = solve_again(
+                graphs, between, weight, self._pipeline.solve, self._pipeline.join, self._pipeline.refine
+            )
+        except GraphError as error:  # it stays as it is
+            self.reasons.append(f"{len(names)} drives from {names[0]} on cannot be solved as a whole. {error}")
+            return
+        judged = dict(zip(known, map(with_solve, known.values(), joined.weight, joined.residual), strict=True))
+        made_from = [part.folders, [self._judged[drive] for drive in names]]
+        for members in joined.maps:
+            inside = [names[at] for at in members]
+            if len(members) == 1:
+                self._part |= {inside[0]: Part({inside[0]: ""})}
+                continue
+            solved = {names[at]: joined.world_from_body[at] for at in members}
+            ledgers = {pair: one for pair, one in judged.items() if solved.keys() >= set(pair)}
+            drives = {names[at]: own[at] for at in members}
+            folder = self._write([made_from, inside], solved, drives, ledgers, joined.solved[members])
+            self._part |= dict.fromkeys(inside, Part(dict.fromkeys(inside, folder)))
+
+    def _ledgers(self, part: Part) -> dict[tuple[str, str], Closures]:
+        """The verified closures of all pairs of a component, as they were decided; of pairs whose drives were not in
+        one component then, as rejected."""
+        found = dict[tuple[str, str], "Closures"]()
+        for folder in sorted({*part.folders.values()} - {""}):
+            found |= tables.read_joins(self._store.root / "joint" / folder / "joins.parquet")
+        pairs = [pair for pair in self._pairs if pair[0] in part.folders and pair[1] in part.folders]
+        known = {pair: found[pair] if pair in found else self._pairs[pair]() for pair in pairs}
+        return {pair: one.rows(rows) for pair, one in known.items() if len(rows := verified(one))}
+
+    def _write(
+        self, made_from: Any, poses: Mapping[str, Floats], known: Mapping[str, SolvedDrive],
+        ledgers: dict[tuple[str, str], Closures], refined: Refined | None = None,
+    ) -> str:  # fmt: skip
+        """Write a folder of MAP/joint for these drives, and return its name."""
+        name = f"component={key_of(made_from)[:16]}"
+        made, place = self._store.staging / "joint" / name, self._store.root / "joint" / name
+        if is_whole(place, list(poses)):  # of a join that was killed; its name says that it is the same
+            return name
+        shutil.rmtree(made, ignore_errors=True)
+        drives = {drive: known.get(drive) or self._drive(drive) for drive in poses}
+        for drive, one in drives.items():
+            (made / folder_name(drive)).mkdir(parents=True)
+            write_drive(made / folder_name(drive), "", one, poses[drive], self._header)
+        ends = {one: None for pair in ledgers for one in pair}
+        number = {drive: at for at, drive in enumerate(ends)}
+        numbered = {(number[later], number[earlier]): one for (later, earlier), one in ledgers.items()}
+        write_ledgers(made / "joins.parquet", [self._keyframes(one)[0] for one in ends], numbered, self._header)
+        record = {"drives": list(poses), "joins": [pair_record(*pair, one) for pair, one in ledgers.items()]}
+        if refined is not None:
+            record = solution_record(list(poses), [], refined)
+        run_record.write_run_json(made / "component.json", {**record, "made_from": key_of(made_from)})
+        place.parent.mkdir(exist_ok=True)
+        shutil.rmtree(place, ignore_errors=True)
+        put_in_place(made, place)
+        return name
+
+    def _drive(self, drive: str) -> SolvedDrive:
+        return read_drive(drive, self._store.run(drive))
+
+    def _keyframes(self, drive: str) -> tuple[Keyframes, Floats]:
+        """The keyframes of a drive, and their poses (N, 4, 4) in the frame of its component. Raises LostPosesError."""
+        folder = self._part[drive].folders[drive] if drive in self._part else ""
+        if not folder:
+            with reading_drive(drive):
+                return tables.read_keyframes(self._store.run(drive) / "keyframes.parquet")
+        try:
+            return tables.read_keyframes(self._store.root / "joint" / folder / folder_name(drive) / "keyframes.parquet")
+        except ResultError as error:
+            raise LostPosesError(drive, str(error)) from None
