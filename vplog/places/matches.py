@@ -133,7 +133,7 @@ class Matcher:
                 values, points = described(features, s)
                 if len(values):
                     found.append((kind, times, points, *kind.graph.search(values, s.neighbours)))
-        itself = max((_itself(distance, entry, kind.owner, L) for kind, *_, distance, entry in found), default=-1)
+        itself = max((_itself(distance, entry, kind.owner, L) for kind, _, _, distance, entry in found), default=-1)
         none = np.zeros((0, 2), np.float32)
         parts = [(np.zeros(0, np.int32), none, none, none[:, 0])]
         for kind, times, points, distance, entry in found:

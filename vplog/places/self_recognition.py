@@ -43,7 +43,7 @@ def neighbours(references: Sequence[Reference]) -> Bools:
     names = np.array([one.drive for one in references])
     for name in np.unique(names):
         rows = np.flatnonzero(names == name)
-        _, order = np.unique([references[row].stamp_ns for row in rows], return_inverse=True)
+        _, order = np.unique([references[row].stamp_ns for row in rows.tolist()], return_inverse=True)
         near[np.ix_(rows, rows)] = np.abs(order[:, None] - order) <= _NEAR
     np.fill_diagonal(near, False)
     return near
