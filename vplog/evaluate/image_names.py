@@ -22,11 +22,11 @@ def numbers_of(query: Sequence[str], match: Sequence[str]) -> tuple[Ints, Ints, 
     """(Q,) and (M,) numbers in the names of two sets: the last that no other of its set has, at one place from the end
     where both have one there; and whether folders are part of them, as where each counts its own images.
 
-    None where one has no such number, or its names are times.
+    None where one has no such number, or its names are times, or the sets share no folder by which they could meet.
     """
-    folders = sorted({str(PurePosixPath(name).parent) for name in (*query, *match)})
-    number = {folder: at for at, folder in enumerate(folders)}
-    for by_folder in (False, True):
+    of_query, of_match = ({str(PurePosixPath(name).parent) for name in names} for names in (query, match))
+    number = {folder: at for at, folder in enumerate(sorted(of_query | of_match))}
+    for by_folder in (False, True) if of_query & of_match else (False,):
         here, there = (_own_numbers(names, number if by_folder else {}) for names in (query, match))
         if here and there:
             both = min(here.keys() & there.keys(), default=None)

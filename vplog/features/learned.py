@@ -49,9 +49,6 @@ class OnnxFeatureSettings(NetworkSettings):
     max_features: int = Field(default=2000, ge=1)
     """Features kept of an image."""
 
-    coarse: ClassVar = None
-    """No faster version of it is known."""
-
     def __call__(self, image: Bytes, depth_m: Float32s | None = None) -> Features:
         """Features of a grey (H, W) uint8 image; `depth_m` (H, W) float32 m registered to it is read at the points.
 

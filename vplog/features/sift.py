@@ -82,11 +82,6 @@ class SiftSettings(Settings):
         )
 
     @property
-    def coarse(self) -> SiftSettings | None:
-        """The same without the smallest features, in a third of the time; None where these are left out already."""
-        return self.model_copy(update={"doubled": False}) if self.doubled else None
-
-    @property
     def least_features(self) -> int:
         """`min_features`, and no more than are wanted."""
         return min(self.min_features, self.max_features)

@@ -16,7 +16,6 @@ from vplog.errors import LogError, ResultError, SettingsError, TruthError
 from vplog.geometry import se3
 from vplog.geometry.geodesy import geodetic
 from vplog.geometry.tum import read_tum
-from vplog.maps.localization import localize as localize_module
 from vplog.results import run_record, tables
 
 if TYPE_CHECKING:
@@ -82,25 +81,6 @@ def test_pictures_are_where_they_were_taken(drive: Drive, run: Path) -> None:
         assert np.degrees(se3.angle(error[None]))[0] < 1.0
     assert (run / "landmarks.parquet").is_file()
     assert opened.localize(np.zeros_like(found[0][1]), camera).found.place < 0
-
-
-def test_only_what_has_no_pose_is_looked_at_with_its_smallest_features(
-    drive: Drive, run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    opened, (found, camera), doubled = vplog.open_run(run), frames(drive), list[bool]()
-    describe = localize_module.describe
-
-    def described(extractor: Any, frame: Any) -> Any:
-        doubled.append(extractor.doubled)
-        return describe(extractor, frame)
-
-    monkeypatch.setattr(localize_module, "describe", described)
-    image = found[0][1]
-    assert opened.localize(image, camera).localized
-    assert doubled == [False]
-    noise = np.random.default_rng(0).integers(0, 255, image.shape, np.uint8)
-    assert not opened.localize(noise, camera).localized
-    assert doubled == [False, False, True]
 
 
 def test_the_place_on_earth_is_that_of_the_run(drive: Drive, run: Path, tmp_path: Path) -> None:

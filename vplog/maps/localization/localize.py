@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,7 +103,8 @@ def localize_image(places: Places, image: Bytes | Path | str, camera: Camera | P
 
 
 def localize_frame(places: Places, frame: Frame, execution: Execution) -> LocalizedPicture:
-    return next(_localized(places, [_first_look(places, frame)], execution, TOP, {}))
+    picture = described(places.state, places.pipeline.features, frame, places.name)
+    return next(_localized(places, [picture], execution, TOP, {}))
 
 
 def _frame(image: Bytes | Path | str, camera: Camera | Path | str) -> Frame:
@@ -137,8 +137,6 @@ class Picture:
     features: Features | None
     descriptor: Any = None
     problem: str = ""
-    closer: Callable[[], Picture] | None = None
-    """Describes it again, with its smallest features; None where these are there already."""
 
 
 def _described(places: Places, frames: Iterator[EncodedFrame], execution: Execution) -> Iterator[Picture]:
@@ -146,20 +144,11 @@ def _described(places: Places, frames: Iterator[EncodedFrame], execution: Execut
 
     def work(encoded: EncodedFrame) -> Picture:
         try:
-            return _first_look(places, encoded.decode(colour))
+            return described(places.state, places.pipeline.features, encoded.decode(colour), places.name)
         except LogError as error:
             return Picture(encoded.stamp_ns, None, None, problem=str(error))
 
     return execution.map(work, frames, ahead=2)
-
-
-def _first_look(places: Places, frame: Frame) -> Picture:
-    """A picture without its smallest features, which take two thirds of the time and few pictures need."""
-    full = places.pipeline.features
-    if full.coarse is None:
-        return described(places.state, full, frame, places.name)
-    closer = partial(described, places.state, full, frame, places.name)
-    return replace(described(places.state, full.coarse, frame, places.name), closer=closer)
 
 
 def described(state: PlaceState, extractor: Extractor, frame: Frame, name: str) -> Picture:
@@ -175,22 +164,6 @@ def described(state: PlaceState, extractor: Extractor, frame: Frame, name: str) 
 
 
 def _localized(
-    places: Places, block: Sequence[Picture], execution: Execution, top: int, names: dict[int, str]
-) -> Iterator[LocalizedPicture]:
-    """The answers for some pictures; those without a pose are looked at once more with all their features."""
-    found = list(_answers(places, block, execution, top, names))
-    again = {
-        at: one.closer for at, one in enumerate(block)
-        if one.closer and not found[at].localized and found[at].found.verdict is not Verdict.NO_CALIBRATION
-    }  # fmt: skip
-    if again:
-        closer = list(execution.map(lambda describe: describe(), again.values()))
-        for at, one in zip(again, _answers(places, closer, execution, top, names), strict=True):
-            found[at] = one
-    return iter(found)
-
-
-def _answers(
     places: Places, block: Sequence[Picture], execution: Execution, top: int, names: dict[int, str]
 ) -> Iterator[LocalizedPicture]:
     sound = [one for one in block if one.features is not None]
