@@ -272,13 +272,13 @@ def test_a_closure_that_the_solver_rejects_has_no_weight(drive: Drive, finished:
 
 
 def test_a_library_of_another_drive_is_used_and_named(tiny: Drive, tmp_path: Path) -> None:
-    pipeline = load_pipeline("default", QUICK)
+    pipeline = load_pipeline("default", [*QUICK, "library.size=10"])
     state = build_library([tiny.log], tmp_path / "library", pipeline, execution=Execution(4))
     known = json.loads((tmp_path / "library" / "library.json").read_text())
-    assert known["references"] == 5
+    assert known["references"] == 10
     record = run(tiny.log, tmp_path / "run", pipeline, tmp_path / "library", execution=Execution(4)).record
     about = record["library"]
-    assert (about["hash"], about["from"], about["references"]) == (known["hash"], str(tmp_path / "library"), 5)
+    assert (about["hash"], about["from"], about["references"]) == (known["hash"], str(tmp_path / "library"), 10)
     assert about["coverage"]["explained"] > 0.5
     assert state.hash == known["hash"]
     assert not (tmp_path / "run" / "library").exists()
