@@ -37,15 +37,18 @@ def test_a_place_of_the_defaults_is_stored_in_120_bytes(references: list[Referen
     assert sum(len(leaf) * leaf.type.bit_width // 8 for leaf in leaves) == 120 * len(references)
 
 
-def test_a_reference_is_explained_by_itself_as_much_as_by_the_best_other(
-    learned: BobbState, references: list[Reference]
+@pytest.mark.parametrize(("own", "weight"), [(1.0, 255), (2.0, 180), (4.0, 128)])
+def test_a_reference_is_explained_by_itself_more_than_by_the_best_other(
+    own: float, weight: int, references: list[Reference]
 ) -> None:
+    """By the root of how much more."""
+    learned = BobbSettings(references=4, features=250, own=own).learn(references, Execution(2))
     places = [learned.describe(r.features) for r in references]
     windows = np.arange(9)
     for row, place in enumerate(places):
         assert place.references[0] == row
         assert place.weights[0] == 255
-        assert place.weights[1] in (0, 255)
+        assert place.weights[1] in (0, weight)
         column = place.boxes[0] % 9
         assert (column[windows % 3 == 0] < column[windows % 3 == 2]).all()  # its boxes lie as the windows do
     index = learned.index(places)
@@ -56,7 +59,7 @@ def test_a_reference_is_explained_by_itself_as_much_as_by_the_best_other(
 
 
 def test_without_its_own_image_others_explain_a_reference(references: list[Reference]) -> None:
-    learned = BobbSettings(references=4, features=250, own=False).learn(references, Execution(2))
+    learned = BobbSettings(references=4, features=250, own=0).learn(references, Execution(2))
     for row, r in enumerate(references):
         assert row not in learned.describe(r.features).references.tolist()
 

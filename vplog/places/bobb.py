@@ -56,9 +56,10 @@ class BobbSettings(WeighedMatchSettings, RelearnedSettings):
     share_power: float = Field(default=0.5, ge=0)
     """A reference's weight is its part in explaining the image to this power. With the root, places of equal boxes
     score the Bhattacharyya coefficient of what explains them; with 1 the first reference decides nearly alone."""
-    own: bool = True
-    """An image of the library is explained by itself, as much as by the best other reference; its boxes then lie where
-    the windows are. Off, it is explained by the others alone, and misses the one that a later visit has first."""
+    own: float = Field(default=2.0, ge=0)
+    """An image of the library is explained by itself this many times as much as by the best other reference, since no
+    other shows all of it; its boxes then lie where the windows are. With 0 it is explained by the others alone, and
+    misses the one that a later visit has first."""
     windows_along: int = Field(default=3, ge=1, le=16)
     """Windows along each side; I is their square."""
     window_share: float = Field(default=0.4, gt=0, le=1)
@@ -212,10 +213,10 @@ class BobbState(RecordState):
             here, there, agreed = self.agreed(matches, reference)
             explained = float(agreed.sum(dtype=np.float64) * rarity[reference])
             found.append((reference, explained, here, there, agreed))
+        if s.own > 0 and matches.itself >= 0:
+            best = max((explained for _, explained, *_ in found), default=1.0)
+            found.insert(0, (matches.itself, s.own * best, *self.agreed(matches, matches.itself)))
         found.sort(key=lambda one: -one[1])
-        if s.own and matches.itself >= 0:
-            best = found[0][1] if found else 1.0
-            found.insert(0, (matches.itself, best, *self.agreed(matches, matches.itself)))
         return [(reference, explained / found[0][1], *rest) for reference, explained, *rest in found[: s.references]]  # pyrefly: ignore[bad-return]
 
     def agreed(self, matches: Matches, reference: int) -> tuple[Float32s, Float32s, Float32s]:
