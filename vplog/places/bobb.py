@@ -135,12 +135,12 @@ class BobbSettings(WeighedMatchSettings, RelearnedSettings):
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """What counts how much, by a library's own images."""
+    """Weights of the kinds of matches and of the references, by a library's own images."""
 
     kinds: tuple[float, float]
-    """Of a keypoint's match and a patch's."""
+    """Weight of a match of keypoints, and of one of patches."""
     rarity: Floats
-    """(L,) of each reference."""
+    """(L,) weight of each reference."""
 
     @classmethod
     def of(cls, kinds: tuple[float, float], votes: Floats, popularity: float) -> Weights:
