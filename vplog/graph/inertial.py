@@ -227,7 +227,7 @@ class Solved(NamedTuple):
     log_scale: Floats
     """(K,)."""
     sigma: float
-    """Of the log of the scale, where it is least known."""
+    """Standard deviation of the log of the scale, where it is least known."""
     broken: Floats
     """(B, 6, 6) covariance of each motion across a break, in the IMU."""
 

@@ -31,8 +31,6 @@ _SIGNIFICANT = 0.05
 """Level of the test that patches mislead."""
 _STRONGEST = 200
 """Keypoints that count for a library's size: half of what describes a place, for half of the time."""
-
-
 NO_IMAGE = np.zeros((1, 1), np.uint8)
 """In place of a reference's image, where its features are all that counts."""
 

@@ -83,7 +83,7 @@ def own_images(
         most = len(keyframes.stamp_ns) // FRAMES_A_REFERENCE
 
         def reference(row: int) -> Reference:
-            return Reference(NO_IMAGE, features[row], keyframes.drive, int(keyframes.stamp_ns[row]))
+            return own_references(keyframes, features, [(row, NO_IMAGE)])[0]
 
         rows = choose(keyframes.stamp_ns, settings)
         if settings.size is None:
@@ -161,10 +161,11 @@ def library_of_logs(
     """
     settings = pipeline.library
     with staged(out, lambda: _library_in(out, None if force else opened)) as made:
-        wanted = _stamps_by_coverage if settings.choose == "coverage" else _shares
-        references = _extracted(opened, wanted(opened, pipeline, execution), pipeline, execution)
-        if settings.choose != "coverage" and settings.size is None:
-            _add_until_enough(references, opened, pipeline, execution)
+        by_coverage = settings.choose == "coverage"
+        stamps = _stamps_by_coverage(opened, pipeline, execution) if by_coverage else _shares(opened, pipeline)
+        references = _extracted(opened, stamps, pipeline, execution)
+        if not by_coverage and settings.size is None:
+            _add_until_enough(references, opened, stamps, pipeline, execution)
         for line in dict.fromkeys(line for log in opened for line in log.warnings):
             warn(line)
         state = pipeline.places.learn(references, execution)
@@ -212,11 +213,13 @@ def _extracted(
 
 
 def _add_until_enough(
-    references: list[Reference], opened: Sequence[Log], pipeline: Describing, execution: Execution
-) -> None:
-    """Add twice as many frames of each log as long as the references recognise each other too seldom."""
+    references: list[Reference], opened: Sequence[Log], first: Sequence[Ints], pipeline: Describing,
+    execution: Execution,
+) -> None:  # fmt: skip
+    """Add twice as many frames of each log to those with the `first` stamps, as long as the references recognise each
+    other too seldom."""
     stamps = [log.stamps() for log in opened]
-    rows = [np.flatnonzero(np.isin(one, chosen)) for one, chosen in zip(stamps, _shares(opened, pipeline), strict=True)]
+    rows = [np.flatnonzero(np.isin(one, chosen)) for one, chosen in zip(stamps, first, strict=True)]
     most = min(sum(map(len, stamps)) // FRAMES_A_REFERENCE, MOST)
     while (total := sum(map(len, rows))) < most and references and not suffices(references, execution):
         share = min(1.0, (most - total) / total)
@@ -231,7 +234,7 @@ def _add_until_enough(
         rows = [np.union1d(old, new) for old, new in zip(rows, added, strict=True)]
 
 
-def _shares(opened: Sequence[Log], pipeline: Describing, _: Execution | None = None) -> list[Ints]:
+def _shares(opened: Sequence[Log], pipeline: Describing) -> list[Ints]:
     """Stamps of an equal share of references for each log."""
     size, result = pipeline.library.size or PAPER_SIZE, []
     for number, log in enumerate(opened):

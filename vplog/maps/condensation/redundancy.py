@@ -33,7 +33,7 @@ class OwnQueries:
     """Whether places show that of a query."""
 
     def some(self, chosen: Bools) -> OwnQueries:
-        """Those of the (Q,) queries."""
+        """The queries that are `chosen` (Q,), as if there were no others."""
         rows: list[int] = np.flatnonzero(chosen).tolist()
         return OwnQueries(
             [self.best[row] for row in rows],

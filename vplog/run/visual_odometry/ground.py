@@ -45,13 +45,13 @@ class Below(NamedTuple):
     """Landmarks below the camera in one view."""
 
     row: int
-    """Of the frame in the odometry."""
+    """Row of the frame in the odometry."""
     points: Floats
     """(K, 3) below, ahead, left of the camera in the axes of the body, in units."""
 
 
 def below(row: int, points: Floats, camera: Camera) -> Below:
-    """Those of the landmarks (K, 3) in the camera that may be of the ground."""
+    """Landmarks of the ground, as far as their direction tells, among (K, 3) in the axes of the camera."""
     axes = camera.body_from_camera[[2, 0, 1], :3] * np.array([[-1.0], [1.0], [1.0]])
     found = points @ axes.T
     low = found[:, 0] > _DEPRESSION * np.linalg.norm(found, axis=1)

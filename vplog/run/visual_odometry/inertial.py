@@ -40,7 +40,7 @@ class Inertial(NamedTuple):
     scale: float
     """Metres of its unit, in the median; 1 where it had metres."""
     sigma: float
-    """Of the log of that, where it is least known; 0 where it had metres."""
+    """Standard deviation of the log of the scale, where it is least known; 0 where it had metres."""
     bridged: int
     """Breaks that it crosses."""
 
