@@ -336,8 +336,8 @@ def compare(
     chosen = None if truth is None else TruthChoice(os.fspath(truth), *bounds)
     with limited(threads), ExitStack() as stack:
         references = None if library is None else stack.enter_context(local_copy(located(library)))
-        place, parts, kept = None if out is None else located(out), _topics(topics), CacheChoice(cache, cache_gb)
-        options = CompareOptions(references, library_size, library_seed, min_gap, sequence, place, parts, kept)
+        place, parts, features = None if out is None else located(out), _topics(topics), CacheChoice(cache, cache_gb)
+        options = CompareOptions(references, library_size, library_seed, min_gap, sequence, place, parts, features)
         names = split_methods(methods) if isinstance(methods, str) else methods
         drives = located(query), None if map is None else located(map)
         settled = _pipeline(pipeline, settings)

@@ -150,8 +150,8 @@ def _flush() -> None:
 
 def _interrupted(arguments: argparse.Namespace, error: BaseException) -> NoReturn:
     again = f". Go on with: vplog run --resume -o {shlex.quote(str(arguments.shown))}"
-    kept = f"finished results in the output folder are kept{again if getattr(arguments, 'resume', False) else ''}"
-    known = getattr(error, "__notes__", [kept])
+    default = f"finished results in the output folder are kept{again if getattr(arguments, 'resume', False) else ''}"
+    known = getattr(error, "__notes__", [default])
     print_status(without_secrets(f"interrupted; {known[-1]}", arguments.command))
     sys.exit(128 + (_ended.pop() if _ended else signal.SIGINT))
 
@@ -317,10 +317,10 @@ def _parser() -> argparse.ArgumentParser:
     root = Parser(prog="vplog", description=about)
     root.add_argument("-V", "--version", action="version", version=f"vplog {__version__}")
     common = argparse.ArgumentParser(add_help=False)
-    said = common.add_argument_group("output and errors")
-    flag(said, "--json", "print one JSON object")
-    flag(said, "--debug", "show the traceback of an error")
-    option(said, "--events", parser.output_file, "FILE", "write progress as JSON lines, each as it happens")
+    output_group = common.add_argument_group("output and errors")
+    flag(output_group, "--json", "print one JSON object")
+    flag(output_group, "--debug", "show the traceback of an error")
+    option(output_group, "--events", parser.output_file, "FILE", "write progress as JSON lines, each as it happens")
     topics = parser.topic_options()
     threads = argparse.ArgumentParser(add_help=False)
     work = threads.add_argument_group("execution")

@@ -505,10 +505,11 @@ def print_condensed(found: dict[str, Any]) -> None:
     ]  # fmt: skip
     print_table(("drive", "places", "kept", "faded", "kB", "kept kB"), rows)
     warn(found["warnings"])
-    asked, recall, places, size = found["queries"], found["recall"], found["places"], found["descriptor_bytes"]
+    queries, recall, places, size = found["queries"], found["recall"], found["places"], found["descriptor_bytes"]
     print(
-        f"own queries  {asked['places']}: {asked['by_other_drives']} answered by other drives, "
-        f"{asked['by_own_drive']} by their own, {asked['alone']} by no other place, within {found['distance_m']:g} m"
+        f"own queries  {queries['places']}: {queries['by_other_drives']} answered by other drives, "
+        f"{queries['by_own_drive']} by their own, {queries['alone']} by no other place, "
+        f"within {found['distance_m']:g} m"
     )
     after = f"{recall['after']:.4f} after, by queries that did not choose what goes"
     print(f"recall       {recall['before']:.4f} before, {after}; {found['loss']:g} may be lost")

@@ -106,9 +106,9 @@ def solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps
 
 
 def _apart(broken: Ints, keyframes: Keyframes, graph: PoseGraph, solution: Solution) -> list[str]:
-    """A warning of the breaks of the odometry (edges) that no closure kept spans."""
-    kept = ~graph.odometry & (solution.weight > 0.5)
-    begin, end = (np.sort(rows[kept]) for rows in (graph.a, graph.b))
+    """A warning of the breaks of the odometry (edges) that no accepted closure spans."""
+    accepted = ~graph.odometry & (solution.weight > 0.5)
+    begin, end = (np.sort(rows[accepted]) for rows in (graph.a, graph.b))
     open_ = begin.searchsorted(broken, "right") == end.searchsorted(broken, "right")  # as many ended as had begun
     if not open_.any():
         return []

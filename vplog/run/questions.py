@@ -40,8 +40,8 @@ def ask_ledger(
     odometry = np.zeros(len(weight) - len(rows))
     log_odds = np.concatenate([odometry, log_odds_false(closures)[rows]])
     found = questions(graph, weight, log_odds, np.concatenate([odometry > 0, decided[rows]]))
-    asked = [rows[one.edges - len(odometry)] for one in found]
-    order = [about[np.argsort(-closures.inliers[about], kind="stable")].tolist() for about in asked]
+    row_sets = [rows[one.edges - len(odometry)] for one in found]
+    order = [about[np.argsort(-closures.inliers[about], kind="stable")].tolist() for about in row_sets]
     return [Question(about, one.p_wrong, one.moved_m) for about, one in zip(order, found, strict=True)]
 
 

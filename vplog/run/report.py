@@ -132,8 +132,8 @@ def _thumbnails(folder: Path, content: Content) -> dict[int, bytes]:
     """Small JPEGs of at most `_MOST_THUMBNAILS` keyframes of closures: those asked about, false ones, those in the
     solution, then the nearest misses, by inliers; empty where result.mcap has no pictures."""
     closures = content.closures
-    asked = np.isin(np.arange(len(closures)), [row for one in content.questions for row in one.rows])
-    nearest = np.lexsort((-closures.inliers, ~closures.of(*USED), ~false_closures(content), ~asked))
+    in_question = np.isin(np.arange(len(closures)), [row for one in content.questions for row in one.rows])
+    nearest = np.lexsort((-closures.inliers, ~closures.of(*USED), ~false_closures(content), ~in_question))
     ends = np.stack([closures.query[nearest], closures.match[nearest]], 1).ravel().tolist()
     wanted = set(list(dict.fromkeys(ends))[:_MOST_THUMBNAILS])
     row_at = {stamp: row for row, stamp in enumerate(content.tracks.keyframes.stamp_ns.tolist()) if row in wanted}

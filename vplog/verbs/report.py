@@ -78,8 +78,8 @@ def judge(
     error_m = np.full(len(keyframes.stamp_ns), np.nan)
     error_m[at.known] = np.linalg.norm(se3.transform(world_from_truth, units * true) - solved, axis=1) / units
     closures = tables.read_closures(folder / "closures.parquet")
-    seen = se3.between(at.world_from_body[closures.match], at.world_from_body[closures.query])
-    apart_m = np.linalg.norm((seen - se3.stretched(closures.match_from_query, 1.0 / units))[:, :3, 3], axis=1)
+    expected = se3.between(at.world_from_body[closures.match], at.world_from_body[closures.query])
+    apart_m = np.linalg.norm((expected - se3.stretched(closures.match_from_query, 1.0 / units))[:, :3, 3], axis=1)
     return TruthComparison(
         Path(shown(truth)).name,
         found.record,

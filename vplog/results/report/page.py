@@ -335,8 +335,8 @@ def _map(content: Content) -> tuple[list[tuple[str, str]], dict[str, Any]]:
         for kind, _, points in paths
     ]
     error = None if judged is None or judged.error_m is None else _rounded(judged.error_m, 3)
-    seen = np.round(position @ view.T, 3).tolist()
-    return legend, {"axes": axes, "paths": flat, "keyframes": seen, "error_m": error}
+    viewed = np.round(position @ view.T, 3).tolist()
+    return legend, {"axes": axes, "paths": flat, "keyframes": viewed, "error_m": error}
 
 
 def _truth(judged: TruthComparison) -> list[list[str]]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy import sparse
 
+from vplog.data import SCALE_WANDER
 from vplog.run.visual_odometry.metres import scaled
 
 if TYPE_CHECKING:
@@ -34,8 +35,6 @@ _TUNING = 3.0
 _FINEST = 0.01
 """Least relative deviation that is told from zero."""
 _ROUNDS = 40
-_WANDER = 0.01
-"""Standard deviation of the log of the scale after a unit, growing as the root of the way."""
 _ACROSS = 1.0
 """That across a break."""
 _HUBER = 2.0
@@ -98,7 +97,7 @@ def _heights(views: list[Below]) -> tuple[Floats, float]:
 def _smoothed(odometry: Odometry, rows: Ints, measured: Floats, spread: float) -> tuple[Floats, float]:
     """(V,) logs of a scale that wanders slowly, by those measured, and the deviation of these from it."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(odometry.odom_from_body[:, :3, 3], axis=0), axis=1))])
-    sigma = _WANDER * np.sqrt(np.diff(way[rows]) + 1e-6)
+    sigma = SCALE_WANDER * np.sqrt(np.diff(way[rows]) + 1e-6)
     if odometry.breaks is not None:
         pieces = np.searchsorted(odometry.breaks, rows, "right")
         sigma[np.diff(pieces) > 0] = _ACROSS

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy import sparse
 
-from vplog.data import RECEIVER_SIGMA_M
+from vplog.data import RECEIVER_SIGMA_M, SCALE_WANDER
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
 
@@ -20,9 +20,6 @@ _APART = 10.0
 """Sigmas of a fix between two that are compared: their distance then is known to a seventh."""
 _REACH = (1, 2, 4, 8)
 """Numbers of such steps over which distances are compared."""
-_WANDER = 0.01
-"""Standard deviation of the log of the scale after a metre, growing as the root of the way: 10 % in 100 m, as a single
-camera's wanders in bends."""
 _TUNING = 2.0
 """Sigmas beyond which a distance counts less (Huber)."""
 _ROUNDS = 15
@@ -117,7 +114,7 @@ def _log_scale(way: _Way, sigma_m: float) -> Floats | None:
     column = np.concatenate([np.arange(a, b) for a, b in pairs.tolist()])
     metres = np.linalg.norm(np.diff(way.enu_m, axis=0), axis=1)
     smooth = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(count - 1, count)).tocsr()
-    smooth = sparse.diags_array(1.0 / (_WANDER * np.sqrt((metres[1:] + metres[:-1]) / 2.0))) @ smooth
+    smooth = sparse.diags_array(1.0 / (SCALE_WANDER * np.sqrt((metres[1:] + metres[:-1]) / 2.0))) @ smooth
     sigma = np.sqrt(2.0) * sigma_m / length
     for _ in range(_ROUNDS):
         moved = np.exp(x)[:, None] * steps

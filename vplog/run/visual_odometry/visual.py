@@ -96,7 +96,7 @@ class _Tracker:
 
     sensor: Sensor
     height_m: float | None = None
-    """Of the camera over the ground, where it gives a camera without depth its metres."""
+    """Height of the camera over the ground, where it gives a camera without depth its metres."""
     below: list[Below] = field(default_factory=list)
     """Landmarks below the camera in each view, where its height is known."""
     stamp_ns: list[int] = field(default_factory=list)
