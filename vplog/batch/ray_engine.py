@@ -13,7 +13,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future, InvalidStateErr
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from vplog.batch.ray_cluster import Head, connected, watched_head
 from vplog.batch.worker import Outcome, Task, compute_drive, made_by
@@ -22,13 +22,10 @@ from vplog.results import run_record
 from vplog.run.feature_extraction import Part, compute_part, missing_parts, parts_of, put_part
 from vplog.run.provenance import library_of
 from vplog.storage.remote_path import located
-from vplog.storage.scratch import files_in, packed, pieces, scratch, unpacked, write_pieces
+from vplog.storage.scratch import Bytes, files_in, packed, pieces, scratch, unpacked, write_pieces
 from vplog.version import __version__
 
-if TYPE_CHECKING:
-    from vplog.storage.scratch import Bytes
-
-    Files = tuple[tuple[str, tuple[Any, ...]], ...]
+Files = tuple[tuple[str, tuple[Any, ...]], ...]
 
 _OTHER = "{} has another vplog, or other packages, than the machine of the batch. Install the same there."
 _PROBE_S = 60.0

@@ -8,10 +8,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog import logs
 from vplog.batch.batch import run_batch, write_failures
+from vplog.batch.engine import BatchOptions
 from vplog.batch.plan import DriveInput
 from vplog.batch.worker import Drive
 from vplog.errors import LogError, SettingsError
@@ -22,6 +23,7 @@ from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import skip_damaged
 from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.layout import ABOUT
+from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline
 from vplog.places.library_files import read_library_record
 from vplog.results import run_record
@@ -29,10 +31,6 @@ from vplog.run.provenance import stored_log
 from vplog.run.reference_library import build_library
 from vplog.storage.remote_path import local_copy
 from vplog.storage.scratch import scratch
-
-if TYPE_CHECKING:
-    from vplog.batch.engine import BatchOptions
-    from vplog.maps.storage.map_store import Store
 
 
 def redescribe_map(

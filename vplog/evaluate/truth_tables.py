@@ -6,16 +6,14 @@ import csv
 import pickletools
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from vplog.data import Ints
 from vplog.errors import TruthError, VplogError, nearest_path
 from vplog.evaluate.image_names import row_finder
-
-if TYPE_CHECKING:
-    from vplog.stages import Log
+from vplog.stages import Log
 
 _LINE_LIMIT = 4096
 """Characters: two paths; a file without line ends is not read whole."""

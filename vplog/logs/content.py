@@ -4,24 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import compress
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Floats, Gps, Ints, Odometry, OdometrySource
 from vplog.errors import LogError, plural
 from vplog.logs.continuity import without_jumps
-from vplog.logs.formats.container import Notes
+from vplog.logs.formats.container import Channel, Container, Contents, Notes, Place
 from vplog.logs.gather import TopicCollector
+from vplog.logs.messages.records import CalibrationMessage
 from vplog.logs.odometry_sources import choose_odometry, other_sources, rank_sources, read_sources
 from vplog.logs.recorder_clock import correct_clock_steps
 from vplog.logs.stamps import nearest, set_common_clock
 from vplog.logs.tf_odometry import FrameTree
-
-if TYPE_CHECKING:
-    from vplog.data import Floats, Gps, Ints, Odometry, OdometrySource
-    from vplog.logs.formats.container import Channel, Container, Contents, Place
-    from vplog.logs.messages.records import CalibrationMessage
-    from vplog.logs.topic_selection import Selection
+from vplog.logs.topic_selection import Selection
 
 
 @dataclass(frozen=True)

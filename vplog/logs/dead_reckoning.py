@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 
-from vplog.data import RECEIVER_SIGMA_M, Odometry
+from vplog.data import RECEIVER_SIGMA_M, Floats, Gps, Ints, Odometry
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
-
-if TYPE_CHECKING:
-    from vplog.data import Floats, Gps, Ints
 
 _LONGEST_S = 1.0
 """s; over a longer gap the last velocity is not held, as of a recorder that was paused."""

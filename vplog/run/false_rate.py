@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,10 +13,12 @@ from vplog.cache.steps import step
 from vplog.data import Bools, Closures, Ints, Keyframes, Odometry, Verdict
 from vplog.evaluate.body_truth import TruthAt
 from vplog.evaluate.closure_pose import pose_bounds, pose_errors
+from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.graph.build import build_graph
 from vplog.graph.consistency import OdometryChain
 from vplog.graph.noise import NoiseSettings, broken_edges, edge_covariance
+from vplog.loops.candidate import Drive
 from vplog.loops.false_rate import (
     MOST_APART,
     FalseRateSettings,
@@ -31,10 +32,6 @@ from vplog.loops.false_rate import (
 from vplog.loops.propose import Proposals, ProposeSettings, candidate_stops
 from vplog.loops.verify import verify_between
 from vplog.run.verification import DriveFeatures, for_verification
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
-    from vplog.loops.candidate import Drive
 
 _log = logging.getLogger(__name__)
 _FAR_M = 1e6

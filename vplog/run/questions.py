@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import EdgeKind, Verdict
+from vplog.data import Closures, EdgeKind, Floats, Ints, PoseGraph, Verdict
 from vplog.errors import ResultError
 from vplog.graph.build import busier, checked
 from vplog.graph.hypotheses import bounded
 from vplog.graph.questions import questions
 from vplog.loops.false_rate import log_odds_false
 from vplog.results.report.page import Question
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from vplog.data import Closures, Floats, Ints, PoseGraph
 
 
 def ask_ledger(

@@ -4,29 +4,33 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from vplog.data import USED, Trajectory
+from vplog.data import USED, Ints, Trajectory
 from vplog.errors import GraphError, ResultError
 from vplog.geometry import se3
 from vplog.graph.joint import spaced_apart
 from vplog.results import mcap_read, tables
 from vplog.results.html import mapping
 from vplog.results.previews import thumbnail
-from vplog.results.report.page import Content, Pictures, Tracks, false_closures, page
+from vplog.results.report.page import (
+    Changes,
+    Content,
+    Pictures,
+    Question,
+    Tracks,
+    TruthComparison,
+    false_closures,
+    page,
+)
 from vplog.run.figures.run_figures import earth_of
 from vplog.run.questions import ask_ledger
 from vplog.storage.image_file import decode_image
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vplog.data import Ints
-    from vplog.results.report.page import Changes, Question, TruthComparison
 
 _log = logging.getLogger(__name__)
 

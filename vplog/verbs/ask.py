@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import shlex
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from vplog.data import Verdict
+from vplog.data import Closures, Keyframes, Verdict
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.collage import FramePanel, collage
 from vplog.results.previews import jpeg
+from vplog.results.report.page import Question
 from vplog.run.decisions import decided_lines, write_decisions
 from vplog.run.questions import ask_ledger
 from vplog.storage.image_file import decode_image
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from vplog.data import Closures, Keyframes
-    from vplog.results.report.page import Question
 
 _QUALITY = 80
 """JPEG quality."""

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vplog import logs
-from vplog.data import Closures, Keyframes
+from vplog.data import Bytes, Camera, Closures, Features, Keyframes
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
-from vplog.pipeline import recorded_pipeline
+from vplog.pipeline import Pipeline, recorded_pipeline
 from vplog.results import run_record, tables
 from vplog.run.figures.closure_view import SharedBoxes, find_agreement, find_boxes
 from vplog.run.keyframes import row_of
@@ -22,10 +22,6 @@ from vplog.stages import BoxState, Log
 from vplog.verbs import explain_text
 from vplog.verbs.explain_figure import View, draw
 from vplog.verbs.report import frames_at, recorded_places
-
-if TYPE_CHECKING:
-    from vplog.data import Bytes, Camera, Features
-    from vplog.pipeline import Pipeline
 
 
 def explain(

@@ -8,18 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog.benchmark.feature_cache import CacheChoice
 from vplog.benchmark.recogniser_specs import read_method
 from vplog.benchmark.study.evaluation_store import LESS_IS_BETTER, SCORES, Bench, Evaluation, Library
 from vplog.errors import SettingsError
+from vplog.logs import TopicChoice
 from vplog.places.reference_choice import PAPER_SIZE
 
-if TYPE_CHECKING:
-    from vplog.logs import TopicChoice
-
-    Row = dict[str, Any]
+Row = dict[str, Any]
 
 METHODS = ("bobb", "bobb_paper", "bovf", "fabmap", "vlad", "gist", "thumbnail")
 """Compared where the user names none."""

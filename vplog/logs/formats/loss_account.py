@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Ints
 from vplog.errors import plural
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
-
-    from vplog.data import Ints
 
 Span = tuple[int, int]
 """First and last ns of something, both included."""

@@ -13,10 +13,11 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from vplog.data import Bools
 from vplog.errors import SettingsError
 from vplog.execution.execution import Execution
 from vplog.maps.condensation.own_queries import OwnAnswers, OwnPlaces, query_own_places, read_own_places, search_of
@@ -26,17 +27,13 @@ from vplog.maps.merge import copy_library, put_library
 from vplog.maps.search.query import open_map
 from vplog.maps.storage import layout, map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
+from vplog.maps.storage.map_store import Store
 from vplog.places.library_files import ReferencesState
 from vplog.results import run_record, tables
 from vplog.run.provenance import library_of
-from vplog.stages import CodedState, FrameState
+from vplog.stages import CodedState, FrameState, PlaceState
 from vplog.storage.folders import regular_files
 from vplog.storage.scratch import copy_folder
-
-if TYPE_CHECKING:
-    from vplog.data import Bools
-    from vplog.maps.storage.map_store import Store
-    from vplog.stages import PlaceState
 
 LOSS = 0.01
 """Loss of recall at rank one of the map's own queries."""

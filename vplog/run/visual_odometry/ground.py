@@ -8,16 +8,13 @@ say how such heights hold a monocular scale).
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
-from vplog.data import SCALE_WANDER
+from vplog.data import SCALE_WANDER, Camera, Floats, Ints, Odometry
 from vplog.run.visual_odometry.metres import scaled
-
-if TYPE_CHECKING:
-    from vplog.data import Camera, Floats, Ints, Odometry
 
 _DEPRESSION = np.sin(np.radians(4.0))
 """Sine of the angle below the horizon: what is farther is low by a small error of the pitch alone."""

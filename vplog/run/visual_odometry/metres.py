@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
-from vplog.data import RECEIVER_SIGMA_M, SCALE_WANDER
+from vplog.data import RECEIVER_SIGMA_M, SCALE_WANDER, Camera, Floats, Gps, Ints, Odometry
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
-
-if TYPE_CHECKING:
-    from vplog.data import Camera, Floats, Gps, Ints, Odometry
 
 _APART = 10.0
 """Sigmas of a fix between two that are compared: their distance then is known to a seventh."""

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
+from vplog.data import Float32s, Floats, Frame
 from vplog.features.extraction import describe
 from vplog.features.matching import MatchSettings, match_features
 from vplog.features.sift import SiftSettings
@@ -16,11 +16,7 @@ from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.loops.pose_refinement import Matches
 from vplog.loops.verify_metric import MetricSettings, find_pose, log10_false_alarms, refit
-from vplog.run.visual_odometry.sensor import follow
-
-if TYPE_CHECKING:
-    from vplog.data import Float32s, Floats, Frame
-    from vplog.run.visual_odometry.sensor import Points, Sensor
+from vplog.run.visual_odometry.sensor import Points, Sensor, follow
 
 _CORNERS = 300
 """Points of a frame: RTAB-Map's and VINS' 150 to 1000; more cost time, and hardly sharpen a pose."""

@@ -10,26 +10,18 @@ of the window make its depth sure.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import Odometry
+from vplog.data import Camera, Float32s, Floats, Frame, Odometry
 from vplog.geometry import se3
 from vplog.graph.bundle import Observations, adjust
-from vplog.run.visual_odometry.ground import below, by_height
-from vplog.run.visual_odometry.sensor import Sensor, follow
-from vplog.run.visual_odometry.tracking import Reference, cloud, corners, solve, track
+from vplog.run.visual_odometry.ground import Below, below, by_height
+from vplog.run.visual_odometry.sensor import Points, Sensor, follow
+from vplog.run.visual_odometry.tracking import Motion, Reference, cloud, corners, solve, track
 from vplog.run.visual_odometry.two_views import CERTAINTY, rho_of, rho_variance, two_views
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from vplog.data import Camera, Float32s, Floats, Frame
-    from vplog.run.visual_odometry.ground import Below
-    from vplog.run.visual_odometry.sensor import Points
-    from vplog.run.visual_odometry.tracking import Motion
 
 _WINDOW = 8
 """References that are adjusted together: as libviso's and VINS' 5 to 10; what is older hardly shares a landmark."""
