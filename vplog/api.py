@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from vplog.batch.worker import Drive
+    from vplog.batch.worker import DriveState
     from vplog.benchmark.compare import Comparison
     from vplog.data import Camera
     from vplog.logs import TopicChoice
@@ -364,7 +364,7 @@ def batch(
     dry_run: bool = False,
     cost_per_cpu_hour: float | None = None,
     progress: Progress = silent,
-    on_drive: Callable[[Drive], None] = lambda _: None,
+    on_drive: Callable[[DriveState], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Compute many drives into one growing map, each log in a process of its own, here or on a Ray cluster.
 

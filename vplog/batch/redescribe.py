@@ -14,7 +14,7 @@ from vplog import logs
 from vplog.batch.batch import run_batch, write_failures
 from vplog.batch.engine import BatchOptions
 from vplog.batch.plan import DriveInput
-from vplog.batch.worker import Drive
+from vplog.batch.worker import DriveState
 from vplog.errors import LogError, SettingsError
 from vplog.execution.execution import Execution
 from vplog.maps.import_places import PLACES_ONLY
@@ -47,7 +47,7 @@ def redescribe_map(
     with map_store.reading(root) as store:
         head = store.head()
         drives, topics = skip_damaged(store, lambda: _drives_of(store))
-        damaged = {drive: Drive(drive, "", "failed", error=why) for drive, why in store.damaged.items()}
+        damaged = {drive: DriveState(drive, "", "failed", error=why) for drive, why in store.damaged.items()}
         _bring_caches(store.root, target)
     outcomes, missing, joined, join_error = [], damaged, None, ""
     inputs = dict[str, DriveInput]()
@@ -62,7 +62,7 @@ def redescribe_map(
                 log, "Its log", f"Put it back, and give the same command again, or add it: vplog batch LOG -o {target}"
             )
         except LogError as error:
-            missing[drive] = Drive(drive, log, "failed", error=str(error))
+            missing[drive] = DriveState(drive, log, "failed", error=str(error))
         else:
             choice = logs.TopicChoice.read(topics[drive] or {}, f"{root}: {drive}/run.json")
             about = {name: drives[drive][name] for name in ABOUT[1:] if name in drives[drive]}

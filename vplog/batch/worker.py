@@ -88,7 +88,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Drive:
+class DriveState:
     """State of one log in a batch; `seconds` to `warnings` as in the Outcome of the last attempt."""
 
     drive: str
@@ -107,7 +107,7 @@ class Drive:
     warnings: Sequence[str] = ()
 
     @classmethod
-    def after(cls, task: Task, state: str, attempts: int, outcome: Outcome) -> Drive:
+    def after(cls, task: Task, state: str, attempts: int, outcome: Outcome) -> DriveState:
         """The drive of a task with this outcome of an attempt."""
         names = (one.name for one in fields(cls)[4:])
         return cls(task.drive, shown(task.log), state, attempts, **{name: getattr(outcome, name) for name in names})

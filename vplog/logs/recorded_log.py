@@ -15,9 +15,9 @@ from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.calibration_file import SidecarFiles
 from vplog.logs.cameras import BODY, body_from_camera, camera_of
-from vplog.logs.content import Content, read_content
+from vplog.logs.content import LogContent, read_content
 from vplog.logs.formats.container import Channel, Container, Contents, Notes
-from vplog.logs.formats.loss_account import Loss
+from vplog.logs.formats.loss_account import TopicLoss
 from vplog.logs.formats.ros2_folder import messages_unpacked
 from vplog.logs.frames import ImageReader, RecordedFrame, size_of
 from vplog.logs.masks import masks_of
@@ -63,7 +63,7 @@ class RecordedLog:
         return self._notes.lines
 
     @property
-    def losses(self) -> list[Loss]:
+    def losses(self) -> list[TopicLoss]:
         """Losses counted so far; complete once the log was read."""
         return self.account.losses
 
@@ -254,7 +254,7 @@ class RecordedLog:
         return ImageReader(self._container, image, known.codec if known else "", content, self._notes)
 
     @property
-    def _content(self) -> Content:
+    def _content(self) -> LogContent:
         return self._images.content
 
     def camera(self) -> Camera:

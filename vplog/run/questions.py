@@ -13,12 +13,12 @@ from vplog.graph.build import busier, checked
 from vplog.graph.hypotheses import bounded
 from vplog.graph.questions import questions
 from vplog.loops.false_rate import log_odds_false
-from vplog.results.report.page import Question
+from vplog.results.report.page import ClosureQuestion
 
 
 def ask_ledger(
     graph: PoseGraph, weight: Floats, closures: Closures, answers: Mapping[int, bool] | None = None
-) -> list[Question]:
+) -> list[ClosureQuestion]:
     """All questions about a ledger and the graph of its run, with the weight (E,) of its edges, most telling first.
 
     Asked are closures with a pose, in the solution or not, without a decision in the ledger or in `answers`, by row,
@@ -37,7 +37,7 @@ def ask_ledger(
     found = questions(graph, weight, log_odds, np.concatenate([odometry > 0, decided[rows]]))
     row_sets = [rows[one.edges - len(odometry)] for one in found]
     order = [about[np.argsort(-closures.inliers[about], kind="stable")].tolist() for about in row_sets]
-    return [Question(about, one.p_wrong, one.moved_m) for about, one in zip(order, found, strict=True)]
+    return [ClosureQuestion(about, one.p_wrong, one.moved_m) for about, one in zip(order, found, strict=True)]
 
 
 def _with_candidates(graph: PoseGraph, weight: Floats, closures: Closures) -> tuple[PoseGraph, Ints, Floats]:

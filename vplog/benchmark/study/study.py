@@ -20,10 +20,10 @@ from vplog import logs
 from vplog.benchmark.compare import check_truth, every_image, protocol, same_drive
 from vplog.benchmark.feature_cache import FeatureFolder
 from vplog.benchmark.recogniser_specs import read_methods
-from vplog.benchmark.study.charts import CHARTS
 from vplog.benchmark.study.evaluation_store import Bench
 from vplog.benchmark.study.example_figures import PICTURES
 from vplog.benchmark.study.experiments import NUMBERS, StudyOptions
+from vplog.benchmark.study.score_charts import CHARTS
 from vplog.benchmark.traversals import candidate_stops
 from vplog.cache.code_hash import code_of
 from vplog.cache.input_hashes import hash_inputs

@@ -14,7 +14,7 @@ from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.calibration_file import read_calibrations
 from vplog.logs.datasets.streams import DataSet, calibration_stream, camera_streams
-from vplog.logs.datasets.tables import lines_of
+from vplog.logs.datasets.text_tables import lines_of
 from vplog.logs.image_folder import named_stamps, natural_order
 from vplog.logs.tf_odometry import are_usable
 

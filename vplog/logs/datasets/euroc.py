@@ -6,7 +6,7 @@ from pathlib import Path
 
 from vplog.logs.calibration_file import read_calibrations
 from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, imu_stream
-from vplog.logs.datasets.tables import listed_images, poses_of
+from vplog.logs.datasets.text_tables import listed_images, poses_of
 from vplog.logs.image_folder import below, image_files, named_stamps
 
 _POSES = ("state_groundtruth_estimate0", "gt0", "mocap0", "vicon0")

@@ -11,7 +11,7 @@ from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.calibration_file import read_calibrations
 from vplog.logs.datasets.streams import DataSet, camera_streams
-from vplog.logs.datasets.tables import numbers_of, rows_of, stamps_ns
+from vplog.logs.datasets.text_tables import numbers_of, rows_of, stamps_ns
 from vplog.logs.image_folder import below, image_files
 
 _CAMERAS = ("image_0", "image_1", "image_2", "image_3")

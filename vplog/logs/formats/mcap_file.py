@@ -15,9 +15,9 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
+from vplog.logs.formats.chunk_layout import Chunk, ChunkLosses
 from vplog.logs.formats.compression import BadChunkError, crc32, unpack
 from vplog.logs.formats.container import BRIEF, Channel, Contents, Message, Notes, Octets, Place, part_of
-from vplog.logs.formats.layout import Chunk, ChunkLosses
 from vplog.logs.formats.loss_account import sampled
 from vplog.logs.formats.mcap_layout import MAGIC, RECORD, read_layout
 from vplog.storage.remote_path import RemotePath

@@ -10,8 +10,8 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from vplog.errors import LogError, plural
+from vplog.logs.formats.chunk_layout import ResyncSearch
 from vplog.logs.formats.container import Channel, Contents, Message, Notes, Place, by_topic
-from vplog.logs.formats.layout import ResyncSearch
 from vplog.logs.formats.loss_account import confirmed_span, main_span
 
 MAGIC = b"SQLite format 3\x00"
