@@ -120,8 +120,8 @@ def _log_scale(way: _Way, sigma_m: float) -> Floats | None:
         reached = np.maximum(np.linalg.norm(chord, axis=1), 1e-9)
         residual = np.log(length / reached) / sigma
         weight = np.sqrt(np.minimum(1.0, _TUNING / np.maximum(np.abs(residual), 1e-9))) / sigma
-        slope = (moved[column] * (chord / reached[:, None])[row]).sum(1) / reached[row]
-        A = sparse.vstack([sparse.csr_array((slope * weight[row], (row, column)), (len(pairs), count)), smooth])
+        gradient = (moved[column] * (chord / reached[:, None])[row]).sum(1) / reached[row]
+        A = sparse.vstack([sparse.csr_array((gradient * weight[row], (row, column)), (len(pairs), count)), smooth])
         b = np.concatenate([residual * sigma * weight, -(smooth @ x)])
         step = sparse.linalg.spsolve((A.T @ A).tocsc(), A.T @ b)
         x = x + np.clip(step, -0.5, 0.5)

@@ -108,8 +108,8 @@ def rho_variance(points: Floats, view_centres: Floats, shown: Bools, ray_varianc
     and measure rays of this variance; a million where none adds parallax."""
     ray, rho = points[:, :2] / points[:, 2:], 1.0 / points[:, 2]
     behind = 1.0 - rho * view_centres[:, 2:]
-    slope = (ray * view_centres[:, None, 2:] - view_centres[:, None, :2]) / np.maximum(behind, 0.1)[..., None] ** 2
-    information = (shown * (slope**2).sum(axis=2)).sum(axis=0) / ray_variance
+    jacobian = (ray * view_centres[:, None, 2:] - view_centres[:, None, :2]) / np.maximum(behind, 0.1)[..., None] ** 2
+    information = (shown * (jacobian**2).sum(axis=2)).sum(axis=0) / ray_variance
     return 1.0 / np.maximum(information, 1e-12)
 
 
