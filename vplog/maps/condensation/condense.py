@@ -21,7 +21,7 @@ from vplog.data import Bools
 from vplog.errors import SettingsError
 from vplog.execution.execution import Execution
 from vplog.maps.condensation.own_queries import OwnAnswers, OwnPlaces, query_own_places, read_own_places, search_of
-from vplog.maps.condensation.redundancy import Candidates, remove_cross_validated
+from vplog.maps.condensation.redundancy import RemovalCandidates, remove_cross_validated
 from vplog.maps.condensation.references import remove_references
 from vplog.maps.merge import copy_library, put_library
 from vplog.maps.search.query import open_map
@@ -103,7 +103,7 @@ def condense_places(
     removable, along_m = posed & (np.isin(every, answers.place) | answers.faded), np.cumsum(places.steps_m())
     total = int(removable.sum())
     most_lost -= len(whole_answers.place) - len(answers.place)
-    candidates = Candidates(places.drive, along_m, removable, answers.faded)
+    candidates = RemovalCandidates(places.drive, along_m, removable, answers.faded)
     removal, lost = remove_cross_validated(
         answers.queries, answers.place % 2 == 0, candidates, most_lost,
         lambda done: execution.progress("remove", done, total),

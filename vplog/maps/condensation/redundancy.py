@@ -43,7 +43,7 @@ class OwnQueries:
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class RemovalCandidates:
     """The N places of drives, in their order, of which some may be removed."""
 
     drive: Ints
@@ -172,7 +172,7 @@ class _Gaps:
 def remove_cross_validated(
     queries: OwnQueries,
     fold: Bools,
-    places: Candidates,
+    places: RemovalCandidates,
     most_lost: int,
     progress: Callable[[int], None] = lambda _: None,
 ) -> tuple[Removal, int]:
@@ -195,7 +195,7 @@ def remove_cross_validated(
 
 def remove_redundant(
     queries: OwnQueries,
-    places: Candidates,
+    places: RemovalCandidates,
     most_lost: int,
     progress: Callable[[int], None] = lambda _: None,
     judges: OwnQueries | None = None,
