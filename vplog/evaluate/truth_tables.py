@@ -220,7 +220,7 @@ def _unpickled(data: bytes) -> Any:
     named = {"_reconstruct": Values, "ndarray": Values, "dtype": Kind, "scalar": scalar, "encode": str.encode}
 
     class Unpickler(pickle._Unpickler):  # that of C allocates what a damaged file claims
-        def find_class(self, _: str, name: str) -> Any:
+        def find_class(self, module: str, name: str) -> Any:
             if name not in named:
                 raise ValueError(f"it asks for {name[:40]!r}")
             return named[name]
