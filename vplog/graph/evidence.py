@@ -42,7 +42,7 @@ _SAMPLE_OF_TILTS = 50
 """Poses by whose pairs it is seen how far the drive's poses turn against each other."""
 _CONCENTRATIONS = (2.0 ** np.arange(-4, 13)).tolist()
 """Concentrations of the Chinese restaurant process of families: from one family to as many as there are runs."""
-_TAIL = 3.0
+TAIL = 3.0
 """Noise of closures that err by much as a multiple of that of the others."""
 _TAIL_SHARES = np.array([0.0, 0.01, 0.02, 0.05, 0.1, 0.2])[:, None]
 """Shares of them among the true ones, as likely as each other."""
@@ -153,11 +153,11 @@ def _log_true(factors: Factors, weight: Floats, poses: Floats, true: Ints, room:
 def log_tails(chi2: Floats, d: int) -> float:
     """Log of how much likelier residuals of d dimensions, squared (K,), are where some closures err more than others.
 
-    A share of them, which may be none, has `_TAIL` times the noise: Tukey's contaminated normal distribution (A survey
+    A share of them, which may be none, has `TAIL` times the noise: Tukey's contaminated normal distribution (A survey
     of sampling from contaminated distributions, 1960). The noise stays as it is: residuals below it, as those of
-    closures that nothing checks, tell nothing, and what errs by far more than `_TAIL` times it is not explained.
+    closures that nothing checks, tell nothing, and what errs by far more than `TAIL` times it is not explained.
     """
-    wide = 0.5 * chi2 * (1.0 - _TAIL**-2) - d * math.log(_TAIL)
+    wide = 0.5 * chi2 * (1.0 - TAIL**-2) - d * math.log(TAIL)
     with np.errstate(divide="ignore"):
         gain = np.logaddexp(np.log1p(-_TAIL_SHARES), np.log(_TAIL_SHARES) + wide).sum(1)
     return float(np.logaddexp.reduce(gain)) - math.log(len(gain))

@@ -16,7 +16,7 @@ import numpy as np
 from vplog.errors import GraphError
 from vplog.graph.build import informed
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, is_loop, residual_sigma
-from vplog.graph.evidence import Accidents, agreeing, log_evidence, log_room, log_tails, runs, student_t
+from vplog.graph.evidence import TAIL, Accidents, agreeing, log_evidence, log_room, log_tails, runs, student_t
 from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
 from vplog.graph.least_squares import Objective, descend
@@ -111,40 +111,53 @@ def best_hypothesis(
 
 
 def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: Cost | None) -> list[Hypothesis]:
-    """The hypothesis with the closures that it predicts within the noise that the log claims, unless noise of heavy
-    tails makes that unlikely: estimated from those that fit best, noise is too small for the others."""
+    """The hypothesis with the closures that it predicts within the noise that the log claims, unless that is very
+    unlikely where noise has heavy tails: estimated from those that fit best, noise is too small for the others.
+
+    By the odometry that the log claims, which may be far worse than what is estimated, false ones may be within: those
+    that need more than `TAIL` times the noise that is claimed for closures themselves are left out.
+    """
     rejected = np.flatnonzero(best.weight == 0)
     if not len(rejected) or not isinstance(optimiser, GncSettings):
         return []
+    d = degrees_of_freedom(claimed.graph)
+    quantile = chi2_quantile(optimiser.inlier_probability, d)
     poses = descend(claimed, best.weight, best.poses, _STEPS, _TOLERANCE).world_from_body
     apart, _ = distance(claimed, best.weight, poses, rejected)
-    within = rejected[apart <= chi2_quantile(optimiser.inlier_probability, degrees_of_freedom(claimed.graph))]
-    if not len(within):
+    within = rejected[apart <= quantile]
+    weight, at = np.array(best.weight), AtSigmas.of(claimed, best.sigmas)
+    most = TAIL * math.sqrt(quantile / d) / best.sigmas.of_closures
+    while len(within):
+        weight[within] = 1.0
+        likelihood, multiple = _under_student_t(at, replace(best, weight=weight), cost)
+        weight[within] = 0.0
+        if (multiple[within] <= most).all():
+            break
+        within = within[multiple[within] <= most]
+    else:
         return []
-    weight = np.array(best.weight)
     weight[within] = 1.0
     more = _refit(claimed, weight, best.poses, best.sigmas)
-    likeliest = max(_log_student(claimed, replace(more, sigmas=sigmas), cost) for sigmas in (best.sigmas, more.sigmas))
-    return [more] if likeliest > _log_student(claimed, best, cost) - _VERY_STRONG else []
+    likeliest = max(likelihood, _under_student_t(AtSigmas.of(claimed, more.sigmas), more, cost)[0])
+    return [more] if likeliest > _under_student_t(at, best, cost)[0] - _VERY_STRONG else []
 
 
-def _log_student(claimed: Factors, one: Hypothesis, cost: Cost | None) -> float:
-    """The log evidence of the hypothesis, less the cost, where the noise of closures is Student's t of its sigmas.
+def _under_student_t(at: AtSigmas, one: Hypothesis, cost: Cost | None) -> tuple[float, Floats]:
+    """The log evidence of the hypothesis, less the cost, where the noise of closures is Student's t, and by what (E,)
+    the sigma of each is then multiplied.
 
-    Each closure has the noise that is likeliest for it, by turns with the poses (expectation maximisation).
+    Each closure has the noise that is expected of it, by turns with the poses (expectation maximisation).
     """
-    at, poses, multiple, found = AtSigmas.of(claimed, one.sigmas), one.poses, np.ones(len(one.weight)), -math.inf
-    graph = at.factors.graph
-    of_loops = ~graph.odometry & (one.weight > 0)
+    poses, multiple, graph = one.poses, np.ones(len(one.weight)), at.factors.graph
     for _ in range(_ROUNDS):
         information = graph.information / multiple[:, None, None] ** 2
         factors = replace(at.factors, graph=replace(graph, information=information))
         normal = replace(at, factors=factors).hypothesis(one.weight, poses)
         residuals = student_t(factors, one.weight, normal.poses, multiple)
-        chi2 = (residual_sigma(factors.graph, normal.poses) ** 2)[of_loops]
-        found = normal.log_evidence - log_tails(chi2, degrees_of_freedom(graph)) + residuals.log_gain
         poses, multiple = normal.poses, residuals.multiple
-    return found - (0.0 if cost is None else cost(at.factors, one.weight, poses))
+    chi2 = (residual_sigma(factors.graph, poses) ** 2)[~graph.odometry & (one.weight > 0)]
+    found = normal.log_evidence - log_tails(chi2, degrees_of_freedom(graph)) + residuals.log_gain
+    return found - (0.0 if cost is None else cost(at.factors, one.weight, poses)), multiple
 
 
 def _recognised(
