@@ -20,6 +20,7 @@ import threading
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
@@ -98,11 +99,12 @@ class Mirror:
             if newest.get(drive, {}).get("generation") != entry["generation"]:
                 shutil.rmtree(self.run(drive), ignore_errors=True)
         self.drives = dict(newest)
-        ledgers = {name for name in self.local_rest() if name.startswith("joins/") and name.endswith(".parquet")}
+        rest, before = self.manifest.now["rest"], self.held
+        self.held = {name: about for name, about in before.items() if rest.get(name) == about}
         for name in self.local_rest():
-            if name in self.held or name not in ledgers - self.manifest.now["rest"].keys():  # what was verified counts
+            verified = name.startswith("joins/") and name.endswith(".parquet")  # which counts
+            if name not in self.held and (name in before or name in rest or not (verified or _of_index(name))):
                 (self.local / name).unlink()
-        self.held.clear()
 
     def local_rest(self) -> list[str]:
         """Names of the files beside drives and libraries in the local folder."""
@@ -181,15 +183,37 @@ class Mirror:
                     if why := self._fetch_file(self.remote / file, self.local / file, about):
                         raise ResultError(f"{why}. Copy it back.")
 
+    def names_below(self, folder: str) -> set[str]:
+        """Names in a folder beside drives."""
+        start = f"{folder}/"
+        return {name.split("/")[start.count("/")] for name in self.manifest.now["rest"] if name.startswith(start)}
+
+    def drop(self, name: str) -> None:
+        """Let a file beside drives, or a folder of such, be removed with what is sent next."""
+        rest, start = self.manifest.now["rest"], f"{name}/"
+        folder = [] if "." in name.rpartition("/")[2] else [one for one in rest if one.startswith(start)]
+        self.held |= {one: rest[one] for one in (name, *folder) if one in rest}
+
+    def fetch_index(self, folder: Path) -> None:
+        """Download what the map has of its index into a folder. What cannot be had is built."""
+        for name, about in self.manifest.now["rest"].items():
+            target = folder / PurePosixPath(name).name
+            if _of_index(name) and not target.exists():
+                with suppress(OSError, ResultError):
+                    if not self._fetch_file(self.remote / "rest" / about["generation"] / name, target, about):
+                        self.held |= {name: about} if folder.parent == self.local else {}
+
     def rest(self, names: Collection[str] = ()) -> None:
         """Download all other files of the map into the local folder, or those of these names.
 
         Raises ResultError where some of it is damaged. A writer goes on without that and without the joint graphs,
         which `map join` makes again; `rest_damage` says why.
         """
-        known = {folder_name(drive) for drive in self.drives}  # files of other drives are not wanted
-        files = {name: about for name, about in self.manifest.now["rest"].items() if name in names or not names}
-        wanted = [name for name in files if name not in self.held and not drives_in(name) - known]
+        files = self.manifest.now["rest"]
+        if not names:
+            known = {folder_name(drive) for drive in self.drives}  # files of other drives are not wanted
+            names = [name for name in files if not drives_in(name) - known and not _of_index(name)]
+        wanted = [name for name in dict.fromkeys(names) if name in files and name not in self.held]
 
         def fetched(name: str) -> str:
             place = self.remote / "rest" / files[name]["generation"] / name
@@ -205,6 +229,8 @@ class Mirror:
         self.held |= {name: files[name] for name in wanted}
         if damaged:
             self.rest_damage = damaged[0]
+            self.drop("joint.json")
+            self.drop("joint")
             (self.local / "joint.json").unlink(missing_ok=True)
             shutil.rmtree(self.local / "joint", ignore_errors=True)
 
@@ -271,6 +297,10 @@ class Mirror:
     def run(self, drive: str) -> Path:
         """The drive's local folder."""
         return self.local / "runs" / folder_name(drive)
+
+
+def _of_index(name: str) -> bool:
+    return name.startswith("index/")
 
 
 def _state(about: dict[str, Any]) -> tuple[int, str]:

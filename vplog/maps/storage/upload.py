@@ -239,7 +239,10 @@ def remove(mirror: Mirror, drives: Sequence[str]) -> None:
 def send_rest(mirror: Mirror) -> None:
     """Send what the local folder has beside drives and libraries, if it changed; tables and records also by their own
     names, for those who read them as data sets. Raises LostRaceError where another writer has changed the same."""
-    known, hashes = mirror.held, {name: sha256_of(mirror.local / name) for name in mirror.local_rest()}
+    known, hashes = mirror.held, dict[str, str]()
+    for name in mirror.local_rest():  # parts of the index are named by what is in them
+        same = name in known and name.endswith(".lists")
+        hashes[name] = known[name]["sha256"] if same else sha256_of(mirror.local / name)
     new = [name for name in hashes if hashes[name] != known.get(name, {}).get("sha256")]
     gone = [name for name in known if name not in hashes]
     if not new and not gone:
@@ -276,7 +279,7 @@ def send_rest(mirror: Mirror) -> None:
 
 def _of_order(name: str) -> bool:
     """Whether a file says which drives a join has come to."""
-    return name.rpartition("/")[2] in ("joins.json", "joint.json")
+    return name == "joint.json" or name.startswith("joins/states-")
 
 
 def _replace_rest(snapshot: Snapshot, changes: dict[str, Any]) -> None:
