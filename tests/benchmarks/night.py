@@ -1,8 +1,8 @@
 """New drives put into a map of many and joined: what that reads and takes, by the drives of the map.
 
-The map is a city of short roads: drives of twenty keyframes, twelve of each road, whatever their number, and each road
-is a hundred metres from the next. What is verified is made up, four closures with each other drive of the road and none
-elsewhere, since it does not depend on the map. The drives before have been joined, the records of that are written here.
+The map is a city of short roads, a hundred metres from one another: drives of twenty keyframes, twelve of each road,
+whatever their number. What is verified is made up, four closures with each other drive of the road and none elsewhere,
+since it does not depend on the map. The drives before have been joined, the records of that are written here.
 """
 
 from __future__ import annotations

@@ -358,3 +358,23 @@ def test_of_many_drives_those_most_alike_are_searched(copy: Path, monkeypatch: p
         for threads in (1, 3):
             found = candidates.candidates_of(store, members, [2], state, few, Execution(threads))[2]
             assert set(found.drive.tolist()) == {1}
+
+
+def test_drives_that_satellites_tell_apart_are_not_compared(copy: Path) -> None:
+    """Bounds of half a degree around the antimeridian; a drive without fixes may be anywhere."""
+    with map_store.reading(copy) as store:
+        drives = read_drives(store, {})
+        state = map_join.load_places(store.library(drives.library), PIPELINE)
+        records = {f"{number}": {**drives.records["after"], "earth": None} for number in range(5)}
+        for name, bounds in (
+            ("0", [10, 179, 11, 179.999]),
+            ("1", [10, -179, 11, -178]),
+            ("3", [10, -179.9999, 11, -179]),
+        ):
+            records[name]["earth"] = {"bounds": bounds}
+        later = {number: candidates.places_of(store, "after", state) for number in (3, 4)}
+        near = candidates.drives_to_search(store, records, later, state, PIPELINE)
+    assert near == {3: [0, 1, 2], 4: [0, 1, 2, 3]}
+    far = PIPELINE.model_copy(update={"join": JoinSettings(apart_m=1.0)})
+    with map_store.reading(copy) as store:
+        assert candidates.drives_to_search(store, records, later, state, far)[3] == [1, 2]

@@ -351,7 +351,7 @@ def test_a_join_that_crosses_another_is_repeated(root: Any, monkeypatch: pytest.
         return {}
 
     monkeypatch.setattr(join, "_join", joined)
-    monkeypatch.setattr(join, "read_drives", lambda *_: SimpleNamespace(members=[]))
+    monkeypatch.setattr(join, "read_drives", lambda *_: SimpleNamespace(joins=[]))
     with map_store.writing(root) as store:
         join.join(store, load_pipeline("default"))
     assert seen == [{"one"}, {"one", "two"}]

@@ -242,7 +242,6 @@ def solve_groups(
 
 
 def _joint(store: Store) -> dict[str, Any]:
-    store.fetch_beside(["joint.json"])
     try:
         return read_joint(store.root)
     except NewerError:

@@ -95,6 +95,7 @@ def join(
         pipeline = pipeline.model_copy(update={"join": lean})
 
     def joined() -> dict[str, Any]:
+        store.fetch_beside(["joint.json"])  # for `send_rest` to see whether others have changed it
         drives = read_drives(store, urls)
         new = _out_of_date(store, drives, pipeline)
         return _join(_Work(store, drives, new, pipeline, execution, executor, whole), places)
