@@ -10,7 +10,7 @@ What two drives have in common lies with the one that came later, so a new drive
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -157,7 +157,7 @@ def search_key(pipeline: Pipeline) -> str:
     return key_of({**depends(pipeline), "search": search_code()})
 
 
-def remove_stale_ledgers(store: Store, drive: str, but: set[str], before: set[str]) -> None:
+def remove_stale_ledgers(store: Store, drive: str, but: Collection[str], before: Collection[str] = ()) -> None:
     """Remove the ledgers of a drive in other drives than these, as those of `before`, and files that a killed writer
     left."""
     folder = folder_of(store, drive)

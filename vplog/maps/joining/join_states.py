@@ -8,7 +8,7 @@ So a join reads one file for hundreds of drives, and new drives touch the last o
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError
@@ -118,4 +118,4 @@ def _state(row: Any, text: dict[str, str]) -> JoinState | None:
         return own
     for pair in pairs:
         pair |= {name: text.setdefault(pair[name], pair[name]) for name in ("match", "match_key")}
-    return JoinState(**{**vars(own), "made_from": text.setdefault(made_from, made_from), "pairs": tuple(pairs)})
+    return replace(own, made_from=text.setdefault(made_from, made_from), pairs=tuple(pairs))
