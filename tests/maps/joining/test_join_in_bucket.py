@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import pickle
+from concurrent.futures import Executor, Future
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 
 from tests.maps.bucket import counting, serving
@@ -15,12 +18,15 @@ from vplog.maps.joining import join as map_join
 from vplog.maps.joining.joint_record import joint_components, keyframe_poses
 from vplog.maps.merge import merge_maps
 from vplog.maps.search.index import update_index
+from vplog.maps.search.query import MapQuery, search
 from vplog.maps.storage import map_store
 from vplog.maps.storage.download_cache import cache_in
+from vplog.maps.storage.remote_map import StoredFile
+from vplog.places.sequence import SequenceSettings
 from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
 
@@ -103,5 +109,30 @@ def test_the_index_is_in_the_bucket(root: Any, tmp_path: Path, monkeypatch: pyte
         state: Any = few.places.load(store.library(library), Execution())
         parts, warnings = update_index(store, drives, state)
         assert not list(store.root.glob("runs/*/descriptors.parquet"))
-    assert (warnings, [part.path.name for part in parts if part.path]) == ([], [name.removeprefix("index/")])
-    assert sorted(parts[0].numbers.tolist()) == [0, 1, 2]
+        assert (warnings, [part.path.name for part in parts if part.path]) == ([], [name.removeprefix("index/")])
+        assert sorted(parts[0].numbers.tolist()) == [0, 1, 2]
+        views: Any = candidate_drives.places_of(store, "after", state)
+        here, _ = search(store, drives, state, views, MapQuery(3), SequenceSettings(length=1))
+        sent = Sent(monkeypatch, tmp_path / "worker")
+        there, _ = search(store, drives, state, views, MapQuery(3, executor=sent), SequenceSettings(length=1))
+    assert sent.segments, "names go to workers, and no part of the index"
+    assert {type(one) for one in sent.segments} == {StoredFile}
+    assert list((tmp_path / "worker").glob("maps/objects/*"))
+    for one in ("drive", "keyframe", "score"):
+        assert np.array_equal(getattr(here, one), getattr(there, one))
+
+
+class Sent(Executor):
+    """A machine with a cache of its own."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, cache: Path) -> None:
+        self.patch, self.cache, self.segments = patch, cache, list[Any]()
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        data, future = pickle.dumps((fn, args, kwargs)), Future[Any]()
+        self.segments += args[0].segments
+        with self.patch.context() as patch:
+            patch.setenv("VPLOG_CACHE", str(self.cache))
+            function, given, options = pickle.loads(data)  # noqa: S301
+            future.set_result(function(*given, **options))
+        return future

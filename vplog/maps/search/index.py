@@ -32,6 +32,7 @@ from vplog.storage.parquet_limits import check_file, footer_start
 
 if TYPE_CHECKING:
     from vplog.maps.storage.map_store import Store
+    from vplog.maps.storage.remote_map import StoredFile
     from vplog.stages import CodedState, PlaceState
 
 CAPACITY = 1 << 20
@@ -49,6 +50,8 @@ class SegmentView:
     """None where it is in memory alone."""
     numbers: Int32s
     """(D,) number of each of its drives in the map; -1 where the map has it no more, or another part has it."""
+    stored: StoredFile | None = None
+    """Where a map on an object store has it, for other machines."""
 
     @property
     def places(self) -> int:

@@ -15,16 +15,18 @@ none, is removed by `map vacuum` a day later.
 
 from __future__ import annotations
 
+import secrets
 import shutil
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import zstandard
 
@@ -35,7 +37,7 @@ from vplog.maps.storage.layout import ADD_AGAIN, RUN_TABLES, TABLES, folder_name
 from vplog.maps.storage.snapshot import Manifest, Snapshot, store_errors
 from vplog.results import run_record
 from vplog.storage.object_store import plain_errors
-from vplog.storage.remote_path import RemotePath, objects_below, reason
+from vplog.storage.remote_path import RemotePath, located, objects_below, reason
 from vplog.storage.scratch import files_in
 
 if TYPE_CHECKING:
@@ -47,6 +49,31 @@ _SECTIONS = 8
 """Sections that a reader holds."""
 Copies = dict[str, str | None]
 """Objects to copy within the store, by the new name; None: to remove."""
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    """A file on an object store, by name for other machines."""
+
+    url: str
+    sha256: str
+    bytes: int
+
+    def fetched(self, cache: Cache | None) -> Path:
+        """The file in this machine's cache. Raises ResultError where it cannot be had."""
+        if cache is None:
+            raise ResultError("A worker has no cache for the index of the map. Set VPLOG_CACHE to a folder there.")
+        target = cache.root / "objects" / self.sha256
+        part, place = target.with_name(f".{secrets.token_hex(8)}.part"), cast("RemotePath", located(self.url))
+        if not target.exists():
+            with store_errors(place):
+                target.parent.mkdir(parents=True, exist_ok=True)
+                digest = objects.fetch(place, part, self.bytes)
+                if digest != self.sha256:
+                    part.unlink()
+                    raise ResultError(f"{place} is damaged. Remove it: the next join builds it again.")
+                part.replace(target)
+        return target
 
 
 class Mirror:
@@ -202,6 +229,14 @@ class Mirror:
                 with suppress(OSError, ResultError):
                     if not self._fetch_file(self.remote / "rest" / about["generation"] / name, target, about):
                         self.held |= {name: about} if folder.parent == self.local else {}
+
+    def stored_index(self, path: Path | None) -> StoredFile | None:
+        """Where the map has a file of the index that is here; None where no writer has put it there."""
+        name = f"index/{'' if path is None else path.name}"
+        if (about := self.manifest.now["rest"].get(name)) is None:
+            return None
+        place = self.remote / "rest" / about["generation"] / name
+        return StoredFile(place.url, about["sha256"], about["bytes"])
 
     def rest(self, names: Collection[str] = ()) -> None:
         """Download all other files of the map into the local folder, or those of these names.
