@@ -97,8 +97,9 @@ def write_states(store: Store, states: Iterable[JoinState], changed: Collection[
         if any(one.drive in changed for one in inside):
             rows = [asdict(one) for one in sorted(inside, key=lambda one: (one.position, one.drive))]
             write_compressed(store.root / "joins" / f"{STATES}{number:05d}.json.gz", rows)
-    for drive in changed:
-        store.remove_beside(f"joins/{folder_name(drive)}/{_OLDER}")
+    for name in (f"joins/{folder_name(drive)}/{_OLDER}" for drive in changed):
+        if store.has_beside(name):
+            store.remove_beside(name)
 
 
 def _state(row: Any, text: dict[str, str]) -> JoinState | None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from vplog.errors import ResultError
-from vplog.maps.storage.layout import RUN_TABLES
+from vplog.maps.storage.layout import RUN_TABLES, folder_name, is_drive_record
 from vplog.storage.compressed_json import read_compressed, write_compressed
 
 NAME = ".drives.json.gz"
@@ -36,10 +36,14 @@ def read_catalogue(root: Path) -> dict[str, Entry]:
         found = read_compressed(root / NAME)
     except ResultError:
         return {}
-    sound = isinstance(found, dict) and all(
-        isinstance(one, list) and len(one) == 2 and isinstance(one[1], dict) for one in found.values()
-    )
-    return found if isinstance(found, dict) and sound else {}
+    if not isinstance(found, dict):
+        return {}
+    entries = {name: one for name, one in found.items() if isinstance(one, list) and len(one) == 2}
+    return {
+        name: one
+        for name, one in entries.items()
+        if isinstance(one[1], dict) and is_drive_record(one[1]) and folder_name(one[1]["drive"]) == name
+    }
 
 
 def write_catalogue(root: Path, entries: dict[str, Entry]) -> None:

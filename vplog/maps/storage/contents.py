@@ -182,8 +182,10 @@ class Store:
         """Remove a file beside drives, or a folder of such."""
         if self.mirror is not None:
             self.mirror.drop(name)
-        shutil.rmtree(self.root / name, ignore_errors=True)
-        (self.root / name).unlink(missing_ok=True)
+        if (path := self.root / name).is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
     def drives(self) -> dict[str, dict[str, Any]]:
         """drive.json of every finished drive, by ID in order, but for those that are damaged. Raises NewerError."""

@@ -4,7 +4,7 @@
     MAP/libraries/HASH/...                            as in a folder
     MAP/runs/drive=ID/GENERATION/...                  the run folder; its generation is a random name, never used twice
     MAP/packs/TOKEN                                   small files of drives together, after `map compact` (packs.py)
-    MAP/rest/GENERATION/...                           all else that a map's folder has, as what joins its drives
+    MAP/rest/GENERATION/...                           all else that a map's folder has: what joins its drives, the index
     MAP/keyframes/drive=ID/keyframes.parquet          tables as data sets, and what joins drives by its own name; copied
                                                       within the store, after the manifest
 
@@ -127,7 +127,8 @@ class Mirror:
                 shutil.rmtree(self.run(drive), ignore_errors=True)
         self.drives = dict(newest)
         rest, before = self.manifest.now["rest"], self.held
-        self.held = {name: about for name, about in before.items() if rest.get(name) == about}
+        same = {name: about for name, about in before.items() if rest.get(name) == about}
+        self.held = {name: about for name, about in same.items() if not of_order(name)}
         for name in self.local_rest():
             verified = name.startswith("joins/") and name.endswith(".parquet")  # which counts
             if name not in self.held and (name in before or name in rest or not (verified or _of_index(name))):
@@ -218,8 +219,9 @@ class Mirror:
     def drop(self, name: str) -> None:
         """Let a file beside drives, or a folder of such, be removed with what is sent next."""
         rest, start = self.manifest.now["rest"], f"{name}/"
-        folder = [] if "." in name.rpartition("/")[2] else [one for one in rest if one.startswith(start)]
-        self.held |= {one: rest[one] for one in (name, *folder) if one in rest}
+        self.held |= {
+            one: rest[one] for one in ([name] if name in rest else rest) if one == name or one.startswith(start)
+        }
 
     def fetch_index(self, folder: Path) -> None:
         """Download what the map has of its index into a folder. What cannot be had is built."""
@@ -332,6 +334,11 @@ class Mirror:
     def run(self, drive: str) -> Path:
         """The drive's local folder."""
         return self.local / "runs" / folder_name(drive)
+
+
+def of_order(name: str) -> bool:
+    """Whether a file says which drives a join has come to."""
+    return name == "joint.json" or name.startswith("joins/states-")
 
 
 def _of_index(name: str) -> bool:

@@ -16,7 +16,7 @@ from vplog.errors import ResultError, SettingsError
 from vplog.maps.storage import objects, older_maps
 from vplog.maps.storage.damage import rows_of
 from vplog.maps.storage.layout import RUN_TABLES, TABLES, drive_record, folder_name, renamed, sha256_of
-from vplog.maps.storage.remote_map import Copies, Mirror, drives_in, tag_of
+from vplog.maps.storage.remote_map import Copies, Mirror, drives_in, of_order, tag_of
 from vplog.maps.storage.snapshot import LostRaceError, Snapshot, now, store_errors
 from vplog.results import run_record, tables
 from vplog.storage.remote_path import RemotePath, names_below, objects_below
@@ -255,8 +255,8 @@ def send_rest(mirror: Mirror) -> None:
     def change(snapshot: Snapshot) -> None:
         check_recent(began)
         contested = set(changes)
-        if any(map(_of_order, changes)):  # drives are joined one after the other
-            contested |= set(filter(_of_order, snapshot["rest"]))
+        if any(map(of_order, changes)):  # drives are joined one after the other
+            contested |= set(filter(of_order, snapshot["rest"]))
         for name in contested:
             theirs = snapshot["rest"].get(name)
             if theirs != known.get(name) and (theirs or {}).get("sha256") != hashes.get(name):
@@ -275,11 +275,6 @@ def send_rest(mirror: Mirror) -> None:
         raise
     mirror.held = {name: mirror.manifest.now["rest"][name] for name in hashes if name in mirror.manifest.now["rest"]}
     _copy(mirror, {name: source for name, source in mirror.manifest.now["copies"].items() if name in changes})
-
-
-def _of_order(name: str) -> bool:
-    """Whether a file says which drives a join has come to."""
-    return name == "joint.json" or name.startswith("joins/states-")
 
 
 def _replace_rest(snapshot: Snapshot, changes: dict[str, Any]) -> None:
