@@ -120,10 +120,9 @@ class Night:
                 for one in before
             )  # fmt: skip
             states.append(JoinState(name, number, member.key, records[name]["key"], False, made_from, pairs))
-            drive_pairs.folder_of(store, name).mkdir(parents=True, exist_ok=True)
-            if number % self.roads in met:  # the others are not read
-                camera = CameraTrust({"matrix": np.eye(3).tolist()}, 0.0)
-                drive_pairs.put_camera(store, replace(member, drive=name), self.pipeline, camera)
+            camera = CameraTrust({"matrix": np.eye(3).tolist()}, 0.0)
+            drive_pairs.put_camera(store, replace(member, drive=name), self.pipeline, camera)
+            if number % self.roads in met:  # the ledgers of others are not read
                 for one in before:
                     path = drive_pairs.ledger_path(store, name, name_of(one))
                     path.write_bytes(_ledger(name, name_of(one), _key(number, one)))
