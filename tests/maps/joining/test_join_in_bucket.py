@@ -19,10 +19,10 @@ from vplog.maps.joining.joint_record import joint_components, keyframe_poses
 from vplog.maps.merge import merge_maps
 from vplog.maps.search.index import update_index
 from vplog.maps.search.query import MapQuery, search
+from vplog.maps.search.sequences import LineSearch
 from vplog.maps.storage import map_store
 from vplog.maps.storage.download_cache import cache_in
 from vplog.maps.storage.remote_map import StoredFile
-from vplog.places.sequence import SequenceSettings
 from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
@@ -112,9 +112,9 @@ def test_the_index_is_in_the_bucket(root: Any, tmp_path: Path, monkeypatch: pyte
         assert (warnings, [part.path.name for part in parts if part.path]) == ([], [name.removeprefix("index/")])
         assert sorted(parts[0].numbers.tolist()) == [0, 1, 2]
         views: Any = candidate_drives.places_of(store, "after", state)
-        here, _ = search(store, drives, state, views, MapQuery(3), SequenceSettings(length=1))
+        here, _ = search(store, drives, state, views, MapQuery(3), LineSearch())
         sent = Sent(monkeypatch, tmp_path / "worker")
-        there, _ = search(store, drives, state, views, MapQuery(3, executor=sent), SequenceSettings(length=1))
+        there, _ = search(store, drives, state, views, MapQuery(3, executor=sent), LineSearch())
     assert sent.segments, "names go to workers, and no part of the index"
     assert {type(one) for one in sent.segments} == {StoredFile}
     assert list((tmp_path / "worker").glob("maps/objects/*"))
