@@ -27,6 +27,7 @@ from tests.benchmarks.images import drives
 from tests.benchmarks.large_graphs import large
 from tests.benchmarks.localize import SCENES, localize
 from tests.benchmarks.mining import describing, mining
+from tests.benchmarks.night import night
 from tests.benchmarks.reading import LARGE_GB, SMALL_GB, reading
 from tests.benchmarks.scale import scale
 from tests.benchmarks.search import free_memory_gb, growth, search
@@ -52,7 +53,7 @@ DISCOVERY_BAR = 1000.0
 SEARCH_BARS = (4.0, 40.0)
 """Times faster than a scan of binary codes, and of vectors of floats."""
 SIZES = (10_000, 100_000, 1_000_000, 10_000_000)
-LONG = {"large", "batch", "localize", "condense", "compaction", "ask", "serve", "city"}
+LONG = {"large", "batch", "localize", "condense", "compaction", "ask", "serve", "city", "night"}
 """What is measured where it is named."""
 LARGEST_NEEDS_GB = 12.0
 """Memory that must be free for the largest map: the places, the index, and what the system needs beside."""
@@ -94,6 +95,7 @@ def _arguments() -> argparse.Namespace:
         "compaction",
         "ask",
         "city",
+        "night",
     )
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     named = f"of {', '.join(kinds)}; where none is named all but {', '.join(sorted(LONG))}. Or backend (its own --help)"
@@ -104,6 +106,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, default=3, help="of the false closures put into pose graphs")
     parser.add_argument("--poses", type=int, nargs="+", default=[100_000, 1_000_000], help="of the large pose graphs")
     parser.add_argument("--drives", type=int, nargs="+", default=[300, 1000], help="of the joined cities")
+    parser.add_argument("--fixes", action="store_true", help="give the drives of `night` a place on earth")
     parser.add_argument("--places", type=int, default=1_000_000, help="size of the map that is searched")
     parser.add_argument(
         "--folder",
@@ -171,6 +174,8 @@ def _long(arguments: argparse.Namespace) -> Iterator[Figure]:
         yield from compaction()
     if "city" in arguments.what:
         yield from city(arguments.drives)
+    if "night" in arguments.what:
+        yield from night(arguments.drives, arguments.fixes)
     if "ask" in arguments.what:
         yield from ask(arguments.questions, arguments.seeds, arguments.runs)
     if "localize" in arguments.what:

@@ -13,7 +13,6 @@ import time
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -30,6 +29,7 @@ from vplog.loops.verify import no_closures
 from vplog.maps.joining import components
 from vplog.maps.joining.components import Drives, PairLedger
 from vplog.maps.joining.growth import Growth
+from vplog.maps.joining.join_states import JoinState
 from vplog.maps.joining.joint_record import joint_components, keyframe_poses
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import load_pipeline
@@ -165,9 +165,9 @@ class Cost:
     def solve(self, city: City, count: int, pipeline: Pipeline, *, whole: bool = False) -> dict[str, Any]:
         """Solve the first drives of the city."""
         made = city.drives[:count]
-        members = cast("Any", [SimpleNamespace(drive=one.name, key=one.name) for one in made])
-        number = {one.name: at for at, one in enumerate(made)}
-        drives = Drives(members, [], {one.name: one.name for one in made}, {}, "a" * 64, number)
+        joins = [JoinState(one.name, at, one.name) for at, one in enumerate(made)]
+        records = {one.name: {"key": one.name} for one in made}
+        drives = Drives(joins, records, {}, "a" * 64, cast("Any", None), [])
         ledgers = [ledger for one in made for ledger in one.ledgers]
         read, add, solve = tables._read, Growth.add, Growth._solve
 

@@ -124,18 +124,20 @@ def make_queries(places: Places, count: int, settings: BobbSettings, library: in
     new = make_places(count, settings, seed=2, library=library, drive=1)
     queries = []
     for n in range(count):
-        references, weights, boxes = new.references[n], new.weights[n], new.boxes[n]
-        if n % 2:
-            row = int(rng.integers(len(places)))
-            other = rng.permutation(len(references))[: round(0.3 * len(references))]
-            fresh = np.setdiff1d(references, places.references[row])[: len(other)]
-            references = places.references[row].copy()
-            references[other[: len(fresh)]] = fresh
-            seen = places.weights[row] * np.exp(rng.normal(0, 0.3, len(weights)))
-            weights = np.maximum(np.rint(255 * seen / seen.max()), 1).astype(np.uint8)
-            boxes = np.where(rng.random(boxes.shape) < 0.4, boxes, places.boxes[row])
-        queries.append(Place(references, weights, boxes))
+        place = Place(new.references[n], new.weights[n], new.boxes[n])
+        queries.append(seen_again(places, int(rng.integers(len(places))), place, rng) if n % 2 else place)
     return queries
+
+
+def seen_again(places: Places, row: int, other: Place, rng: np.random.Generator) -> Place:
+    """A place of the map as it might be seen again: three of ten references and 40 % of the boxes are another's."""
+    replaced = rng.permutation(len(other.references))[: round(0.3 * len(other.references))]
+    fresh = np.setdiff1d(other.references, places.references[row])[: len(replaced)]
+    references = places.references[row].copy()
+    references[replaced[: len(fresh)]] = fresh
+    seen = places.weights[row] * np.exp(rng.normal(0, 0.3, len(references)))
+    weights = np.maximum(np.rint(255 * seen / seen.max()), 1).astype(np.uint8)
+    return Place(references, weights, np.where(rng.random(other.boxes.shape) < 0.4, other.boxes, places.boxes[row]))
 
 
 def _table(settings: BobbSettings) -> np.ndarray:

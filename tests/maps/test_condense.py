@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -156,8 +155,7 @@ def test_a_condensed_map_works_as_before(whole: Path, halves: Path, tmp_path: Pa
     with map_store.reading(small) as store:
         state = open_map(store, Execution())[2]
         for drive in HALVES:  # a new drive is searched among all keyframes
-            member: Any = SimpleNamespace(drive=drive)
-            assert len(places_of(store, member, state)) == kept_of(small, drive)[0][-1] + 1
+            assert len(places_of(store, drive, state)) == kept_of(small, drive)[0][-1] + 1
     places = verb("map", "export", small, "-o", tmp_path / "places.parquet", "--json").json
     assert places["places"] == told["places"]["after"]
     whole_joins = digests(whole)

@@ -16,7 +16,7 @@ from tests.maps.runs import make_map, put, seeds
 from tests.maps.storage.test_map_store import forked
 from vplog.errors import ResultError, VplogError
 from vplog.maps.remove import remove_drives
-from vplog.maps.storage import map_store, objects
+from vplog.maps.storage import catalogue, map_store, objects
 from vplog.storage.remote_path import located, objects_below
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def whole_map(root: Path) -> Path:
 
 
 def files(root: Path) -> dict[str, bytes]:
-    hidden = (".lock", ".staging")
+    hidden = (".lock", ".staging", catalogue.NAME)
     names = [path for path in sorted(root.rglob("*")) if path.is_file()]
     return {str(path.relative_to(root)): path.read_bytes() for path in names if path.name not in hidden}
 

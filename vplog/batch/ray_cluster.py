@@ -120,10 +120,8 @@ def _imported() -> Any:
         os.environ.setdefault(name, value)
     try:
         import ray
-        import ray._private.worker as session
     except ImportError:
         raise SettingsError("--engine ray needs Ray. Install it: pip install 'vplog[ray]'") from None
-    setattr(session, "_worker_logs_enabled", False)  # noqa: B010 (workers' logs would go to our stdout)
     return ray
 
 

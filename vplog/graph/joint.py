@@ -37,6 +37,9 @@ class JoinSettings(Settings):
     most_drives: int = Field(default=32, ge=1)
     """Drives that one is verified against: those whose places are most like its own. With `propose.per_query`, which
     bounds the candidates of a keyframe in all drives together, what a drive costs does not grow with their number."""
+    apart_m: float = Field(default=200.0, gt=0)
+    """Metres between the bounds of two drives on earth, of those that have satellite fixes, beyond which they are not
+    searched in one another: far more than fixes are wrong by."""
     first_look: int = Field(default=32, ge=1)
     """Keyframes, those whose best candidate in another drive scores highest, of which this candidate is verified first,
     or an eighth of them where that is more. Where geometry shows none of these to be of the same place, the others are

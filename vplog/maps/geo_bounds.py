@@ -129,6 +129,13 @@ class DriveBounds:
             raise ResultError(f"No drive of {name} is in the box that is searched; {without}")
         return within, [f"Not searched: {without}"] if unplaced else []
 
+    def near(self, number: int, radius_m: float) -> NDArray[np.bool_]:
+        """(N,) which drives may be so near to one; those without a place on earth may be, and all to one of these."""
+        south, west, north, east = self._bounds[number].tolist()
+        if math.isnan(south):
+            return np.ones(len(self.names), bool)
+        return np.isnan(self._bounds[:, 0]) | _overlap(self._bounds, box_around(south, west, north, east, radius_m))
+
 
 def _overlap(bounds: Floats, box: Box) -> NDArray[np.bool_]:
     """(N,) which bounds (N, 4) meet the box; those of NaN meet none."""

@@ -172,6 +172,7 @@ def _merge_drive(
 def _link_join_inputs(other: Store, drive: str, store: Store, taken: str) -> None:
     """Link what later closures are verified by, so that these need the logs no more than in the source."""
     source, target = (one.root / "joins" / folder_name(name) for one, name in ((other, drive), (store, taken)))
+    other.fetch_beside(f"joins/{folder_name(drive)}/{name}" for name in DRIVE_FILES)
     for name in DRIVE_FILES:
         if (source / name).is_file():
             try:

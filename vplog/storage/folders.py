@@ -53,6 +53,13 @@ def regular_files(folder: Path) -> Iterator[str]:
                 )
 
 
+def names_in(folder: Path) -> list[str]:
+    """Names in a folder, in order; none where there is no such folder."""
+    with suppress(FileNotFoundError, NotADirectoryError):
+        return sorted(path.name for path in folder.iterdir())
+    return []
+
+
 def is_unicode(name: str) -> bool:
     """Whether the name of a file is UTF-8: Python has half a character for each byte of any other."""
     return not any("\ud800" <= character <= "\udfff" for character in name)

@@ -33,6 +33,7 @@ from vplog.maps.storage import map_store
 from vplog.pipeline import load_pipeline
 from vplog.results import run_record, tables
 from vplog.results.run_record import read_run_json
+from vplog.storage.compressed_json import read_compressed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 
 PIPELINE = load_pipeline("default", QUICK)
 HALVES = ("before", "after")
+STATES_FILE = "joins/states-00000.json.gz"
 
 
 def put(root: Path, joint: Path, *names: str, **changes: Any) -> None:
@@ -141,14 +143,15 @@ def test_a_drive_added_to_a_map_touches_its_own_alone(whole: Path, joint: Path, 
     root, elsewhere = tmp_path / "map", Elsewhere()
     put(root, joint, "after")
     assert joined(root)["components"] == []
-    before = digests(root)
+    before, states = digests(root), read_compressed(root / STATES_FILE)
     put(root, joint, "before", "drive")
     shutil.rmtree(root / ".cache" / "drive=after")
     told = joined(root, elsewhere)
     assert told["searched"] == ["before", "drive"]
     assert elsewhere.tasks == told["pairs_computed"] + 2, "the pairs, and how the two see"
     after = digests(root)
-    assert {name: text for name, text in after.items() if name in before} == before
+    assert {name: text for name, text in after.items() if name in before} == {**before, STATES_FILE: after[STATES_FILE]}
+    assert read_compressed(root / STATES_FILE)[:1] == states
     assert after == digests(whole)
     assert joined(root)["pairs_computed"] == 0
     assert digests(root) == after
@@ -161,13 +164,15 @@ def test_what_is_killed_goes_on_to_the_same_bytes(whole: Path, copy: Path, monke
     def killed(*_: Any, **__: Any) -> None:
         raise Killed
 
-    for path in [copy / "joint.json", *copy.glob("joins/*/joins.json")]:
+    for path in [copy / "joint.json", *copy.glob("joins/states-*")]:
         path.unlink()
     shutil.rmtree(copy / "joint")
     (copy / "joins" / "drive=drive" / "match=after.parquet").unlink()
     for module, name in (
+        (map_join, "write_states"),
         (drive_pairs, "put_ledger"),
         (map_join, "_record_pairs"),
+        (component_folders, "write_states"),
         (run_record, "write_run_json"),
         (component_folders, "write_joint"),
     ):
@@ -343,14 +348,43 @@ def test_of_many_drives_those_most_alike_are_searched(copy: Path, monkeypatch: p
     few = PIPELINE.model_copy(update={"join": JoinSettings(most_drives=1)})
     with map_store.reading(copy) as store:
         drives = read_drives(store, {})
-        by_name = {member.drive: member for member in drives.members}
-        other = next(name for name in by_name if name not in HALVES)
-        members = [by_name[name] for name in (other, *HALVES)]
+        other = next(name for name in drives.names if name not in HALVES)
+        members = {name: drives.records[name] for name in (other, *HALVES)}
         state = map_join.load_places(store.library(drives.library), few)
-        later = {number: candidates.places_of(store, members[number], state) for number in (1, 2)}
-        assert candidates.drives_to_search(store, members, later, state, few) == {1: range(1), 2: {1}}
+        later = {number: candidates.places_of(store, list(members)[number], state) for number in (1, 2)}
+        assert candidates.drives_to_search(store, members, later, state, few) == {1: [0], 2: [1]}
         every = candidates.drives_to_search(store, members, later, state, PIPELINE)
-        assert every == {1: range(1), 2: range(2)}
+        assert every == {1: [0], 2: [0, 1]}
         for threads in (1, 3):
             found = candidates.candidates_of(store, members, [2], state, few, Execution(threads))[2]
             assert set(found.drive.tolist()) == {1}
+
+
+def test_drives_that_satellites_tell_apart_are_not_compared(copy: Path) -> None:
+    """Bounds of half a degree around the antimeridian; a drive without fixes may be anywhere."""
+    with map_store.reading(copy) as store:
+        drives = read_drives(store, {})
+        state = map_join.load_places(store.library(drives.library), PIPELINE)
+        records = {f"{number}": {**drives.records["after"], "earth": None} for number in range(5)}
+        for name, bounds in (
+            ("0", [10, 179, 11, 179.999]),
+            ("1", [10, -179, 11, -178]),
+            ("3", [10, -179.9999, 11, -179]),
+        ):
+            records[name]["earth"] = {"bounds": bounds}
+        later = {number: candidates.places_of(store, "after", state) for number in (3, 4)}
+        near = candidates.drives_to_search(store, records, later, state, PIPELINE)
+    assert near == {3: [0, 1, 2], 4: [0, 1, 2, 3]}
+    far = PIPELINE.model_copy(update={"join": JoinSettings(apart_m=1.0)})
+    with map_store.reading(copy) as store:
+        assert candidates.drives_to_search(store, records, later, state, far)[3] == [1, 2]
+
+
+def test_states_of_an_older_vplog_are_taken_over(whole: Path, copy: Path) -> None:
+    """Of each drive in a file of its own."""
+    for row in read_compressed(copy / STATES_FILE):
+        older = {name: row[name] for name in ("drive", "position", "member", "made_from", "pairs")}
+        run_record.write_run_json(copy / "joins" / f"drive={row['drive']}" / "joins.json", older)
+    (copy / STATES_FILE).unlink()
+    assert joined(copy)["searched"] == []
+    assert digests(copy) == digests(whole)

@@ -132,6 +132,19 @@ def test_all_else_of_a_map_goes_with_it(root: Any) -> None:
     assert not any("one" in name for name in names(root) if not name.startswith(("runs", "rest")))
 
 
+def test_a_folder_beside_drives_is_removed_without_being_fetched(root: Any) -> None:
+    make_map(root, {"a.b": 1})
+    name = "joins/drive=a.b/match=one.parquet"
+    with map_store.writing(root) as store:
+        write_rest(store, "ledger", name)
+    assert name in rest_of(root)
+    with map_store.writing(root) as store:
+        assert store.has_beside(name)
+        store.remove_beside("joins/drive=a.b")
+        assert not store.has_beside(name)
+    assert name not in rest_of(root)
+
+
 def test_a_writer_killed_anywhere_leaves_the_old_drive_or_the_new(root: Any) -> None:
     """Before one of its requests; then nothing more comes from it."""
     make_map(root, {"one": 1})
@@ -351,7 +364,7 @@ def test_a_join_that_crosses_another_is_repeated(root: Any, monkeypatch: pytest.
         return {}
 
     monkeypatch.setattr(join, "_join", joined)
-    monkeypatch.setattr(join, "read_drives", lambda *_: SimpleNamespace(members=[]))
+    monkeypatch.setattr(join, "read_drives", lambda *_: SimpleNamespace(joins=[]))
     with map_store.writing(root) as store:
         join.join(store, load_pipeline("default"))
     assert seen == [{"one"}, {"one", "two"}]

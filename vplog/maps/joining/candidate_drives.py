@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from vplog.execution.execution import Execution
+from vplog.maps.geo_bounds import DriveBounds
 from vplog.maps.joining.inter_session import Candidates, candidates_among
 from vplog.maps.search.exact import best_places
 from vplog.maps.search.index import read_column, rows_on_keyframes, update_index
@@ -18,7 +19,6 @@ from vplog.maps.storage.damage import reading_drive
 from vplog.stages import CodedState, PlaceState
 
 if TYPE_CHECKING:
-    from vplog.maps.joining.members import Member
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
 
@@ -29,54 +29,59 @@ _AT_ONCE = 64
 """New drives that are searched in one earlier drive while its places are in memory; theirs are too, some 40 MB."""
 
 
-def places_of(store: Store, member: Member, state: PlaceState) -> Sequence[Any]:
+def places_of(store: Store, drive: str, state: PlaceState) -> Sequence[Any]:
     """The place of each keyframe of a drive; of a condensed map the nearest. Raises DamagedDriveError where they are of
     another recogniser."""
-    column, nearest = read_column(store, member.drive, state), rows_on_keyframes(store, member.drive)
+    column, nearest = read_column(store, drive, state), rows_on_keyframes(store, drive)
     if nearest is not None:
         column = column.take(pa.array(nearest))
-    with reading_drive(member.drive):
+    with reading_drive(drive):
         return state.from_arrow(column)
 
 
 def candidates_of(
-    store: Store, members: Sequence[Member], new: Sequence[int], state: PlaceState, pipeline: Pipeline,
+    store: Store, drives: Mapping[str, Mapping[str, Any]], new: Sequence[int], state: PlaceState, pipeline: Pipeline,
     execution: Execution = Execution(),
 ) -> dict[int, Candidates]:  # fmt: skip
-    """For each new drive, by number, its best candidates in the drives of `drives_to_search`."""
-    found: dict[int, Candidates] = {}
+    """For each new drive, by number, its best candidates in the drives of `drives_to_search`. `drives` are the records
+    of all, in order."""
+    names, found = list(drives), dict[int, Candidates]()
     counts = [min(number, _CHOICE * pipeline.join.most_drives) for number in new]
     for first in range(0, len(new), _AT_ONCE):
-        block = {number: places_of(store, members[number], state) for number in new[first : first + _AT_ONCE]}
-        searched = drives_to_search(store, members, block, state, pipeline, Execution(execution.threads))
+        block = {number: places_of(store, names[number], state) for number in new[first : first + _AT_ONCE]}
+        searched = drives_to_search(store, drives, block, state, pipeline, Execution(execution.threads))
         found |= candidates_among(
-            block, lambda number: places_of(store, members[number], state), searched, state, pipeline,
+            block, lambda number: places_of(store, names[number], state), searched, state, pipeline,
             execution.part(sum(counts[:first]), sum(counts)),
         )  # fmt: skip
     return found
 
 
 def drives_to_search(
-    store: Store, members: Sequence[Member], later: Mapping[int, Sequence[Any]], state: PlaceState,
+    store: Store, drives: Mapping[str, Mapping[str, Any]], later: Mapping[int, Sequence[Any]], state: PlaceState,
     pipeline: Pipeline, execution: Execution = Execution(),
-) -> dict[int, Container[int]]:  # fmt: skip
-    """For each drive of `later`, places by number, the drives of a lower number that it is searched in: all, and where
-    these are many the ones that hold most of what is like its views, each view for itself, by the map's index.
+) -> dict[int, Collection[int]]:  # fmt: skip
+    """For each drive of `later`, places by number, the drives of a lower number that it is searched in: those that may
+    be near, and where these are many the ones that hold most of what is like its views, each view for itself, by the
+    map's index. Near may be what is not known, by satellites, to be `join.apart_m` away.
 
-    So what a drive more costs grows as a query of the map does, not with its drives. Maps without an index, which are
-    those of other recognisers and those on object stores, are searched drive by drive.
+    So what a drive more costs grows as a query of the map does, not with its drives. Maps of recognisers without an
+    index are searched drive by drive.
     """
-    most = _CHOICE * pipeline.join.most_drives
-    searched: dict[int, Container[int]] = {number: range(number) for number in later}
-    if max(later) <= most or not isinstance(state, CodedState) or store.mirror is not None:
+    most, bounds = _CHOICE * pipeline.join.most_drives, DriveBounds(drives)
+    near = {number: np.flatnonzero(bounds.near(number, pipeline.join.apart_m)[:number]) for number in later}
+    searched: dict[int, Collection[int]] = {number: rows.tolist() for number, rows in near.items()}
+    if max(map(len, near.values())) <= most or not isinstance(state, CodedState):
         return searched
-    parts, _ = update_index(store, {one.drive: store.record(one.drive) for one in members}, state, execution)
+    parts, _ = update_index(store, drives, state, execution)
     for number, views in later.items():
-        if number <= most:
+        if len(near[number]) <= most:
             continue
-        before = [replace(part, numbers=np.where(part.numbers < number, part.numbers, -1)) for part in parts]
+        asked = np.full(len(drives) + 1, -1, np.int32)  # the last stands for drives that are in no part
+        asked[near[number]] = near[number]
+        before = [replace(part, numbers=asked[part.numbers]) for part in parts]
         _, drive, credit = drive_credits(best_places(before, state, views, PLACES_A_VIEW, execution))
         like = np.bincount(drive, credit, number)
         best = np.lexsort((np.arange(number), -like))[:most]
-        searched[number] = set(best[like[best] > 0].tolist())
+        searched[number] = np.sort(best[like[best] > 0]).tolist()
     return searched

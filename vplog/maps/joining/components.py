@@ -15,9 +15,9 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,9 @@ from vplog.data import Closures
 from vplog.errors import NewerError, ResultError, VplogError
 from vplog.graph.build import parts
 from vplog.loops.verify import no_closures
+from vplog.maps.joining.drive_pairs import fetch_inputs
 from vplog.maps.joining.growth import Growth, LostPosesError
+from vplog.maps.joining.join_states import write_states
 from vplog.maps.joining.joint_graph import (
     pair_record,
     read_drive,
@@ -46,7 +48,7 @@ from vplog.storage.scratch import put_in_place
 
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution
-    from vplog.maps.joining.drive_pairs import JoinState
+    from vplog.maps.joining.join_states import JoinState
     from vplog.maps.joining.members import Member
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
@@ -56,21 +58,36 @@ if TYPE_CHECKING:
 class Drives:
     """The drives of a map that may be joined, in its order."""
 
-    members: list[Member]
     joins: list[JoinState]
     """The place of each in the order, and the drives that it was verified against."""
-    keys: dict[str, str]
-    """Keys of drive.json, by ID."""
+    records: dict[str, dict[str, Any]]
+    """drive.json of these and others, by ID."""
     excluded: dict[str, str]
     """Why others are not joined, by ID."""
     library: str
-    number: dict[str, int]
-    """Place of each member in the order, by ID."""
+    member: Callable[[int], Member]
+    """A drive as verification needs it, by number. Raises ResultError."""
+    others: list[JoinState]
+    """Of those that are excluded."""
+
+    @cached_property
+    def names(self) -> list[str]:
+        """IDs in order."""
+        return [one.drive for one in self.joins]
+
+    @cached_property
+    def number(self) -> dict[str, int]:
+        """Place of each ID in the order."""
+        return {drive: at for at, drive in enumerate(self.names)}
 
     def counts(self, later: int, pair: dict[str, Any]) -> bool:
         """Whether the drive that a pair is with is there, before its own, and the one that it was then."""
         at = self.number.get(pair["match"], later)
-        return at < later and self.members[at].key == pair["match_key"]
+        return at < later and self.joins[at].member == pair["match_key"]
+
+    def write(self, store: Store, changed: Collection[str]) -> None:
+        """Write the states of these drives. Raises ResultError."""
+        write_states(store, [*self.joins, *self.others], changed)
 
 
 @dataclass(frozen=True)
@@ -110,35 +127,42 @@ def _settings(pipeline: Pipeline) -> dict[str, Any]:
 
 def groups_of(every: Drives, pair_ledgers: Sequence[PairLedger], pipeline: Pipeline) -> list[Group]:
     """The groups of two drives and more, in the order of their first ones."""
-    order, at = [member.drive for member in every.members], every.number
+    order, at = every.names, every.number
     good = [entry for entry in pair_ledgers if entry.verified >= pipeline.join.least_closures]
     a, b = (np.array([at[getattr(one, end)] for one in good], np.int64) for end in ("earlier", "later"))
     number = parts(len(order), a, b)
     code = code_of("vplog.maps.joining.components", type(pipeline.solve).__module__)["code"]
     common, found = key_of([_settings(pipeline), code]), list[Group]()
+    within: dict[int, list[PairLedger]] = {}
+    for entry in pair_ledgers:
+        if (one := int(number[at[entry.later]])) == number[at[entry.earlier]]:
+            within.setdefault(one, []).append(entry)
+    rows = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number, minlength=1))[:-1])
     for one in np.flatnonzero(np.bincount(number, minlength=1) > 1).tolist():
-        drives = tuple(order[row] for row in np.flatnonzero(number == one).tolist())
-        inside = set(drives)
-        between = [entry for entry in pair_ledgers if {entry.later, entry.earlier} <= inside]
-        own = tuple(sorted(between, key=lambda entry: (at[entry.later], at[entry.earlier])))
+        drives = tuple(order[row] for row in rows[one].tolist())
+        own = tuple(sorted(within[one], key=lambda entry: (at[entry.later], at[entry.earlier])))
         met: dict[str, list[list[str]]] = {drive: [] for drive in drives}
         for entry in own:
             met[entry.later].append([entry.earlier, entry.key])
-        made_from = {drive: json.dumps([common, every.keys[drive], pairs]) for drive, pairs in met.items()}
+        made_from = {drive: json.dumps([common, every.records[drive]["key"], pairs]) for drive, pairs in met.items()}
         judged = {drive: hashlib.sha256(text.encode()).hexdigest()[:16] for drive, text in made_from.items()}
         found.append(Group(drives, own, judged))
     return found
 
 
-def solve_group(group: Group, runs: Sequence[Path], pipeline: Pipeline, library: str, staging: Path) -> dict[str, Any]:
+def solve_group(
+    store: Store, group: Group, pipeline: Pipeline, library: str, staging: Path, gone: dict[str, str]
+) -> dict[str, Any]:
     """Solve a group, and make a folder in `staging` for each component that comes of it.
 
-    Returns the group as joint.json has it: `components`, and the pairs kept `apart` with reasons. Raises GraphError
-    where it cannot be solved, and ResultError where a drive's folder is damaged.
+    Returns the group as joint.json has it: `components`, and the pairs kept `apart` with reasons. Drives whose ledgers
+    are damaged are noted in `gone`. Raises GraphError where it cannot be solved, and ResultError where a drive's folder
+    is damaged.
     """
-    drives = list(map(read_drive, group.drives, runs))
+    drives = [read_drive(drive, store.run(drive)) for drive in group.drives]
     at = {drive: number for number, drive in enumerate(group.drives)}
-    ledgers = {(at[entry.later], at[entry.earlier]): _ledger(entry) for entry in group.pair_ledgers}
+    fetch_inputs(store, [(entry.later, entry.earlier) for entry in group.pair_ledgers], ())
+    ledgers = {(at[entry.later], at[entry.earlier]): _ledger(store, entry, gone) for entry in group.pair_ledgers}
     joined, ledgers = solve_drives(drives, ledgers, pipeline)
     header, components = tables.TableMetadata(_settings(pipeline), library), []
     for members, refined in joined.solved.items():
@@ -163,23 +187,18 @@ def solve_group(group: Group, runs: Sequence[Path], pipeline: Pipeline, library:
     return {"key": group.key, "drives": list(group.drives), "components": components, "apart": apart}
 
 
-def _ledger(entry: PairLedger) -> Closures:
-    ledger = tables.read_joins(entry.path).get((entry.later, entry.earlier))
-    if ledger is None:
-        raise ResultError(
-            f"{entry.path} is not of {entry.later} in {entry.earlier}. Move it out of the map, and run again."
-        )
-    return ledger
-
-
-def _sound_ledger(entry: PairLedger, gone: list[str]) -> Closures:
+def _ledger(store: Store, entry: PairLedger, gone: dict[str, str]) -> Closures:
     """The ledger; of a damaged one, which the next join makes again, no closures and a line in `gone`."""
+    fetch_inputs(store, [(entry.later, entry.earlier)], ())
     try:
-        return _ledger(entry)
+        if (ledger := tables.read_joins(entry.path).get((entry.later, entry.earlier))) is not None:
+            return ledger
+        why = f"{entry.path} is not of {entry.later} in {entry.earlier}."
     except ResultError as error:
-        entry.path.unlink(missing_ok=True)
-        gone.append(f"{error} It is left out, and made again by the next join.")
-        return no_closures()
+        why = str(error)
+    store.remove_beside(entry.path.relative_to(store.root).as_posix())
+    gone[entry.later] = f"{why} It is left out, and made again by the next join."
+    return no_closures()
 
 
 def solve_groups(
@@ -190,28 +209,35 @@ def solve_groups(
     placed in groups of more than `join.judged_anew`; `whole`: which are then solved as a whole."""
     groups, before = groups_of(drives, pair_ledgers, pipeline), _joint(store)
     known = {group["key"]: group for group in before.get("groups", [])}
-    folder, solved, judged = store.root / "joint", list[dict[str, Any]](), dict[str, str]()
+    few = len(drives.joins) <= pipeline.join.judged_anew
+    solved, judged, gone = list[dict[str, Any]](), dict[str, str](), dict[str, str]()
     for done, group in enumerate(groups):
         execution.progress("solve together", done, len(groups))
-        components, keys = known.get(group.key, {}).get("components"), group.judged
-        if len(group.drives) > pipeline.join.judged_anew:
-            if components is None or whole or not all(map(partial(_has_folders, folder), components)):
-                known[group.key], keys = _grown(store, group, pipeline, drives.library, before, whole)
-        elif components is None or not all(is_whole(folder / one["folder"], one["drives"]) for one in components):
-            known[group.key] = _solved(store, group, pipeline, drives.library)
-        judged |= keys if known[group.key]["key"] else {}
-        solved.append(known[group.key])
+        components, grown = known.get(group.key, {}).get("components"), len(group.drives) > pipeline.join.judged_anew
+        there = components is not None and all(_is_there(store, one, few) for one in components)
+        if there and not (grown and whole):
+            record, keys = known[group.key], group.judged
+        elif grown:
+            record, keys = _grown(store, group, pipeline, drives.library, before, whole, gone)
+        else:
+            record = _solved(store, group, pipeline, drives.library, gone)
+            keys = group.judged if record["key"] else {}
+        judged |= keys
+        solved.append(record)
     execution.progress("solve together", len(groups), len(groups))
     together = {drive for group in solved for component in group["components"] for drive in component["drives"]}
-    alone = sorted([*(one.drive for one in drives.members if one.drive not in together), *drives.excluded])
-    keys = {drive: drives.keys[drive] for drive in sorted(together)}
+    alone = sorted([*(one for one in drives.names if one not in together), *drives.excluded])
+    keys = {drive: drives.records[drive]["key"] for drive in sorted(together)}
     record = {"groups": solved, "alone": alone, "apart": drives.excluded, "keys": keys, "judged": judged}
-    if solved or (store.root / "joint.json").exists():
+    if solved or store.has_beside("joint.json"):
         write_joint(store.root, record)
     named = {name for group in solved for component in group["components"] for name in folders_of(component)}
-    for path in folder.glob("component=*"):
-        if path.name not in named:
-            shutil.rmtree(path, ignore_errors=True)
+    for name in store.names_beside("joint") - named:
+        store.remove_beside(f"joint/{name}")
+    if gone:
+        for at in [drives.number[drive] for drive in gone]:
+            drives.joins[at] = replace(drives.joins[at], made_from="")
+        drives.write(store, gone.keys())
     return record
 
 
@@ -225,19 +251,22 @@ def _joint(store: Store) -> dict[str, Any]:
 
 
 def _grown(
-    store: Store, group: Group, pipeline: Pipeline, library: str, before: Mapping[str, Any], whole: bool
+    store: Store, group: Group, pipeline: Pipeline, library: str, before: Mapping[str, Any], whole: bool,
+    gone: dict[str, str],
 ) -> tuple[dict[str, Any], dict[str, str]]:  # fmt: skip
     """The group as joint.json has it, its new drives placed in the components `before`, and the keys of those that are
     not tried again."""
     header, judged = tables.TableMetadata(_settings(pipeline), library), group.judged
-    gone = list[str]()
-    pairs = {(one.later, one.earlier): partial(_sound_ledger, one, gone) for one in group.pair_ledgers if one.verified}
+    damaged = dict[str, str]()
+    entries = [one for one in group.pair_ledgers if one.verified]
+    pairs = {(one.later, one.earlier): partial(_ledger, store, one, damaged) for one in entries}
     inside, known = set(group.drives), [one for other in before.get("groups", []) for one in other["components"]]
-    known = [one for one in known if inside & set(one["drives"]) and _has_folders(store.root / "joint", one)]
+    known = [one for one in known if inside & set(one["drives"]) and _is_there(store, one)]
     stayed, lost = before.get("judged", {}), set[str]()
     if not known or all(stayed.get(one) != judged[one] for one in group.drives):
         seed = _first_of(group, pipeline)
-        known, stayed = _solved(store, seed, pipeline, library)["components"], {one: judged[one] for one in seed.drives}
+        known = _solved(store, seed, pipeline, library, damaged)["components"]
+        stayed = {one: judged[one] for one in seed.drives}
     while True:
         stays = [one for one in group.drives if stayed.get(one) == judged[one] and one not in lost]
         try:
@@ -253,9 +282,11 @@ def _grown(
         {"query_drive": later, "match_drive": earlier, "reason": why.strip()}
         for (later, earlier), why in growth.apart.items()
     ]
-    record = {"key": group.key, "drives": list(group.drives), "components": growth.records(), "apart": apart}
-    if growth.reasons or gone:
-        record["reason"] = " ".join([*growth.reasons, *dict.fromkeys(gone)])
+    key = "" if growth.failed or damaged else group.key  # tried again
+    record = {"key": key, "drives": list(group.drives), "components": growth.records(), "apart": apart}
+    if growth.reasons or damaged:
+        record["reason"] = " ".join([*growth.reasons, *damaged.values()])
+    gone |= damaged
     return record, {drive: key for drive, key in judged.items() if drive not in growth.failed}
 
 
@@ -282,23 +313,27 @@ def folders_of(component: Mapping[str, Any]) -> set[str]:
     return {component["folder"], *component.get("grown", {}).values()}
 
 
-def _has_folders(joint: Path, component: Mapping[str, Any]) -> bool:
-    return all((joint / one / "component.json").is_file() for one in folders_of(component))
+def _is_there(store: Store, component: Mapping[str, Any], checked: bool = False) -> bool:
+    """Whether the folders of a component are there and, if `checked`, as they were written."""
+    if checked:
+        return is_whole(store, component["folder"], component["drives"])
+    return all(store.has_beside(f"joint/{one}/component.json") for one in folders_of(component))
 
 
-def _solved(store: Store, group: Group, pipeline: Pipeline, library: str) -> dict[str, Any]:
+def _solved(store: Store, group: Group, pipeline: Pipeline, library: str, gone: dict[str, str]) -> dict[str, Any]:
     staging = store.staging / "joint"
     shutil.rmtree(staging, ignore_errors=True)
-    runs = [store.run(drive) for drive in group.drives]
     try:
-        record = solve_group(group, runs, pipeline, library, staging)
+        record = solve_group(store, group, pipeline, library, staging, gone)
     except DamagedDriveError:  # the others are solved without it
         raise
     except VplogError as error:  # one group must not take the others along; it is tried again
         return {"key": "", "drives": list(group.drives), "components": [], "apart": [], "reason": str(error)}
+    if damaged := [gone[drive] for drive in group.drives if drive in gone]:
+        record |= {"key": "", "reason": " ".join(damaged)}
     for component in record["components"]:
         place = store.root / "joint" / component["folder"]
-        if is_whole(place, component["drives"]):  # of a join that was killed; its name says that it is the same
+        if is_whole(store, component["folder"], component["drives"]):  # of a join that was killed: it is the same
             continue
         place.parent.mkdir(exist_ok=True)
         shutil.rmtree(place, ignore_errors=True)

@@ -3,13 +3,14 @@
     MAP/joins/drive=NEW/camera.json          the drive's camera, for those that come after it
     MAP/joins/drive=NEW/features.parquet     the features of its keyframes for verification, likewise
     MAP/joins/drive=NEW/match=OLD.parquet    the ledger of its keyframes in a drive before it
-    MAP/joins/drive=NEW/joins.json           after which drives it came, and which of them it was verified against
+    MAP/joins/states-...                     after which drives each came (join_states.py)
 
 What two drives have in common lies with the one that came later, so a new drive touches no folder but its own.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,8 +39,6 @@ DRIVE_FILES = ("camera.json", "features.parquet")
 """Files that depend on the drive alone, not on its name or the other drives."""
 _SEARCH = "vplog.maps.joining.candidate_drives"
 """The module that chooses the drives that one is searched in."""
-_PAIR = {"match": str, "match_key": str, "candidates": int, "verified": int, "ledger": str}
-"""Fields of a pair in joins.json."""
 
 
 @dataclass(frozen=True)
@@ -148,56 +147,32 @@ def _camera_key(member: Member, pipeline: Pipeline) -> str:
     return key_of({"member": member.key, "verify": verify, "code": code["code"]})
 
 
-@dataclass(frozen=True)
-class JoinState:
-    """joins.json: after which drives one came, and which of them it was verified against."""
-
-    position: int
-    """Increases from drive to drive: by ID within a batch. It stays while the drive stays what it is."""
-    member: str
-    """Key of the drive that has it."""
-    made_from: str = ""
-    """sha256 over what the pairs depend on, beside the drives before it; empty as long as they are not all there."""
-    pairs: tuple[dict[str, Any], ...] = ()
-    """`match`, `match_key` (the drive's), `candidates`, `verified`, and `ledger`, its key, empty where it is
-    left out; `reason` then says why."""
-
-
 def search_code() -> str:
     """sha256 over the code that chooses what is verified, and verifies it; read once, which takes half a second."""
     return code_of(*_CODE, _SEARCH)["code"]
 
 
-def search_key(member: Member, pipeline: Pipeline) -> str:
-    """sha256 over what a drive's joins depend on, beside the drives before it."""
-    return key_of({"member": member.key, **depends(pipeline), "search": search_code()})
+def search_key(pipeline: Pipeline) -> str:
+    """sha256 over what the joins of every drive depend on, beside the drives."""
+    return key_of({**depends(pipeline), "search": search_code()})
 
 
-def read_joins(store: Store, drive: str) -> JoinState | None:
-    """joins.json; None where there is none, without pairs where these are damaged."""
-    record = _read(folder_of(store, drive) / "joins.json")
-    position, member, made_from, pairs = (record.get(name) for name in ("position", "member", "made_from", "pairs"))
-    if not (isinstance(position, int) and isinstance(member, str) and isinstance(made_from, str)):
-        return None
-    if not isinstance(pairs, list) or any(
-        not isinstance(pair, dict) or any(not isinstance(pair.get(name), kind) for name, kind in _PAIR.items())
-        for pair in pairs
-    ):
-        return JoinState(position, member)
-    return JoinState(position, member, made_from, tuple(pairs))
-
-
-def put_joins(store: Store, drive: str, joins: JoinState) -> None:
-    """Write joins.json. Raises ResultError."""
-    run_record.write_run_json(folder_of(store, drive) / "joins.json", {"drive": drive, **asdict(joins)})
-
-
-def remove_stale_ledgers(store: Store, drive: str, but: set[str]) -> None:
-    """Remove the ledgers of a drive in other drives than these, and files that a killed writer left."""
+def remove_stale_ledgers(store: Store, drive: str, but: Collection[str], before: Collection[str] = ()) -> None:
+    """Remove the ledgers of a drive in other drives than these, as those of `before`, and files that a killed writer
+    left."""
     folder = folder_of(store, drive)
-    known = {ledger_path(store, drive, earlier) for earlier in but}
-    for path in [*(set(folder.glob("match=*.parquet")) - known), *folder.glob(".*.part")]:
-        path.unlink(missing_ok=True)
+    known, stale = ({ledger_path(store, drive, earlier) for earlier in one} for one in (but, before))
+    stale |= set(folder.glob("match=*.parquet"))
+    for path in [*(stale - known), *folder.glob(".*.part")]:
+        store.remove_beside(path.relative_to(store.root).as_posix())
+
+
+def fetch_inputs(store: Store, pairs: Iterable[tuple[str, str]], drives: Iterable[str]) -> None:
+    """Fetch the ledgers of these pairs, later and earlier drive, and the `DRIVE_FILES` of drives, as far as a map on an
+    object store has them."""
+    paths = [ledger_path(store, *pair) for pair in pairs]
+    paths += [folder_of(store, drive) / name for drive in drives for name in DRIVE_FILES]
+    store.fetch_beside(path.relative_to(store.root).as_posix() for path in paths)
 
 
 def _read(path: Path) -> dict[str, Any]:

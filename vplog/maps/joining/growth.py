@@ -30,7 +30,7 @@ from vplog.maps.joining.joint_graph import (
     write_drive,
     write_ledgers,
 )
-from vplog.maps.joining.joint_record import is_whole
+from vplog.maps.joining.joint_record import fetch_poses, is_whole
 from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.layout import folder_name
 from vplog.results import run_record, tables
@@ -185,6 +185,7 @@ class Growth:
 
     def _solve(self, part: Part) -> None:
         """Solve a component as a whole; what no closures hold together any more is parted."""
+        fetch_poses(self._store, part.folders)
         names = list(part.folders)
         number = {drive: at for at, drive in enumerate(names)}
         own = [self._drive(drive) for drive in names]
@@ -219,8 +220,9 @@ class Growth:
     def _ledgers(self, part: Part) -> dict[tuple[str, str], Closures]:
         """The verified closures of all pairs of a component, as they were decided; of pairs whose drives were not in
         one component then, as rejected."""
-        found = dict[tuple[str, str], "Closures"]()
-        for folder in sorted({*part.folders.values()} - {""}):
+        found, folders = dict[tuple[str, str], "Closures"](), sorted({*part.folders.values()} - {""})
+        self._store.fetch_beside(f"joint/{folder}/joins.parquet" for folder in folders)
+        for folder in folders:
             found |= tables.read_joins(self._store.root / "joint" / folder / "joins.parquet")
         pairs = [pair for pair in self._pairs if pair[0] in part.folders and pair[1] in part.folders]
         known = {pair: found[pair] if pair in found else self._pairs[pair]() for pair in pairs}
@@ -233,7 +235,7 @@ class Growth:
         """Write a folder of MAP/joint for these drives, and return its name."""
         name = f"component={key_of(made_from)[:16]}"
         made, place = self._store.staging / "joint" / name, self._store.root / "joint" / name
-        if is_whole(place, list(poses)):  # of a join that was killed; its name says that it is the same
+        if is_whole(self._store, name, list(poses)):  # of a join that was killed; its name says that it is the same
             return name
         shutil.rmtree(made, ignore_errors=True)
         drives = {drive: known.get(drive) or self._drive(drive) for drive in poses}
@@ -262,6 +264,7 @@ class Growth:
         if not folder:
             with reading_drive(drive):
                 return tables.read_keyframes(self._store.run(drive) / "keyframes.parquet")
+        fetch_poses(self._store, {drive: folder})
         try:
             return tables.read_keyframes(self._store.root / "joint" / folder / folder_name(drive) / "keyframes.parquet")
         except ResultError as error:

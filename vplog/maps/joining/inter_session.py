@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -73,7 +73,7 @@ def with_proposals(known: Candidates, number: int, more: Proposals, pipeline: Pi
 def candidates_among(
     later: Mapping[int, Sequence[Any]],
     earlier: Callable[[int], Sequence[Any]],
-    searched: Mapping[int, Container[int]],
+    searched: Mapping[int, Collection[int]],
     state: PlaceState,
     pipeline: Pipeline,
     execution: Execution,
@@ -86,17 +86,18 @@ def candidates_among(
     Progress counts the pairs of drives that were compared.
     """
     found = dict.fromkeys(later, Candidates(np.empty(0, np.int32), propose([], ProposeSettings())))
-    inside = Execution(-(-execution.threads // max(later)))
-    total, done = sum(number in searched[one] for one in later for number in range(max(later))), 0
+    queries: dict[int, list[int]] = {}
+    for one in later:
+        for number in searched[one]:
+            queries.setdefault(number, []).append(one)
+    inside = Execution(-(-execution.threads // max(len(queries), 1)))
+    total, done, numbers = sum(map(len, queries.values())), 0, sorted(queries)
 
     def compare(number: int) -> list[tuple[int, Proposals]]:
-        queries = [one for one in later if number in searched[one]]
-        if not queries:
-            return []
         known = later[number] if number in later else earlier(number)
-        return [(one, proposed_in(later[one], known, state, pipeline, inside)) for one in queries]
+        return [(one, proposed_in(later[one], known, state, pipeline, inside)) for one in queries[number]]
 
-    for number, proposed in enumerate(execution.map(compare, range(max(later)), ahead=2)):
+    for number, proposed in zip(numbers, execution.map(compare, numbers, ahead=2), strict=True):
         for one, more in proposed:
             found[one] = with_proposals(found[one], number, more, pipeline)
         done += len(proposed)

@@ -6,13 +6,12 @@ by geometry. Drives come in order of their IDs within a batch, and after all tha
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
@@ -27,7 +26,8 @@ from vplog.maps.joining import drive_pairs
 from vplog.maps.joining.candidate_drives import candidates_of, places_of
 from vplog.maps.joining.components import Drives, PairLedger, solve_groups
 from vplog.maps.joining.inter_session import DrivePair, likely_pairs
-from vplog.maps.joining.members import CameraTrust, Member, member_of, why_not_joined
+from vplog.maps.joining.join_states import JoinState, read_states, write_states
+from vplog.maps.joining.members import CameraTrust, Member, member_of
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import damaged_table
 from vplog.maps.storage.layout import PICTURES, folder_name
@@ -95,10 +95,9 @@ def join(
         pipeline = pipeline.model_copy(update={"join": lean})
 
     def joined() -> dict[str, Any]:
-        if store.mirror is not None:
-            store.mirror.rest()
+        store.fetch_beside(["joint.json"])  # for `send_rest` to see whether others have changed it
         drives = read_drives(store, urls)
-        new = [at for at in range(len(drives.members)) if not _is_up_to_date(store, drives, at, pipeline)]
+        new = _out_of_date(store, drives, pipeline)
         return _join(_Work(store, drives, new, pipeline, execution, executor, whole), places)
 
     def attempt() -> dict[str, Any]:
@@ -143,12 +142,12 @@ def _join(work: _Work, places: Callable[[], PlaceState] | None) -> dict[str, Any
             f"Closures of {one['query_drive']} to {one['match_drive']} were not enough to join them. {one['reason']}"
             for one in group["apart"]
         ]
-    searched = [drives.members[at] for at in work.new]
-    cameras = [(member.drive, drive_pairs.known_camera(store, member, pipeline)) for member in searched]
+    searched = [drives.names[at] for at in work.new]
+    cameras = [(drives.names[at], drive_pairs.known_camera(store, drives.member(at), pipeline)) for at in work.new]
     if uncalibrated := [drive for drive, known in cameras if known is not None and known.camera["matrix"] is None]:
         unjoined.append(f"No camera calibration, so no metric closure joins these drives: {', '.join(uncalibrated)}.")
     return {
-        "searched": [member.drive for member in searched],
+        "searched": searched,
         "pairs": len(pair_ledgers),
         "pairs_computed": computed,
         "components": [component for group in record["groups"] for component in group["components"]],
@@ -161,69 +160,81 @@ def _join(work: _Work, places: Callable[[], PlaceState] | None) -> dict[str, Any
 def read_drives(store: Store, urls: Mapping[str, str]) -> Drives:
     """Give new drives their place in the order, which stays: a killed join goes on as it began."""
     library = store.head().library or ""
-    members: dict[str, Member] = {}
     reasons, known = dict[str, str](), store.drives()
+    stored, states = read_states(store, known), dict[str, JoinState]()
+
+    def read(drive: str) -> Member:
+        return member_of(store, {**known[drive], "log": urls.get(drive, known[drive]["log"])})
+
     for drive, about in known.items():
+        state = stored.get(drive)
         if about.get(PICTURES):
             reasons[drive] = f"{drive} has no odometry: it can be found, and is joined with no other drive."
             continue
-        try:
-            member = member_of(store, {**about, "log": urls.get(drive, about["log"])})
-        except VplogError as error:
-            reasons[drive] = f"{drive} is joined with no other drive. {error}"
-            continue
-        if why := why_not_joined(member, library, about["library"]):
+        if state is None or state.key != about["key"]:
+            try:
+                member = read(drive)
+            except VplogError as error:
+                reasons[drive] = f"{drive} is joined with no other drive. {error}"
+                continue
+            fields = {"member": member.key, "key": about["key"], "gps": member.pipeline.gps.use}
+            state = JoinState(drive, -1, **fields) if state is None or state.member != member.key else state
+            state = replace(state, **fields)
+        states[drive] = state
+        if why := state.why_apart(library, about["library"]):
             reasons[drive] = why
-        else:
-            members[drive] = member
-    stored = {drive: drive_pairs.read_joins(store, drive) for drive in members}
-    last = max((one.position for one in stored.values() if one is not None), default=-1)
-    placed = {drive: own for drive, own in stored.items() if own is not None and own.member == members[drive].key}
-    for number, drive in enumerate([drive for drive in members if drive not in placed], start=last + 1):
-        placed[drive] = drive_pairs.JoinState(number, members[drive].key)
-        drive_pairs.put_joins(store, drive, placed[drive])
-    order = sorted(placed, key=lambda drive: (placed[drive].position, drive))
-    keys = {drive: about["key"] for drive, about in known.items()}
-    number = {drive: at for at, drive in enumerate(order)}
-    return Drives([members[one] for one in order], [placed[one] for one in order], keys, reasons, library, number)
+    last = max((one.position for one in states.values()), default=-1)
+    for number, drive in enumerate([drive for drive, one in states.items() if one.position < 0], start=last + 1):
+        states[drive] = replace(states[drive], position=number)
+    if changed := {drive for drive, one in states.items() if one is not stored.get(drive)}:
+        write_states(store, states.values(), changed)
+    order = sorted(states.keys() - reasons.keys(), key=lambda drive: (states[drive].position, drive))
+    others = [one for drive, one in states.items() if drive in reasons]
+    return Drives([states[one] for one in order], known, reasons, library, cache(lambda at: read(order[at])), others)
 
 
-def _is_up_to_date(store: Store, drives: Drives, at: int, pipeline: Pipeline) -> bool:
-    """Whether a drive need not be searched again: a drive that is gone has taken candidates that others might have. Of
-    many drives no ledger is read for that: of joint graphs that grow, one that is damaged is made again once it is."""
-    member, joins = drives.members[at], drives.joins[at]
-    few = len(drives.members) <= pipeline.join.judged_anew
-    return joins.made_from == drive_pairs.search_key(member, pipeline) and all(
-        drives.counts(at, pair)
-        and pair["ledger"]
-        and _is_there(drive_pairs.ledger_path(store, member.drive, pair["match"]), whole=few)
-        for pair in joins.pairs
-    )
-
-
-def _is_there(ledger: Path, *, whole: bool) -> bool:
-    return not damaged_table(ledger) if whole else ledger.is_file()
+def _out_of_date(store: Store, drives: Drives, pipeline: Pipeline) -> list[int]:
+    """Numbers of the drives that are to be searched: a drive that is gone has taken candidates that others might have.
+    Of many drives no ledger is read for that: one that is damaged is made again once it was needed."""
+    made_from = drive_pairs.search_key(pipeline)
+    new = [
+        at
+        for at, joins in enumerate(drives.joins)
+        if joins.made_from != made_from or not all(drives.counts(at, pair) and pair["ledger"] for pair in joins.pairs)
+    ]
+    left = sorted(set(range(len(drives.joins))) - set(new))
+    if len(drives.joins) > pipeline.join.judged_anew:
+        names = store.names_beside("joins")
+        new += [at for at in left if drives.joins[at].pairs and folder_name(drives.names[at]) not in names]
+        return sorted(new)
+    pairs = {at: [(drives.names[at], pair["match"]) for pair in drives.joins[at].pairs] for at in left}
+    drive_pairs.fetch_inputs(store, [pair for own in pairs.values() for pair in own], ())
+    paths = {at: [drive_pairs.ledger_path(store, *pair) for pair in own] for at, own in pairs.items()}
+    return sorted([*new, *(at for at, own in paths.items() if any(map(damaged_table, own)))])
 
 
 def _search(work: _Work, places: Callable[[], PlaceState] | None) -> list[DrivePair]:
-    store, members, pipeline = work.store, work.drives.members, work.pipeline
+    store, drives, pipeline = work.store, work.drives, work.pipeline
     later = [at for at in work.new if at]  # the first has none before it
     if not later:
         return []
-    state = places() if places else load_places(store.library(work.drives.library), pipeline, work.quiet)
-    found = candidates_of(store, members, later, state, pipeline, work.execution)
-    return likely_pairs(found, lambda at: places_of(store, members[at], state), state, pipeline.join)
+    state = places() if places else load_places(store.library(drives.library), pipeline, work.quiet)
+    records = {drive: drives.records[drive] for drive in drives.names}
+    found = candidates_of(store, records, later, state, pipeline, work.execution)
+    return likely_pairs(found, lambda at: places_of(store, drives.names[at], state), state, pipeline.join)
 
 
 def _verify(work: _Work, wanted: Sequence[DrivePair]) -> tuple[int, dict[tuple[str, str], str]]:
     """Store the ledgers that are not there yet; how many those were, and why others could not be made, by drives."""
-    store, members, progress = work.store, work.drives.members, work.execution.progress
+    store, drives, progress = work.store, work.drives, work.execution.progress
+    names = [(drives.names[one.later], drives.names[one.earlier]) for one in wanted]
+    drive_pairs.fetch_inputs(store, names, [drives.names[at] for at in _paired(work, wanted)])
     cameras, failed = _cameras(work, wanted)
     reasons: dict[tuple[str, str], str] = {}
 
     def tasks() -> Iterator[PairTask]:
         for at, one in enumerate(wanted):
-            later, earlier = members[one.later], members[one.earlier]
+            later, earlier = drives.member(one.later), drives.member(one.earlier)
             progress("verify between drives", at, len(wanted))
             if why := failed.get(one.later, "") or failed.get(one.earlier, ""):
                 reasons[later.drive, earlier.drive] = why
@@ -254,58 +265,62 @@ def _cameras(work: _Work, wanted: Sequence[DrivePair]) -> tuple[dict[int, Camera
 
     New drives are included, paired or not, while their features are in the caches of their runs.
     """
-    store, members, pipeline = work.store, work.drives.members, work.pipeline
-    paired = {at for one in wanted for at in (one.later, one.earlier)}
-    numbers = sorted(paired | {at for at in work.new if members[at].cache.is_dir()})
-    known = {at: drive_pairs.known_camera(store, members[at], pipeline) for at in numbers}
+    store, member, pipeline = work.store, work.drives.member, work.pipeline
+    numbers = sorted(_paired(work, wanted) | {at for at in work.new if member(at).cache.is_dir()})
+    known = {at: drive_pairs.known_camera(store, member(at), pipeline) for at in numbers}
     cameras = {at: camera for at, camera in known.items() if camera is not None}
     missing, failed = [at for at in numbers if at not in cameras], dict[int, str]()
     compute = partial(drive_pairs.compute_camera, pipeline=pipeline, execution=work.quiet)
-    done = run_tasks(compute, [members[at] for at in missing], work.executor)
-    for at, (member, camera, why) in zip(missing, done, strict=True):
+    done = run_tasks(compute, [member(at) for at in missing], work.executor)
+    for at, (one, camera, why) in zip(missing, done, strict=True):
         if camera is None:
             failed[at] = why
         else:
             cameras[at] = camera
-            drive_pairs.put_camera(store, member, pipeline, camera)
+            drive_pairs.put_camera(store, one, pipeline, camera)
     return cameras, failed
 
 
+def _paired(work: _Work, wanted: Sequence[DrivePair]) -> set[int]:
+    return {at for one in wanted for at in (one.later, one.earlier)}.union(work.new)
+
+
 def _record_pairs(work: _Work, wanted: Sequence[DrivePair], reasons: dict[tuple[str, str], str]) -> None:
-    store, drives = work.store, work.drives
+    store, drives, made_from = work.store, work.drives, drive_pairs.search_key(work.pipeline)
+    earlier: dict[int, list[int]] = {at: [] for at in work.new}
+    for one in wanted:
+        earlier[one.later].append(one.earlier)
     for at in work.new:
-        member, pairs = drives.members[at], []
-        for earlier in (drives.members[one.earlier] for one in wanted if one.later == at):
-            why = reasons.get((member.drive, earlier.drive), "")
-            path = drive_pairs.ledger_path(store, member.drive, earlier.drive)
-            ledger = None if why else tables.read_joins(path).get((member.drive, earlier.drive))
+        own, pairs = drives.joins[at], []
+        for other in (drives.joins[number] for number in earlier[at]):
+            why = reasons.get((own.drive, other.drive), "")
+            path = drive_pairs.ledger_path(store, own.drive, other.drive)
+            ledger = None if why else tables.read_joins(path).get((own.drive, other.drive))
             verdicts = () if ledger is None else ledger.verdict
             pairs.append({
-                "match": earlier.drive,
-                "match_key": earlier.key,
+                "match": other.drive,
+                "match_key": other.member,
                 "candidates": len(verdicts),
                 "verified": sum(verdict in ACCEPTED for verdict in verdicts),
                 "ledger": "" if why else tables.read_metadata(path).get("vplog.made_from", ""),
                 **({"reason": why} if why else {}),
             })  # fmt: skip
-        key = drive_pairs.search_key(member, work.pipeline)
-        drives.joins[at] = drive_pairs.JoinState(drives.joins[at].position, member.key, key, tuple(pairs))
-        drive_pairs.put_joins(store, member.drive, drives.joins[at])
+        drives.joins[at] = replace(own, made_from=made_from, pairs=tuple(pairs))
+        held, before = ({pair["match"] for pair in one.pairs if pair["ledger"]} for one in (drives.joins[at], own))
+        drive_pairs.remove_stale_ledgers(store, own.drive, held, before)
+    drives.write(store, {drives.names[at] for at in work.new})
 
 
 def _current_ledgers(work: _Work) -> list[PairLedger]:
-    """The pairs that count; the ledgers of others, as of drives that are gone, are removed."""
-    store, drives, new, pair_ledgers = work.store, work.drives, set(work.new), []
-    for at, (member, joins) in enumerate(zip(drives.members, drives.joins, strict=True)):
-        held = [pair for pair in joins.pairs if pair["ledger"] and drives.counts(at, pair)]
-        if at in new:
-            drive_pairs.remove_stale_ledgers(store, member.drive, {pair["match"] for pair in held})
-        for pair in held:
-            path = drive_pairs.ledger_path(store, member.drive, pair["match"])
-            if pair["candidates"]:
-                pair_ledgers.append(PairLedger(member.drive, pair["match"], path, pair["ledger"], pair["verified"]))
-    known = {folder_name(drive) for drive in [*drives.keys, *store.damaged]}
-    for folder in store.root.glob("joins/drive=*"):
-        if folder.name not in known:
-            shutil.rmtree(folder, ignore_errors=True)
+    """The pairs that count; what joins drives that are gone is removed."""
+    store, drives, pair_ledgers = work.store, work.drives, []
+    for at, (drive, joins) in enumerate(zip(drives.names, drives.joins, strict=True)):
+        for pair in joins.pairs:
+            if pair["ledger"] and pair["candidates"] and drives.counts(at, pair):
+                path = drive_pairs.ledger_path(store, drive, pair["match"])
+                pair_ledgers.append(PairLedger(drive, pair["match"], path, pair["ledger"], pair["verified"]))
+    known = {folder_name(drive) for drive in [*drives.records, *store.damaged]}
+    for name in store.names_beside("joins") - known:
+        if name.startswith("drive="):
+            store.remove_beside(f"joins/{name}")
     return pair_ledgers

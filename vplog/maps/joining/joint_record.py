@@ -65,14 +65,23 @@ def _is_component(record: Any) -> bool:
     )
 
 
-def is_whole(component: Path, drives: Sequence[str]) -> bool:
-    """Whether the record and the tables of a component are there, as they were written."""
-    names = [f"{folder_name(drive)}/{table}" for drive in drives for table in ("keyframes", "trajectory")]
+def is_whole(store: Store, folder: str, drives: Sequence[str]) -> bool:
+    """Whether the record and the tables of a component, in a folder of MAP/joint, are as they were written."""
+    if not store.has_beside(f"joint/{folder}/component.json"):
+        return False
+    names = [f"{folder_name(drive)}/{table}.parquet" for drive in drives for table in ("keyframes", "trajectory")]
+    names = [f"joint/{folder}/{name}" for name in ("component.json", "joins.parquet", *names)]
+    store.fetch_beside(names)
     try:
-        run_record.read_run_json(component / "component.json")
+        run_record.read_run_json(store.root / names[0])
     except ResultError:
         return False
-    return not any(damaged_table(component / f"{name}.parquet") for name in ("joins", *names))
+    return not any(damaged_table(store.root / name) for name in names[1:])
+
+
+def fetch_poses(store: Store, folders: Mapping[str, str]) -> None:
+    """Fetch the keyframes of drives from their folders in MAP/joint, of a map on an object store."""
+    store.fetch_beside(f"joint/{one}/{folder_name(drive)}/keyframes.parquet" for drive, one in folders.items() if one)
 
 
 def components_in(store: Store) -> list[dict[str, Any]] | None:

@@ -94,21 +94,6 @@ def opened_log(member: Member, check: bool = False) -> Log:
     return log
 
 
-def why_not_joined(member: Member, library: str, made_by: str) -> str:
-    """Why a drive is joined with no other; empty where it may be."""
-    if made_by != library:
-        return (
-            f"{member.drive} was described with library {made_by[:12]}, and the map's is {library[:12]}: it is joined "
-            "with no other drive."
-        )
-    if member.pipeline.gps.use:
-        return (
-            f"{member.drive} was solved with GPS factors, which are for one drive at a time: it keeps its own "
-            "georeference and is joined with no other drive."
-        )
-    return ""
-
-
 @dataclass(frozen=True)
 class CameraTrust:
     """The camera of a drive, and how far its calibration is trusted."""

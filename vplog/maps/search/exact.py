@@ -19,10 +19,12 @@ from vplog.data import Bytes, Float32s, Int32s, Ints, Ranking
 from vplog.errors import ResultError
 from vplog.execution.execution import Execution
 from vplog.maps.search.segment import Segment, open_segment
+from vplog.maps.storage.download_cache import cache_in
 from vplog.places.code_search import CodeIndex
 
 if TYPE_CHECKING:
     from vplog.maps.search.index import SegmentView
+    from vplog.maps.storage.remote_map import StoredFile
     from vplog.places.bobb import Place
     from vplog.places.code_search import Pairing
     from vplog.stages import CodedState
@@ -71,8 +73,8 @@ def merge(parts: Sequence[Answers], top: int) -> Answers:
 class Shard:
     """Some segments of a map to search, as a task for another process or machine."""
 
-    segments: Sequence[Segment | Path]
-    """A file, or the segment itself where it is in memory alone."""
+    segments: Sequence[Segment | Path | StoredFile]
+    """A file, also one on an object store, or the segment itself where it is in memory alone."""
     numbers: Sequence[Int32s]
     """For each segment, (D,) number of its drives, -1 where one does not count."""
     views: Sequence[Place]
@@ -88,9 +90,9 @@ def best_places(
     execution: Execution = Execution(), executor: Executor | None = None,
 ) -> Answers:  # fmt: skip
     """The `top` best of all places for each of Q views. With an executor its workers search, each some of the parts,
-    whose files they must see under the same path. The same answers for any execution."""
+    whose files they see under the same path, or fetch into their own caches. The same answers for any execution."""
     every = Shard(
-        [part.path if part.path and executor else part.segment for part in parts],
+        [(part.stored or part.path or part.segment) if executor else part.segment for part in parts],
         [part.numbers for part in parts], views, state.overlaps(), state.pairing, top, execution,
     )  # fmt: skip
     if executor is None:
@@ -119,7 +121,8 @@ def search_shard(shard: Shard) -> Answers:
     return best
 
 
-def _open(path: Path) -> Segment:
+def _open(where: Path | StoredFile) -> Segment:
+    path = where if isinstance(where, Path) else where.fetched(cache_in(None))
     try:
         return open_segment(path)
     except FileNotFoundError:

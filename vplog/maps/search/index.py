@@ -32,6 +32,7 @@ from vplog.storage.parquet_limits import check_file, footer_start
 
 if TYPE_CHECKING:
     from vplog.maps.storage.map_store import Store
+    from vplog.maps.storage.remote_map import StoredFile
     from vplog.stages import CodedState, PlaceState
 
 CAPACITY = 1 << 20
@@ -49,6 +50,8 @@ class SegmentView:
     """None where it is in memory alone."""
     numbers: Int32s
     """(D,) number of each of its drives in the map; -1 where the map has it no more, or another part has it."""
+    stored: StoredFile | None = None
+    """Where a map on an object store has it, for other machines."""
 
     @property
     def places(self) -> int:
@@ -71,9 +74,13 @@ def update_index(
     to is indexed in memory. Raises ResultError or LibraryError where descriptors cannot be read or are of another
     library.
     """
-    wanted = list(execution.map(lambda drive: content_of(store, drive, drives[drive]["key"]), drives))
+    wanted = list(execution.map(lambda drive: content_of(store, drive, drives[drive]), drives))
     known, useless, warnings = _open_all(store, state)
     parts, missing = _assign_drives(known, wanted)
+    if missing and store.mirror is not None:  # a writer may have indexed them
+        store.mirror.fetch_index(store.index)
+        known, useless, warnings = _open_all(store, state)
+        parts, missing = _assign_drives(known, wanted)
     absorbed, groups = _plan_compaction(parts, missing, {one: store.rows("descriptors", one.drive) for one in missing})
     parts = [part for part in parts if part not in absorbed]
     numbers = {one: number for number, one in enumerate(wanted)}
@@ -95,12 +102,14 @@ def update_index(
     return parts, warnings
 
 
-def content_of(store: Store, drive: str, key: str) -> Content:
-    """The drive's content now; on an object store by its manifest. Raises ResultError."""
-    if store.mirror is not None and (entry := store.mirror.drives[drive]["files"].get("descriptors.parquet")):
-        return Content(drive, key, entry["sha256"])
+def content_of(store: Store, drive: str, about: Mapping[str, Any]) -> Content:
+    """The drive's content by its drive.json or, on an object store, its manifest. Raises ResultError."""
+    files = about.get("files") if store.mirror is None else store.mirror.drives[drive]["files"]
+    entry = files.get("descriptors.parquet") if isinstance(files, dict) else None
+    if isinstance(entry, dict) and isinstance(mark := entry.get("sha256"), str):
+        return Content(drive, about["key"], mark)
     with reading_drive(drive):
-        return Content(drive, key, _footer_hash(store.file(drive, "descriptors.parquet")))
+        return Content(drive, about["key"], _footer_hash(store.file(drive, "descriptors.parquet")))
 
 
 def _footer_hash(path: Path) -> str:
@@ -179,7 +188,7 @@ def _plan_compaction(
 def _build(store: Store, group: Sequence[Content], state: CodedState, execution: Execution) -> Segment:
     def read(one: Content) -> pa.Array:
         column = read_column(store, one.drive, state)
-        if content_of(store, one.drive, one.key) != one:
+        if content_of(store, one.drive, store.record(one.drive)) != one:
             path = store.file(one.drive, "descriptors.parquet")
             raise ResultError(f"{path} was replaced while it was read. Run again.")
         return column

@@ -239,8 +239,8 @@ def search(
     else:
         parts, warnings = update_index(store, drives, state, execution)
         parts = [part for one in parts if (part := one.of(numbered)).places]
-        if store.mirror is not None:  # workers elsewhere do not see these files
-            parts = [replace(part, path=None) for part in parts]
+        if store.mirror is not None:  # workers elsewhere do not see these files, and fetch those of the bucket
+            parts = [replace(part, path=None, stored=store.mirror.stored_index(part.path)) for part in parts]
         places = sum(part.places for part in parts)
         if lines.settings.length == 1:
             return best_places(parts, state, descriptors, min(query.top, places), execution, executor), warnings

@@ -48,8 +48,8 @@ class Content:
     key: str
     """Key in drive.json: hash of all that the drive was made from."""
     mark: str
-    """Hash of the footer of its descriptors.parquet, which differs between tables even where the key is the same; on an
-    object store that of the whole file, which its manifest has."""
+    """sha256 of its descriptors.parquet by drive.json or the manifest, which differs between tables even where the key
+    is the same; in a map of an older vplog that of its footer."""
 
 
 @dataclass(frozen=True, eq=False)

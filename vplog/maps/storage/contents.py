@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import unquote
 
 from vplog.errors import LibraryError, NewerError, ResultError, nearest_path
 from vplog.maps.geo_bounds import earth_from_record, earth_of_run
+from vplog.maps.storage.catalogue import Entry, read_catalogue, state_of, write_catalogue
 from vplog.maps.storage.damage import (
     DamagedDriveError,
     UnreachableError,
@@ -23,7 +26,7 @@ from vplog.maps.storage.damage import (
 from vplog.maps.storage.layout import FORMAT, HASH, RUN_TABLES, drive_record, folder_name, write_changed
 from vplog.maps.storage.upload import send_rest, update_failures, write_head
 from vplog.results import run_record
-from vplog.storage.folders import regular_files
+from vplog.storage.folders import names_in, regular_files
 from vplog.storage.parquet_limits import check_version
 from vplog.version import __version__
 
@@ -57,6 +60,8 @@ class Store:
     """None for a map that is a folder."""
     damaged: dict[str, str] = field(default_factory=dict)
     """Drives that are left out of `drives` and of answers, and why."""
+    uncatalogued: set[str] = field(default_factory=set)
+    """Run folders of a map's folder that its catalogue did not have as they are."""
 
     def __str__(self) -> str:
         """The map's path or URL."""
@@ -158,6 +163,30 @@ class Store:
             with suppress(UnreachableError):
                 send_rest(self.mirror)
 
+    def names_beside(self, folder: str) -> set[str]:
+        """Names in a folder beside drives, as `joins`."""
+        found = set(names_in(self.root / folder))
+        return found if self.mirror is None else found | self.mirror.names_below(folder)
+
+    def fetch_beside(self, names: Iterable[str]) -> None:
+        """Fetch files beside drives that a map on an object store has. Raises ResultError."""
+        if self.mirror is not None and (wanted := list(names)):
+            self.mirror.rest(wanted)
+
+    def has_beside(self, name: str) -> bool:
+        """Whether there is a file beside drives of this name."""
+        there = self.mirror is not None and name not in self.mirror.held and name in self.mirror.manifest.now["rest"]
+        return there or (self.root / name).is_file()
+
+    def remove_beside(self, name: str) -> None:
+        """Remove a file beside drives, or a folder of such."""
+        if self.mirror is not None:
+            self.mirror.drop(name)
+        if (path := self.root / name).is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
     def drives(self) -> dict[str, dict[str, Any]]:
         """drive.json of every finished drive, by ID in order, but for those that are damaged. Raises NewerError."""
         if self.mirror is not None:
@@ -165,8 +194,16 @@ class Store:
             return {drive: known[drive]["record"] for drive in sorted(known) if drive not in self.damaged}
         removed = set(map(folder_name, self.removed()))
         found = dict[str, dict[str, Any]]()
-        for folder in sorted(self.root.glob("runs/drive=*")):
-            if folder.name in removed or not any((folder / name).exists() for name in ("drive.json", *RUN_TABLES)):
+        for name in names_in(self.root / "runs"):
+            if name in removed or not name.startswith("drive="):
+                continue
+            state, (known, record) = state_of(f"{self.root}/runs/{name}"), self._catalogue.get(name, (None, {}))
+            if state is not None and state == known:
+                if record["drive"] not in self.damaged:
+                    found[record["drive"]] = record
+                continue
+            folder = self.root / "runs" / name
+            if not any((folder / one).exists() for one in ("drive.json", *RUN_TABLES)):
                 continue
             try:
                 record = self._checked_record(folder)
@@ -175,9 +212,25 @@ class Store:
             except ResultError as error:
                 self.damaged.setdefault(_drive_of(folder), str(error))
             else:
+                self.uncatalogued.add(name)
+                if state is not None:
+                    self._catalogue[name] = [state, record]
                 if record["drive"] not in self.damaged:
                     found[record["drive"]] = record
         return dict(sorted(found.items()))
+
+    @cached_property
+    def _catalogue(self) -> dict[str, Entry]:
+        return read_catalogue(self.root)
+
+    def write_catalogue(self) -> None:
+        """Note the drives of a map's folder as they are, for commands to come."""
+        there = set(map(folder_name, self.drives()))
+        if gone := self._catalogue.keys() - there:
+            for name in gone:
+                del self._catalogue[name]
+        if gone or self.uncatalogued:
+            write_catalogue(self.root, self._catalogue)
 
     def _checked_record(self, folder: Path) -> dict[str, Any]:
         """drive.json of a run folder whose tables are there. Raises ResultError."""

@@ -56,13 +56,20 @@ def quoted(drive: str) -> str:
     return f"{begins}~{hashlib.sha256(drive.encode()).hexdigest()[:16]}"
 
 
+_WANTED = {"drive": str, "log": str, "key": str, "library": str, "inputs": dict}
+
+
+def is_drive_record(record: dict[str, Any]) -> bool:
+    """Whether it has the fields of drive.json that are relied on."""
+    return all(isinstance(record.get(name), kind) for name, kind in _WANTED.items())
+
+
 def drive_record(folder: Path) -> dict[str, Any]:
     """drive.json of a run folder in a map. Raises ResultError."""
     record = run_record.read_run_json(folder / "drive.json")
-    wanted = {"drive": str, "log": str, "key": str, "library": str, "inputs": dict}
-    if any(not isinstance(record.get(name), kind) for name, kind in wanted.items()):
+    if not is_drive_record(record):
         raise ResultError(
-            f"{folder}/drive.json lacks one of {', '.join(wanted)}. Move the folder out of the map, and {ADD_AGAIN}"
+            f"{folder}/drive.json lacks one of {', '.join(_WANTED)}. Move the folder out of the map, and {ADD_AGAIN}"
         )
     if folder.name.startswith("drive=") and folder.name != folder_name(record["drive"]):
         raise ResultError(

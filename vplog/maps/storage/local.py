@@ -7,7 +7,7 @@ import fcntl
 import os
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
@@ -115,12 +115,12 @@ def link_tables(store: Store, drive: str) -> None:
     for name in TABLES:
         source = store.run(drive) / f"{name}.parquet"
         path = store.root / name / folder_name(drive) / source.name
-        if not source.is_file():
-            raise ResultError(f"{source} is not there. Copy it back, or {ADD_AGAIN}")
-        if path.exists():
+        with suppress(OSError):  # they are not both there
             alike = path.stat().st_size == source.stat().st_size
             if path.samefile(source) or (alike and sha256_of(path) == sha256_of(source)):  # a file system without links
                 continue
+        if not source.is_file():
+            raise ResultError(f"{source} is not there. Copy it back, or {ADD_AGAIN}")
         part = store.staging / f"{name}-{os.getpid()}.parquet"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -7,6 +7,7 @@
     MAP/descriptors/... closures/... edges/... trajectory/...   it; hard links to the run folder's files
     MAP/failures.json                          drives that could not be run, each with its error
     MAP/removed.json                           drives that are being removed, while that is not done
+    MAP/.drives.json.gz                       drives as the last writer found them (catalogue.py)
     MAP/delta/                                 the data sets as Delta Lake tables, once they are asked for (delta.py)
 
 A drive is in the map when its run folder is: that is one rename (local.py); on an object store, when the newest
@@ -81,6 +82,7 @@ def writing(root: Path) -> Iterator[Store]:
         local.recover(store)
         yield store
         shutil.rmtree(store.staging, ignore_errors=True)
+        store.write_catalogue()
         follow_with_delta(store)
 
 

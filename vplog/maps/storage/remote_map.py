@@ -4,7 +4,7 @@
     MAP/libraries/HASH/...                            as in a folder
     MAP/runs/drive=ID/GENERATION/...                  the run folder; its generation is a random name, never used twice
     MAP/packs/TOKEN                                   small files of drives together, after `map compact` (packs.py)
-    MAP/rest/GENERATION/...                           all else that a map's folder has, as what joins its drives
+    MAP/rest/GENERATION/...                           all else that a map's folder has: what joins its drives, the index
     MAP/keyframes/drive=ID/keyframes.parquet          tables as data sets, and what joins drives by its own name; copied
                                                       within the store, after the manifest
 
@@ -15,15 +15,18 @@ none, is removed by `map vacuum` a day later.
 
 from __future__ import annotations
 
+import secrets
 import shutil
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import zstandard
 
@@ -34,7 +37,7 @@ from vplog.maps.storage.layout import ADD_AGAIN, RUN_TABLES, TABLES, folder_name
 from vplog.maps.storage.snapshot import Manifest, Snapshot, store_errors
 from vplog.results import run_record
 from vplog.storage.object_store import plain_errors
-from vplog.storage.remote_path import RemotePath, objects_below, reason
+from vplog.storage.remote_path import RemotePath, located, objects_below, reason
 from vplog.storage.scratch import files_in
 
 if TYPE_CHECKING:
@@ -46,6 +49,31 @@ _SECTIONS = 8
 """Sections that a reader holds."""
 Copies = dict[str, str | None]
 """Objects to copy within the store, by the new name; None: to remove."""
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    """A file on an object store, by name for other machines."""
+
+    url: str
+    sha256: str
+    bytes: int
+
+    def fetched(self, cache: Cache | None) -> Path:
+        """The file in this machine's cache. Raises ResultError where it cannot be had."""
+        if cache is None:
+            raise ResultError("A worker has no cache for the index of the map. Set VPLOG_CACHE to a folder there.")
+        target = cache.root / "objects" / self.sha256
+        part, place = target.with_name(f".{secrets.token_hex(8)}.part"), cast("RemotePath", located(self.url))
+        if not target.exists():
+            with store_errors(place):
+                target.parent.mkdir(parents=True, exist_ok=True)
+                digest = objects.fetch(place, part, self.bytes)
+                if digest != self.sha256:
+                    part.unlink()
+                    raise ResultError(f"{place} is damaged. Remove it: the next join builds it again.")
+                part.replace(target)
+        return target
 
 
 class Mirror:
@@ -98,11 +126,13 @@ class Mirror:
             if newest.get(drive, {}).get("generation") != entry["generation"]:
                 shutil.rmtree(self.run(drive), ignore_errors=True)
         self.drives = dict(newest)
-        ledgers = {name for name in self.local_rest() if name.startswith("joins/") and name.endswith(".parquet")}
+        rest, before = self.manifest.now["rest"], self.held
+        same = {name: about for name, about in before.items() if rest.get(name) == about}
+        self.held = {name: about for name, about in same.items() if not of_order(name)}
         for name in self.local_rest():
-            if name in self.held or name not in ledgers - self.manifest.now["rest"].keys():  # what was verified counts
+            verified = name.startswith("joins/") and name.endswith(".parquet")  # which counts
+            if name not in self.held and (name in before or name in rest or not (verified or _of_index(name))):
                 (self.local / name).unlink()
-        self.held.clear()
 
     def local_rest(self) -> list[str]:
         """Names of the files beside drives and libraries in the local folder."""
@@ -181,15 +211,46 @@ class Mirror:
                     if why := self._fetch_file(self.remote / file, self.local / file, about):
                         raise ResultError(f"{why}. Copy it back.")
 
+    def names_below(self, folder: str) -> set[str]:
+        """Names in a folder beside drives."""
+        start = f"{folder}/"
+        return {name.split("/")[start.count("/")] for name in self.manifest.now["rest"] if name.startswith(start)}
+
+    def drop(self, name: str) -> None:
+        """Let a file beside drives, or a folder of such, be removed with what is sent next."""
+        rest, start = self.manifest.now["rest"], f"{name}/"
+        self.held |= {
+            one: rest[one] for one in ([name] if name in rest else rest) if one == name or one.startswith(start)
+        }
+
+    def fetch_index(self, folder: Path) -> None:
+        """Download what the map has of its index into a folder. What cannot be had is built."""
+        for name, about in self.manifest.now["rest"].items():
+            target = folder / PurePosixPath(name).name
+            if _of_index(name) and not target.exists():
+                with suppress(OSError, ResultError):
+                    if not self._fetch_file(self.remote / "rest" / about["generation"] / name, target, about):
+                        self.held |= {name: about} if folder.parent == self.local else {}
+
+    def stored_index(self, path: Path | None) -> StoredFile | None:
+        """Where the map has a file of the index that is here; None where no writer has put it there."""
+        name = f"index/{'' if path is None else path.name}"
+        if (about := self.manifest.now["rest"].get(name)) is None:
+            return None
+        place = self.remote / "rest" / about["generation"] / name
+        return StoredFile(place.url, about["sha256"], about["bytes"])
+
     def rest(self, names: Collection[str] = ()) -> None:
         """Download all other files of the map into the local folder, or those of these names.
 
         Raises ResultError where some of it is damaged. A writer goes on without that and without the joint graphs,
         which `map join` makes again; `rest_damage` says why.
         """
-        known = {folder_name(drive) for drive in self.drives}  # files of other drives are not wanted
-        files = {name: about for name, about in self.manifest.now["rest"].items() if name in names or not names}
-        wanted = [name for name in files if name not in self.held and not drives_in(name) - known]
+        files = self.manifest.now["rest"]
+        if not names:
+            known = {folder_name(drive) for drive in self.drives}  # files of other drives are not wanted
+            names = [name for name in files if not drives_in(name) - known and not _of_index(name)]
+        wanted = [name for name in dict.fromkeys(names) if name in files and name not in self.held]
 
         def fetched(name: str) -> str:
             place = self.remote / "rest" / files[name]["generation"] / name
@@ -205,6 +266,8 @@ class Mirror:
         self.held |= {name: files[name] for name in wanted}
         if damaged:
             self.rest_damage = damaged[0]
+            self.drop("joint.json")
+            self.drop("joint")
             (self.local / "joint.json").unlink(missing_ok=True)
             shutil.rmtree(self.local / "joint", ignore_errors=True)
 
@@ -271,6 +334,15 @@ class Mirror:
     def run(self, drive: str) -> Path:
         """The drive's local folder."""
         return self.local / "runs" / folder_name(drive)
+
+
+def of_order(name: str) -> bool:
+    """Whether a file says which drives a join has come to."""
+    return name == "joint.json" or name.startswith("joins/states-")
+
+
+def _of_index(name: str) -> bool:
+    return name.startswith("index/")
 
 
 def _state(about: dict[str, Any]) -> tuple[int, str]:

@@ -16,7 +16,7 @@ from vplog.errors import ResultError, SettingsError
 from vplog.maps.storage import objects, older_maps
 from vplog.maps.storage.damage import rows_of
 from vplog.maps.storage.layout import RUN_TABLES, TABLES, drive_record, folder_name, renamed, sha256_of
-from vplog.maps.storage.remote_map import Copies, Mirror, drives_in, tag_of
+from vplog.maps.storage.remote_map import Copies, Mirror, drives_in, of_order, tag_of
 from vplog.maps.storage.snapshot import LostRaceError, Snapshot, now, store_errors
 from vplog.results import run_record, tables
 from vplog.storage.remote_path import RemotePath, names_below, objects_below
@@ -239,7 +239,10 @@ def remove(mirror: Mirror, drives: Sequence[str]) -> None:
 def send_rest(mirror: Mirror) -> None:
     """Send what the local folder has beside drives and libraries, if it changed; tables and records also by their own
     names, for those who read them as data sets. Raises LostRaceError where another writer has changed the same."""
-    known, hashes = mirror.held, {name: sha256_of(mirror.local / name) for name in mirror.local_rest()}
+    known, hashes = mirror.held, dict[str, str]()
+    for name in mirror.local_rest():  # parts of the index are named by what is in them
+        same = name in known and name.endswith(".lists")
+        hashes[name] = known[name]["sha256"] if same else sha256_of(mirror.local / name)
     new = [name for name in hashes if hashes[name] != known.get(name, {}).get("sha256")]
     gone = [name for name in known if name not in hashes]
     if not new and not gone:
@@ -252,8 +255,8 @@ def send_rest(mirror: Mirror) -> None:
     def change(snapshot: Snapshot) -> None:
         check_recent(began)
         contested = set(changes)
-        if any(map(_of_order, changes)):  # drives are joined one after the other
-            contested |= set(filter(_of_order, snapshot["rest"]))
+        if any(map(of_order, changes)):  # drives are joined one after the other
+            contested |= set(filter(of_order, snapshot["rest"]))
         for name in contested:
             theirs = snapshot["rest"].get(name)
             if theirs != known.get(name) and (theirs or {}).get("sha256") != hashes.get(name):
@@ -272,11 +275,6 @@ def send_rest(mirror: Mirror) -> None:
         raise
     mirror.held = {name: mirror.manifest.now["rest"][name] for name in hashes if name in mirror.manifest.now["rest"]}
     _copy(mirror, {name: source for name, source in mirror.manifest.now["copies"].items() if name in changes})
-
-
-def _of_order(name: str) -> bool:
-    """Whether a file says which drives a join has come to."""
-    return name.rpartition("/")[2] in ("joins.json", "joint.json")
 
 
 def _replace_rest(snapshot: Snapshot, changes: dict[str, Any]) -> None:
