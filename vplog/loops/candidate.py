@@ -111,7 +111,7 @@ def check_queries(later: Drive, earlier: Drive, match: int, queries: Sequence[in
             rows.append(Row(len(mine), 0, pose))
         else:
             if landmarks is None:
-                landmarks = _landmarks(earlier, match)
+                landmarks = drive_landmarks(earlier, match)
             rows.append(_check_metric(later, own, (mine, found), landmarks, earlier.stereo, settings.metric))
     return rows
 
@@ -123,7 +123,7 @@ def check_reverse(
 
     `share` is the calibration's error. Where the query has too few landmarks the row is unchanged.
     """
-    landmarks = _landmarks(later, query)
+    landmarks = drive_landmarks(later, query)
     # the limits have been checked in one direction; in reverse only the pose is compared
     metric = lenient(later.settings).metric
     result = []
@@ -140,7 +140,8 @@ def check_reverse(
     return result
 
 
-def _landmarks(drive: Drive, row: int) -> Landmarks:
+def drive_landmarks(drive: Drive, row: int) -> Landmarks:
+    """The landmarks of a keyframe of a drive."""
     settings = drive.settings
     return landmarks_of(row, drive.keyframes, drive.camera, drive.features, settings.matching, settings.landmarks)
 
