@@ -119,8 +119,6 @@ def test_further_cameras_are_calibrated_and_have_frames_of_their_own() -> None:
     front = Selection(image=found[0].channel)
     beside = further_cameras(found, front, TopicChoice())
     others = {one.channel.topic: left and left.channel.topic for one, left in beside}
-        one.channel.topic: left and left.channel.topic for one, left in further_cameras(found, front, TopicChoice())
-    }
     assert others == {"/left/image": None, "/right/image": "/left/image", "/rear/image": None}
     for choice in (TopicChoice(mask="/left/image"), TopicChoice(mask_topics={"/rear/image": "/left/image"})):
         assert "/left/image" not in [one.channel.topic for one, _ in further_cameras(found, front, choice)]
