@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain, product
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,13 +19,12 @@ from vplog.features.matching import match_features
 from vplog.geometry import se3
 from vplog.loops import pose_refinement, undistort
 from vplog.loops.calibration import body_twists, motion_covariance, stamp_covariance
-from vplog.loops.candidate import Drive, agree, drive_landmarks
+from vplog.loops.candidate import Drive, agree
 from vplog.loops.verify_metric import CHI2_2, MODELS, SAMPLE, find_pose, inliers, log10_false_alarms, observe
 
 if TYPE_CHECKING:
     from vplog.data import Bools
     from vplog.execution.execution import Execution
-    from vplog.loops.landmarks import Landmarks
     from vplog.loops.pose_refinement import Matches
 
 _MOST_APART = np.cos(np.radians(50.0))
@@ -107,22 +106,17 @@ def verify_together(closures: Closures, rig: Rig, execution: Execution) -> list[
     """The C candidates of several cameras, those with enough matches with the pose and verdict by all cameras that
     share a view. Counts stay those of one pair of cameras."""
     tried = np.flatnonzero(~closures.of(Verdict.TOO_FEW_MATCHES, Verdict.NO_CALIBRATION))
-    order = tried[np.argsort(closures.match[tried], kind="stable")]
-    groups = np.split(order, np.flatnonzero(np.diff(closures.match[order])) + 1)
-
-    def work(group: Ints) -> list[Closures | None]:
-        known: dict[tuple[int, int], Landmarks] = {}
-        return [_verified(closures.rows(group[at : at + 1]), rig, known) for at in range(len(group))]
-
-    found = dict(zip(order.tolist(), chain.from_iterable(execution.map(work, groups)), strict=True))
-    return [found.get(at) or closures.rows(np.array([at])) for at in range(len(closures))]
+    order = tried[np.argsort(closures.match[tried], kind="stable")].tolist()  # landmarks of a match are remembered
+    found = execution.map(lambda at: _verified(closures.rows(np.array([at])), rig), order)
+    better = dict(zip(order, found, strict=True))
+    return [better.get(at) or closures.rows(np.array([at])) for at in range(len(closures))]
 
 
-def _verified(row: Closures, rig: Rig, known: dict[tuple[int, int], Landmarks]) -> Closures | None:
+def _verified(row: Closures, rig: Rig) -> Closures | None:
     """One candidate by all cameras; None where these add nothing to what one pair of them has."""
     settings, accepted = rig.drives[0].settings, bool(row.accepted[0])
     metric, start = settings.metric, row.match_from_query[0] if accepted else None
-    pairs = _pairs(row, start, rig, known)
+    pairs = _pairs(row, start, rig)
     if len(pairs) < 2 or (found := _solve(pairs, start, rig)) is None:
         return None
     pose, excess, inlier = found
@@ -155,7 +149,7 @@ def _verified(row: Closures, rig: Rig, known: dict[tuple[int, int], Landmarks]) 
     return replace(posed, verdict=[Verdict.ACCEPTED], **columns)
 
 
-def _pairs(row: Closures, start: Floats | None, rig: Rig, known: dict[tuple[int, int], Landmarks]) -> list[_Pair]:
+def _pairs(row: Closures, start: Floats | None, rig: Rig) -> list[_Pair]:
     """The matches of all pairs of cameras that look the same way, by the pose `start`, or by the pair whose candidate
     it is."""
     later, earlier = rig.pictures(int(row.query[0])), rig.pictures(int(row.match[0]))
@@ -171,9 +165,7 @@ def _pairs(row: Closures, start: Floats | None, rig: Rig, known: dict[tuple[int,
         mine, theirs = match_features(own, other.features(match), settings.matching)
         if len(mine) < _LEAST:
             continue
-        if (b, match) not in known:
-            known[b, match] = drive_landmarks(other, match)
-        landmarks, rays = known[b, match], undistort.rays(drive.camera, own.points[mine])
+        landmarks, rays = other.landmarks(match), undistort.rays(drive.camera, own.points[mine])
         usable = np.flatnonzero(landmarks.known[theirs] & np.isfinite(rays).all(axis=1))
         if len(usable) >= _LEAST:
             used = own.rows(mine[usable])
