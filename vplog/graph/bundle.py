@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
 _HUBER = 1.5
 """Sigmas beyond which an error counts linearly, as in the refinement of a single pose."""
 _STEPS = 6
-"""Steps at most; a window starts from the last one's result, and two or three converge."""
+"""Levenberg-Marquardt steps; a window starts from the last one's result, and two or three converge."""
 _CONVERGED = 1e-3
 """Relative decrease of the error that ends it: far below a sigma of the newest pose."""
 _FIXED = 1e-6
@@ -69,8 +68,11 @@ def adjust(world_from_camera: Floats, points: Floats, observed: Observations, me
         held = gtsam.noiseModel.Isotropic.Sigma(1, _FIXED * apart)
         graph.add(gtsam.RangeFactorPose3(X(0), X(1), apart, held))
     _add_observations(graph, observed)
+    settings = gtsam.LevenbergMarquardtParams()
+    settings.setMaxIterations(_STEPS)
+    settings.setRelativeErrorTol(_CONVERGED)
     try:
-        found = _optimized(graph, start)
+        found = gtsam.LevenbergMarquardtOptimizer(graph, start, settings).optimize()
         last = len(world_from_camera) - 1
         joint = gtsam.Marginals(graph, found).jointMarginalCovariance(gtsam.KeyVector([X(last - 1), X(last)]))
         covariance = joint.fullMatrix()
@@ -84,23 +86,6 @@ def adjust(world_from_camera: Floats, points: Floats, observed: Observations, me
     return Bundle(poses, moved, both @ covariance @ both.T)
 
 
-def _optimized(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
-    """By Gauss-Newton, at half the time of Levenberg-Marquardt, which takes over where it diverges. Raises RuntimeError
-    where the system is indeterminate."""
-    before = graph.error(start)
-    for optimizer, settings in (
-        (gtsam.GaussNewtonOptimizer, gtsam.GaussNewtonParams()),
-        (gtsam.LevenbergMarquardtOptimizer, gtsam.LevenbergMarquardtParams()),
-    ):
-        settings.setMaxIterations(_STEPS)
-        settings.setRelativeErrorTol(_CONVERGED)
-        with suppress(RuntimeError):  # an indeterminate system
-            found = optimizer(graph, start, settings).optimize()
-            if graph.error(found) <= before:
-                return found
-    raise RuntimeError("The observations do not determine the views.")
-
-
 def _add_observations(graph: gtsam.NonlinearFactorGraph, observed: Observations) -> None:
     """Factors of a stereo camera of 1 m baseline and focal length: rho is its disparity."""
     stereo, mono = gtsam.Cal3_S2Stereo(1.0, 1.0, 0.0, 0.0, 0.0, 1.0), gtsam.Cal3_S2(1.0, 1.0, 0.0, 0.0, 0.0)
@@ -112,19 +97,12 @@ def _add_observations(graph: gtsam.NonlinearFactorGraph, observed: Observations)
     # left x, right x, y of (x, y, rho)
     turned = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     full = turned @ full @ turned.T
-    views, points = ([key(row) for row in range(rows.max(initial=-1) + 1)]
-                     for key, rows in ((X, observed.view), (L, observed.landmark)))  # fmt: skip
-    models: dict[bytes, gtsam.noiseModel.Base] = {}  # rays of a camera without distortion have one covariance
     columns = (observed.view.tolist(), observed.landmark.tolist(), observed.xyrho.tolist(), measured.tolist())
     for row, (view, landmark, (x, y, rho), known) in enumerate(zip(*columns, strict=True)):
         covariance = full[row] if known else observed.rays[row]
-        if (noise := models.get(key := covariance.tobytes())) is None:
-            models[key] = noise = gtsam.noiseModel.Robust.Create(
-                huber, gtsam.noiseModel.Gaussian.Covariance(covariance)
-            )
+        noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(covariance))
         if known:
             at = gtsam.StereoPoint2(x, x - rho, y)
-            graph.add(gtsam.GenericStereoFactor3D(at, noise, views[view], points[landmark], stereo))
+            graph.add(gtsam.GenericStereoFactor3D(at, noise, X(view), L(landmark), stereo))
         else:
-            at = np.array([x, y])
-            graph.add(gtsam.GenericProjectionFactorCal3_S2(at, noise, views[view], points[landmark], mono))
+            graph.add(gtsam.GenericProjectionFactorCal3_S2(np.array([x, y]), noise, X(view), L(landmark), mono))
