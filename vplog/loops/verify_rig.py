@@ -205,9 +205,8 @@ def _fit(pose: Floats, pairs: Sequence[_Pair], inlier: Sequence[Bools]) -> tuple
     """The pose by the inliers of all pairs, and the residual variance over its expectation."""
 
     def equations(pose: Floats) -> tuple[Floats, Floats, float]:
-        each = zip(*(one.equations(pose, rows) for one, rows in zip(pairs, inlier, strict=True)), strict=True)
-        H, g, cost = (sum(values) for values in each)
-        return H, g, cost
+        H, g, costs = zip(*(one.equations(pose, rows) for one, rows in zip(pairs, inlier, strict=True)), strict=True)
+        return np.sum(H, axis=0), np.sum(g, axis=0), sum(costs)
 
     pose, _, cost = pose_refinement.gauss_newton(pose, equations)
     counts = [pose_refinement.measurements(one.matches.rows(rows)) for one, rows in zip(pairs, inlier, strict=True)]
