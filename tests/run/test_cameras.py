@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -77,9 +78,25 @@ def test_the_rear_camera_closes_the_way_back(rig: Path, verb: Callable[..., Said
     shown = verb("explain", out, "--closure", int(np.flatnonzero(used)[0]), "--json").json["picture"]
     assert shown["agree"] >= 20
     assert shown["references"]
+    check_exports(out, verb, tmp_path)
     again = verb("run", log, "-o", out, "--json", *QUICK, "--set", "gps.use=false").json
     assert again["stages"]["extract"]["parts_reused"] == again["stages"]["extract"]["parts"]
     assert again["graph_sha256"] == found["graph_sha256"]
+
+
+def check_exports(run: Path, verb: Callable[..., Said], folder: Path) -> None:
+    """Both cameras' pictures, each with its own model, and points that both saw."""
+    for kind in ("colmap", "nerfstudio"):
+        assert verb("export", run, "--format", kind, "-o", folder / kind).code == 0
+    sparse = folder / "colmap" / "sparse" / "0"
+    assert [line[:2] for line in (sparse / "cameras.txt").read_text().splitlines()] == ["1 ", "2 "]
+    camera_of = {line.split()[0]: line.split()[8] for line in (sparse / "images.txt").read_text().splitlines()[::2]}
+    tracks = [line.split()[8::2] for line in (sparse / "points3D.txt").read_text().splitlines()]
+    assert sum(len({camera_of[image] for image in track}) == 2 for track in tracks) > 100
+    tree = json.loads((folder / "nerfstudio" / "transforms.json").read_text())
+    assert "fl_x" not in tree
+    assert len({(folder / "nerfstudio" / frame["file_path"]).parent for frame in tree["frames"]}) == 2
+    assert all(frame["fl_x"] > 0 for frame in tree["frames"])
 
 
 def test_one_camera_that_is_chosen_is_alone(rig: Path, verb: Callable[..., Said], tmp_path: Path) -> None:
