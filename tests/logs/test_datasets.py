@@ -17,6 +17,7 @@ from vplog.data import Gps, Trajectory
 from vplog.errors import LogError
 from vplog.logs import TopicChoice
 from vplog.logs.calibration_file import read_calibrations
+from vplog.logs.datasets.video import VideoFrames
 from vplog.stages import Log
 
 if TYPE_CHECKING:
@@ -338,6 +339,13 @@ def write_video(path: Path, pictures: np.ndarray, codec: str, turn_deg: int = 0)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
     return times
+
+
+def test_a_long_video_costs_no_more_for_each_frame(tmp_path: Path) -> None:
+    """Stamps are worked out once, not once for each frame of as many frames."""
+    write_video(tmp_path / "a.mp4", np.zeros((9, 32, 48), np.uint8), "mpeg4")
+    frames = VideoFrames(tmp_path / "a.mp4")
+    assert frames.stamp_ns is frames.stamp_ns
 
 
 @pytest.mark.parametrize(

@@ -237,7 +237,7 @@ def test_points_are_those_of_the_world_and_outliers_leave_them() -> None:
     px += rng.normal(0, 0.3, px.shape)
     wrong = rng.choice(len(px), 20, replace=False)
     px[wrong] += 40
-    found = points_of(poses, camera, image, track, px.astype(np.float32))
+    found = points_of(poses, [camera] * 5, image, track, px.astype(np.float32))
     assert len(found.world) > 70
     assert (np.diff(found.image) >= 0).all()
     assert found.error_px.mean() < 0.5

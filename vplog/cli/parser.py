@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 STDOUT = Path("-")
-_ROLES = ("image", "depth", "right", "camera-info", "odometry", "gps", "imu", "mask")
+_ROLES = ("image", "depth", "right", "camera-info", "odometry", "gps", "imu")
 _DASHES = "\u2013\u2014\u2212"
 """Dashes that text editors replace two hyphens with."""
 _MOST = 10**9
@@ -249,7 +249,8 @@ def topics_of(arguments: argparse.Namespace) -> TopicChoice:
 
     chosen = {role.replace("-", "_"): getattr(arguments, f"{role.replace('-', '_')}_topic") for role in _ROLES}
     first, *more = chosen["image"] or [None]
-    chosen |= {"image": first, "cameras": more or None}
+    masks = dict(arguments.mask_topic)
+    chosen |= {"image": first, "cameras": more or None, "mask": masks.pop("", None), "mask_topics": masks}
     others = (
         *("odometry_file", "calibration_file", "start_s", "stop_s"),
         *("wheelbase_m", "track_m", "wheel_radius_m", "camera_height_m"),
@@ -281,6 +282,8 @@ def topic_options() -> argparse.ArgumentParser:
         "image whose zero pixels give no features, TOPIC=FILE with several cameras; or a folder with one for each image"
     )
     option(topics, "--mask", _mask, "[TOPIC=]FILE", text, action="append", default=[])
+    text = "use these masks, of an image each; TOPIC=MASKS with several cameras"
+    option(topics, "--mask-topic", _mask_topic, "[TOPIC=]MASKS", text, action="append", default=[])
     return parent
 
 
@@ -290,6 +293,12 @@ def _mask(text: str) -> tuple[str, Path]:
     if not given or os.path.exists(text):  # noqa: PTH110
         topic, path = "", text
     return topic, resolved(path)
+
+
+def _mask_topic(text: str) -> tuple[str, str]:
+    """Image topic, empty where none is named, and that of its masks."""
+    topic, _, masks = text.rpartition("=")
+    return topic, masks
 
 
 def settings_options(unless_given: str | None, called: str) -> argparse.ArgumentParser:

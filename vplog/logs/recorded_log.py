@@ -126,7 +126,7 @@ class RecordedLog:
         choice, body = self._choice, self._body or BODY
         if choice.cameras is not None or choice.image is not None:
             return list(choice.cameras or ())
-        tree, known = self._content.tree, further_cameras(self._candidates, self._selection)
+        tree, known = self._content.tree, further_cameras(self._candidates, self._selection, choice)
         return [
             c.channel.topic
             for c, left in known

@@ -77,6 +77,8 @@ class TopicChoice(Settings):
     """Topic of the satellite fixes; an empty string uses none."""
     mask: str | None = None
     """Topic of masks of the camera's images, in which a px of zero is masked."""
+    mask_topics: dict[str, str] = Field(default_factory=dict)
+    """By image topic of further cameras, the topic of their masks."""
     masks: dict[str, Path] = Field(default_factory=dict)
     """By image topic, empty for that in use, the file of its mask, or a folder with one for each image."""
     imu: str | None = None
@@ -97,7 +99,8 @@ class TopicChoice(Settings):
 
     def of_camera(self, topic: str) -> TopicChoice:
         """Choice of topics with a further camera as the one in use, and no others."""
-        own = {"depth": None, "right": None, "camera_info": None, "mask": None, "cameras": ()}
+        own = {"depth": None, "right": None, "camera_info": None, "cameras": ()}
+        own |= {"mask": self.mask_topics.get(topic), "mask_topics": {}}
         masks = {image: path for image, path in self.masks.items() if image}
         return self.model_copy(update={**own, "image": topic, "masks": masks})
 
@@ -196,6 +199,7 @@ _BACKWARD = re.compile(r"(?<![a-z])(back|rear)(?![a-z])", re.IGNORECASE)
 def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Selection:
     """The topics to use by the rules above. Raises LogError where a topic named in `choice` cannot play its part."""
     _check_files(choice)
+    _check_mask_topics(candidates, choice)
     candidates = sorted(candidates, key=lambda c: (-c.count, c.channel))
     usable, pick = [c for c in candidates if c.count], partial(_pick, candidates, choice, log)
 
@@ -223,7 +227,9 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
         if choice.calibration_file is None:
             right_info = _calibration(right, usable) if right is not None else None
             calibration = _calibration(image, usable) if choice.camera_info is None else pick("camera_info")
-    mask = pick("mask", "depth", image=image) if choice.mask else None
+    if image is not None and choice.mask is None:
+        choice = choice.model_copy(update={"mask": choice.mask_topics.get(image.channel.topic)})
+    mask = _pick(candidates, choice, log, "mask", "depth", image=image) if choice.mask else None
     requested_name = choice.odometry if choice.odometry_file is None else ""
     clouds = [c for c in usable if c.role == "lidar"]
     scanned = [c for c in clouds if c.channel.topic == requested_name]
@@ -249,7 +255,9 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     )
 
 
-def further_cameras(candidates: list[Candidate], used: Selection) -> list[tuple[Candidate, Candidate | None]]:
+def further_cameras(
+    candidates: list[Candidate], used: Selection, choice: TopicChoice
+) -> list[tuple[Candidate, Candidate | None]]:
     """Calibrated cameras beside the one in use, each by its best topic: with another frame_id than any before it; and,
     where its name is that of the right one of a pair, the left one."""
     usable = sorted((c for c in candidates if c.count), key=lambda c: (-c.count, c.channel))
@@ -257,10 +265,24 @@ def further_cameras(candidates: list[Candidate], used: Selection) -> list[tuple[
     found = []
     for c in usable:
         info = _calibration(c, usable) if c.role == "image" and c.supported else None
-        if info and info.calibrated and c.frame and c.frame not in taken and c.channel != used.mask:
+        if info and info.calibrated and c.frame and c.frame not in taken and not _is_mask(c, choice):
             taken.add(c.frame)
             found.append((c, _partner(c, usable, back=True)))
     return found
+
+
+def _is_mask(c: Candidate, choice: TopicChoice) -> bool:
+    return c.channel.topic in (choice.mask, *choice.mask_topics.values())
+
+
+def _check_mask_topics(candidates: list[Candidate], choice: TopicChoice) -> None:
+    """Raises LogError where a topic that masks are chosen by is not in the log."""
+    known = {c.channel.topic for c in candidates}
+    for camera, masks in choice.mask_topics.items():
+        if missing := [topic for topic in (camera, masks) if topic not in known]:
+            raise LogError(
+                f"--mask-topic {camera}={masks}: the log has no topic {missing[0]}. Topics: {', '.join(sorted(known))}."
+            )
 
 
 def _check_files(choice: TopicChoice) -> None:
@@ -282,7 +304,7 @@ def _pick(
     if image is not None and wanted == image.channel.topic:
         raise LogError(f"{wanted} is the image topic of {log}. Choose another with --{role}-topic.")
     found = [c for c in candidates if c.role == own and c.count and (role != "depth" or c is not image)]
-    found = [c for c in found if role == "mask" or c.channel.topic != choice.mask]
+    found = [c for c in found if role == "mask" or not _is_mask(c, choice)]
     if not wanted:
         return min(found, key=key, default=None) if wanted is None else None
     named = [c for c in candidates if c.channel.topic == wanted]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +28,8 @@ _LENIENT = {"min_inliers": 6, "min_spread": 0.0, "max_depths": np.inf, "max_dist
 """Metric settings under which a pose is found wherever chance does not explain it."""
 _CHI2_6 = 22.458
 """Mahalanobis^2 of a 6D error that 0.1 % of right pairs exceed: chi-square, 6 degrees of freedom, 99.9 %."""
+_REMEMBERED = 64
+"""Keyframes whose landmarks are kept, some 10 MB."""
 _BISECTIONS = 20
 """Bisections of the weight 0..1, to one in a million."""
 
@@ -66,6 +69,16 @@ class Drive:
     camera: Camera
     features: FeaturesOf
     settings: VerifySettings
+
+    @cached_property
+    def landmarks(self) -> Callable[[int], Landmarks]:
+        """The landmarks of a keyframe. They are made of five images, and neighbours ask for the same again."""
+
+        def make(row: int) -> Landmarks:
+            s = self.settings
+            return landmarks_of(row, self.keyframes, self.camera, self.features, s.matching, s.landmarks)
+
+        return lru_cache(_REMEMBERED)(make)
 
     @property
     def stereo(self) -> bool:
@@ -111,7 +124,7 @@ def check_queries(later: Drive, earlier: Drive, match: int, queries: Sequence[in
             rows.append(Row(len(mine), 0, pose))
         else:
             if landmarks is None:
-                landmarks = _landmarks(earlier, match)
+                landmarks = earlier.landmarks(match)
             rows.append(_check_metric(later, own, (mine, found), landmarks, earlier.stereo, settings.metric))
     return rows
 
@@ -123,7 +136,7 @@ def check_reverse(
 
     `share` is the calibration's error. Where the query has too few landmarks the row is unchanged.
     """
-    landmarks = _landmarks(later, query)
+    landmarks = later.landmarks(query)
     # the limits have been checked in one direction; in reverse only the pose is compared
     metric = lenient(later.settings).metric
     result = []
@@ -138,11 +151,6 @@ def check_reverse(
         else:
             result.append(replace(row, pose=_fuse(row.pose, reverse.pose, share), reverse_inliers=reverse.pose.inliers))
     return result
-
-
-def _landmarks(drive: Drive, row: int) -> Landmarks:
-    settings = drive.settings
-    return landmarks_of(row, drive.keyframes, drive.camera, drive.features, settings.matching, settings.landmarks)
 
 
 def _check_metric(

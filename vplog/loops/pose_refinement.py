@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
@@ -15,6 +16,9 @@ import scipy
 
 from vplog.data import Bools, Floats
 from vplog.geometry import se3
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 _HUBER = 1.5
 """Sigmas beyond which an error counts linearly: 96 % as efficient as least squares on Gaussian errors (Huber 1981)."""
@@ -60,22 +64,38 @@ def agreement(match_from_query: Floats, matches: Matches) -> tuple[Floats, Float
 
 def fit(match_from_query: Floats, matches: Matches) -> tuple[Floats, Floats, float]:
     """Gauss-Newton over all matches: the pose, its Hessian (6, 6), the residual variance over its expectation."""
-    hessian, excess = np.eye(6), 1.0
-    freedom = max(2.0 * len(matches.points) + np.isfinite(matches.rho).sum() - 6.0, 1.0)
+    pose, hessian, cost = gauss_newton(match_from_query, lambda pose: normal_equations(pose, matches))
+    return pose, hessian, cost / max(measurements(matches) - 6.0, 1.0)
+
+
+def gauss_newton(
+    pose: Floats, equations: Callable[[Floats], tuple[Floats, Floats, float]]
+) -> tuple[Floats, Floats, float]:
+    """The pose T exp(d) where the gradient by d vanishes, and the Hessian (6, 6) and cost before the last step; its
+    `equations` are Hessian, gradient (6,) and cost at a pose."""
     for _ in range(_STEPS):
-        hessian, gradient, cost = _normal_equations(
-            se3.inverse(match_from_query), matches.points, matches.covariance, matches.rays, matches.noise,
-            matches.rho, matches.variance,
-        )  # fmt: skip
-        excess = cost / freedom
+        hessian, gradient, cost = equations(pose)
         try:
             step = np.negative(scipy.linalg.cho_solve(scipy.linalg.cho_factor(hessian, check_finite=False), gradient))
         except np.linalg.LinAlgError:  # no one pose is best
             break
-        match_from_query = match_from_query @ se3.exp(step)
+        pose = pose @ se3.exp(step)
         if -step @ gradient < _CONVERGED:
             break
-    return match_from_query, hessian, excess
+    return pose, hessian, cost
+
+
+def measurements(matches: Matches) -> int:
+    """Number of coordinates and depths measured."""
+    return 2 * len(matches.points) + int(np.isfinite(matches.rho).sum())
+
+
+def normal_equations(match_from_query: Floats, matches: Matches) -> tuple[Floats, Floats, float]:
+    """Hessian (6, 6), gradient (6,) and robust cost of all matches in front of the query."""
+    return _normal_equations(
+        se3.inverse(match_from_query), matches.points, matches.covariance, matches.rays, matches.noise, matches.rho,
+        matches.variance,
+    )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,24 +28,32 @@ _STEPS = 4
 """Gauss-Newton steps before each look at the errors; the linear start is within px."""
 
 
-def pairs_to_match(count: int, closures: Closures) -> list[tuple[int, int]]:
-    """Pairs (a, b), a < b, of keyframes that share a view: neighbours, and the accepted closures that count."""
-    pairs = {(row - back, row) for back in range(1, _NEIGHBOURS + 1) for row in range(back, count)}
-    used = closures.weight > 0.5  # NaN where the solver never had it
-    ends = zip(closures.query[used].tolist(), closures.match[used].tolist(), strict=True)
-    pairs |= {(min(pair), max(pair)) for pair in ends}
+def pairs_to_match(keyframe: Sequence[Ints], closures: Closures) -> list[tuple[int, int]]:
+    """Pairs (a, b), a < b, of images that share a view: neighbours, and the accepted closures that count. The images of
+    the first camera, at `keyframe[0]` increasing, come before those of the second."""
+    begin = np.cumsum([0, *map(len, keyframe)])
+    pairs = {
+        (row - back, row)
+        for first, end in pairwise(begin.tolist())
+        for back in range(1, _NEIGHBOURS + 1)
+        for row in range(first + back, end)
+    }
+    used = closures.rows(np.flatnonzero(closures.weight > 0.5))  # NaN where the solver never had it
+    for a, row_a, b, row_b in zip(used.query_camera, used.query, used.match_camera, used.match, strict=True):
+        ends = (int(begin[n] + np.searchsorted(keyframe[n], row)) for n, row in ((a, row_a), (b, row_b)))
+        pairs.add((min(pair := tuple(ends)), max(pair)))
     return sorted(pairs)
 
 
 def triangulate(
     world_from_camera: Floats,
-    camera: Camera,
+    cameras: Sequence[Camera],
     features: FeaturesOf,
     pairs: Sequence[tuple[int, int]],
     matching: MatchSettings,
     execution: Execution,
 ) -> Structure:
-    """Points of N keyframes (N, 4, 4) by the matches of `pairs`, two observations or more each."""
+    """Points of images (N, 4, 4) of N cameras by the matches of `pairs`, two observations or more each."""
 
     def matches(pair: tuple[int, int]) -> tuple[Ints, Ints]:
         return match_features(features(pair[0]), features(pair[1]), matching)
@@ -56,7 +65,7 @@ def triangulate(
     for one in np.unique(image).tolist():
         here = image == one
         px[here] = features(one).points[row[here]]
-    return points_of(world_from_camera, camera, image, track, px)
+    return points_of(world_from_camera, cameras, image, track, px)
 
 
 def tracks(
@@ -80,13 +89,18 @@ def tracks(
     return image, node - start[image], np.unique(label[node], return_inverse=True)[1]
 
 
-def points_of(world_from_camera: Floats, camera: Camera, image: Ints, track: Ints, px: Float32s) -> Structure:
-    """Points of tracks of observations `px` (O, 2) in images (O,), by least squares of the reprojection error; what is
-    more than _GATE_PX off leaves its track."""
-    rays = undistort.rays(camera, px)
+def points_of(
+    world_from_camera: Floats, cameras: Sequence[Camera], image: Ints, track: Ints, px: Float32s
+) -> Structure:
+    """Points of tracks of observations `px` (O, 2) in images (O,) of N cameras, by least squares of the reprojection
+    error; what is more than _GATE_PX off leaves its track."""
+    rays, px_from_ray = np.empty((len(px), 2)), np.full((len(px), 2, 2), np.nan)
+    for one in np.unique(image).tolist():
+        here = np.flatnonzero(image == one)
+        rays[here] = undistort.rays(cameras[one], px[here])
+        known = here[np.isfinite(rays[here]).all(axis=1)]
+        px_from_ray[known] = undistort.px_from_ray(cameras[one], rays[known])
     rows = np.flatnonzero(np.isfinite(rays).all(axis=1))
-    px_from_ray = np.full((len(rays), 2, 2), np.nan)
-    px_from_ray[rows] = undistort.px_from_ray(camera, rays[rows])
     camera_from_world = se3.inverse(world_from_camera)
     points, error_px = np.empty((0, 3)), np.full(len(rays), np.nan)
     for gate in (4 * _GATE_PX, _GATE_PX):

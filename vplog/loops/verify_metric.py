@@ -24,9 +24,9 @@ from vplog.settings import Settings
 if TYPE_CHECKING:
     from vplog.loops.landmarks import Landmarks, LandmarkSettings
 
-_SAMPLE = 3
+SAMPLE = 3
 """Points that determine a calibrated camera's pose: P3P; a fourth selects among its up to four solutions."""
-_MODELS = 4
+MODELS = 4
 """Poses that three points allow: Gao et al. 2003."""
 _CONFIDENCE = 0.99
 """RANSAC ends when three right matches would have been drawn with this probability."""
@@ -128,7 +128,7 @@ def solve(
     match_from_query, hessian, excess, inlier = refit(start, inlier, matches, settings.max_error_px / pixel_sigma)
     count = int(inlier.sum())
     radius = settings.max_error_px
-    alarms = log10_false_alarms(len(points), count, _SAMPLE, _MODELS, np.pi * radius**2 / area_px)
+    alarms = log10_false_alarms(len(points), count, SAMPLE, MODELS, np.pi * radius**2 / area_px)
     if (
         not np.isfinite(match_from_query).all()
         or count < max(settings.min_inliers, settings.min_share * len(points))
@@ -163,7 +163,7 @@ def refit(
     which lie within `most_sigmas` of the pixels' noise."""
     hessian, excess = np.eye(6), 1.0
     for _ in range(_ROUNDS):  # refit to the inliers, select inliers by the refit pose; converges in two or three
-        if inlier.sum() < _SAMPLE + 1:
+        if inlier.sum() < SAMPLE + 1:
             break
         match_from_query, hessian, excess = pose_refinement.fit(match_from_query, matches.rows(inlier))
         distance, alone = pose_refinement.agreement(match_from_query, matches)
@@ -180,7 +180,7 @@ def find_pose(points: Floats, rays: Floats, radius: float, rounds: int) -> tuple
     in normalised image coordinates, are inliers. At most `rounds` samples are drawn (Fischler & Bolles 1981), the same
     ones for the same matches.
     """
-    if len(points) <= _SAMPLE:
+    if len(points) <= SAMPLE:
         return None
     usac = cv2.UsacParams()
     usac.threshold, usac.confidence, usac.maxIterations = radius, _CONFIDENCE, rounds

@@ -10,10 +10,11 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from vplog.data import Bytes, Camera, Floats, Structure
+from vplog.data import Bytes, Camera, Floats, Ints, Structure
 from vplog.errors import ResultError
 from vplog.geometry import se3
 
@@ -23,11 +24,13 @@ _OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 @dataclass(frozen=True, eq=False)
 class PosedImages:
-    """N pictures of one camera, where they were taken, and the points in them."""
+    """N pictures of some cameras, where they were taken, and the points in them."""
 
     names: Sequence[str]
     """(N,) of the files in `images/`."""
-    camera: Camera
+    cameras: Sequence[Camera]
+    camera: Ints
+    """(N,) the one of each picture."""
     world_from_camera: Floats
     """(N, 4, 4)."""
     structure: Structure
@@ -60,11 +63,12 @@ def lens(camera: Camera) -> tuple[str, dict[str, float]]:
 
 def write_colmap(folder: Path, images: PosedImages) -> list[Path]:
     """cameras.txt, images.txt and points3D.txt in `sparse/0` of a folder; the files."""
-    model, parameters = lens(images.camera)
-    numbers = " ".join(repr(float(value)) for value in parameters.values())
-    size = f"{images.camera.width} {images.camera.height}"
     texts = {
-        "cameras.txt": [f"1 {model} {size} {numbers}"],
+        "cameras.txt": [
+            f"{number + 1} {model} {camera.width} {camera.height} {' '.join(repr(float(v)) for v in values.values())}"
+            for number, camera in enumerate(images.cameras)
+            for model, values in [lens(camera)]
+        ],
         "images.txt": _images(images),
         "points3D.txt": _points(images),
     }
@@ -83,7 +87,7 @@ def _images(images: PosedImages) -> Iterator[str]:
     start = np.searchsorted(found.image, np.arange(len(images.names) + 1))
     for row, name in enumerate(images.names):
         pose = [*turn[row].tolist(), *camera_from_world[row, :3, 3].tolist()]
-        yield f"{row + 1} {' '.join(f'{value:.12g}' for value in pose)} 1 {name}"
+        yield f"{row + 1} {' '.join(f'{value:.12g}' for value in pose)} {images.camera[row] + 1} {name}"
         some = slice(start[row], start[row + 1])
         observed = zip((found.px[some] + 0.5).tolist(), found.point[some].tolist(), strict=True)
         yield " ".join(f"{x:.4f} {y:.4f} {point + 1}" for (x, y), point in observed)
@@ -103,28 +107,36 @@ def _points(images: PosedImages) -> Iterator[str]:
 
 def write_nerfstudio(folder: Path, images: PosedImages) -> list[Path]:
     """transforms.json, whose cameras look along -z with y up, and points.ply, from which splats start; the files."""
-    model, parameters = lens(images.camera)
-    if model == "FULL_OPENCV" and any(parameters[name] for name in ("k4", "k5", "k6")):
-        raise ResultError(
-            f"Camera {images.camera.name} has a rational polynomial, which nerfstudio has no model for. Export colmap."
-        )
-    names = {"fx": "fl_x", "fy": "fl_y"}
+    own = [_intrinsics(camera) for camera in images.cameras]
+    if len({one["camera_model"] for one in own}) > 1:
+        raise ResultError("nerfstudio has one camera_model for all cameras, and some are fisheyes. Export colmap.")
     poses = images.world_from_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
+    shared = own[0] if len(own) == 1 else {"camera_model": own[0]["camera_model"]}  # it counts before that of a frame
+    of_frame = [{name: value for name, value in one.items() if name not in shared} for one in own]
     frames = [
-        {"file_path": f"images/{name}", "transform_matrix": pose}
-        for name, pose in zip(images.names, poses.tolist(), strict=True)
+        {"file_path": f"images/{name}", **of_frame[camera], "transform_matrix": pose}
+        for name, camera, pose in zip(images.names, images.camera.tolist(), poses.tolist(), strict=True)
     ]
-    tree = {
-        "camera_model": "OPENCV_FISHEYE" if model == "OPENCV_FISHEYE" else "OPENCV",
-        "w": images.camera.width,
-        "h": images.camera.height,
-        **{names.get(name, name): float(value) for name, value in parameters.items() if name not in ("k5", "k6")},
-        "ply_file_path": "points.ply",
-        "frames": frames,
-    }
+    tree = {**shared, "ply_file_path": "points.ply", "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(tree, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     _write_ply(folder / "points.ply", images)
     return [folder / "transforms.json", folder / "points.ply"]
+
+
+def _intrinsics(camera: Camera) -> dict[str, Any]:
+    """Fields of transforms.json about a camera. Raises ResultError where it has none for it."""
+    model, parameters = lens(camera)
+    if model == "FULL_OPENCV" and any(parameters[name] for name in ("k4", "k5", "k6")):
+        raise ResultError(
+            f"Camera {camera.name} has a rational polynomial, which nerfstudio has no model for. Export colmap."
+        )
+    names = {"fx": "fl_x", "fy": "fl_y"}
+    return {
+        "camera_model": "OPENCV_FISHEYE" if model == "OPENCV_FISHEYE" else "OPENCV",
+        "w": camera.width,
+        "h": camera.height,
+        **{names.get(name, name): float(value) for name, value in parameters.items() if name not in ("k5", "k6")},
+    }
 
 
 def _write_ply(path: Path, images: PosedImages) -> None:

@@ -23,6 +23,7 @@ from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.loops.propose import Proposals, ProposeSettings, candidate_stops, propose
 from vplog.loops.verify import VerifySettings, verify_between
+from vplog.loops.verify_rig import Rig, verify_together
 from vplog.places.sequence import SequenceSettings, rank_places
 from vplog.run.feature_extraction import Extraction, decoded, extract
 from vplog.run.place_recognition import describe, shared_of
@@ -160,7 +161,8 @@ def verify_cameras(
                 share = max(shares[q], shares[m])
                 ledger = steps.part(verify_pair, proposals, share, later.pictures, views[m].pictures)
                 ledgers.append(_of_keyframes(ledger, (later, q), (views[m], m), views[0].pictures.keyframes))
-    return _once(merged(ledgers, _numbered(ledgers)))
+    closures, drives = _once(merged(ledgers, _numbered(ledgers))), [view.pictures for view in views]
+    return steps.part(verify_by_all, closures, drives, [view.row for view in views], max(shares))
 
 
 def _best(found: dict[int, Proposals], count: int) -> dict[int, Proposals]:
@@ -181,6 +183,16 @@ def verify_pair(
 ) -> Closures:
     """The ledger of candidates between the pictures of two cameras."""
     return verify_between(proposals, for_verification(later), for_verification(earlier), execution, share)
+
+
+@step("verify", lambda *_: closures_codec())
+def verify_by_all(
+    closures: Closures, cameras: Sequence[DriveFeatures], rows: Sequence[Ints], share: float, *, execution: Execution
+) -> Closures:
+    """The ledger of `loops.verify_rig.verify_together`; `rows` are the keyframes of the pictures of each camera."""
+    rig = Rig([for_verification(one) for one in cameras], rows, share)
+    found = verify_together(closures, rig, execution)
+    return merged(found, _numbered(found)) if found else closures
 
 
 def _stops(later: View, earlier: View, settings: ProposeSettings) -> Ints:

@@ -17,7 +17,6 @@ from vplog.errors import ResultError
 from vplog.execution.execution import Execution
 from vplog.features.store import FeatureStore
 from vplog.loops.candidate import Drive
-from vplog.loops.landmarks import landmarks_of
 from vplog.loops.undistort import project
 from vplog.loops.verify import VerifySettings, drive_of
 from vplog.results import tables
@@ -90,8 +89,7 @@ def write_drive_landmarks(path: Path, drive: Drive, key: str, execution: Executi
 
 def _strongest(drive: Drive, row: int) -> tuple[Features, Floats]:
     """The strongest landmarks of a keyframe, as features with their depths, and the sigmas of their inverse depths."""
-    settings = drive.settings
-    found = landmarks_of(row, drive.keyframes, drive.camera, drive.features, settings.matching, settings.landmarks)
+    found = drive.landmarks(row)
     known = np.flatnonzero(found.known)[:MOST]
     own, rho = drive.features(row).rows(known), found.rho[known]
     px = project(drive.camera, np.column_stack([found.rays[known], np.ones(len(known))]))

@@ -17,7 +17,6 @@ from vplog.cache.steps import step
 from vplog.data import SCALE_WANDER
 from vplog.geometry import se3
 from vplog.loops.candidate import check_queries
-from vplog.loops.landmarks import landmarks_of
 from vplog.run.verification import for_verification
 from vplog.run.visual_odometry.metres import scaled
 
@@ -71,11 +70,7 @@ def _ratio(drive: Drive, query: int, match: int, row: Row) -> tuple[float, ...] 
     if row.pairs is None or row.pose.match_from_query is None:
         return None
     mine, theirs = row.pairs
-    settings = drive.settings
-    own, other = (
-        landmarks_of(one, drive.keyframes, drive.camera, drive.features, settings.matching, settings.landmarks)
-        for one in (query, match)
-    )
+    own, other = drive.landmarks(query), drive.landmarks(match)
     both = own.known[mine] & other.known[theirs]
     ray = np.column_stack([other.rays[theirs[both]], np.ones(int(both.sum()))])
     at = se3.transform(se3.inverse(row.pose.match_from_query), ray / other.rho[theirs[both], None])

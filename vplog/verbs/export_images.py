@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import re
+from dataclasses import dataclass, replace
 from glob import escape
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,14 +13,16 @@ import cv2
 import numpy as np
 
 from vplog import logs
-from vplog.data import Bytes, Features, Ints, Structure
+from vplog.data import Bytes, Camera, Features, Floats, Ints, Structure
 from vplog.features.extraction import describe
 from vplog.features.store import FeatureStore
+from vplog.geometry import se3
 from vplog.loops.structure import pairs_to_match, triangulate
 from vplog.pipeline import recorded_pipeline
 from vplog.results import colmap, run_record, tables
 from vplog.results.previews import jpeg
 from vplog.results.staging import check_contents, staged
+from vplog.run.cameras import pictures_at
 from vplog.run.provenance import reopened
 from vplog.storage.folders import check_regular, is_below
 from vplog.storage.scratch import files_in, scratch
@@ -44,40 +48,80 @@ def export_images(
     """Write the run in `folder` as one of FOLDERS into `out`, with the pictures of its keyframes from its log, or from
     `log` where that has moved; the files. Raises VplogError."""
     topics = logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json")
-    drive, pipeline = reopened(record, log, topics), recorded_pipeline(folder, record)
-    keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
-    closures = tables.read_closures(folder / "closures.parquet")
-    camera = drive.camera()
-    colmap.lens(camera)  # before the long part
+    pipeline, closures = recorded_pipeline(folder, record), tables.read_closures(folder / "closures.parquet")
+    cameras = _cameras(folder, record, topics, log)
+    for one in cameras:
+        colmap.lens(one.camera)  # before the long part
+    number = np.repeat(np.arange(len(cameras)), [len(one.stamp_ns) for one in cameras])
+    of_image = [cameras[one].camera for one in number.tolist()]
     with staged(out, lambda: _export_in(out)) as made, scratch("features") as place:
         with FeatureStore(place / "features") as store:
-            names = _pictures(drive, keyframes.stamp_ns, pipeline, made, store, execution)
-            world_from_camera = world_from_body @ camera.body_from_camera
-            pairs = pairs_to_match(len(names), closures)
-            found = triangulate(
-                world_from_camera, camera, store.__getitem__, pairs, pipeline.verify.matching, execution
-            )
-        images = colmap.PosedImages(names, camera, world_from_camera, found, _colours(made / "images", names, found))
+            names = list(chain(*(_pictures(one, pipeline, made, store, execution) for one in cameras)))
+            world_from_camera = np.concatenate([one.world_from_camera for one in cameras])
+            pairs = pairs_to_match([one.keyframe for one in cameras], closures)
+            matching = pipeline.verify.matching
+            found = triangulate(world_from_camera, of_image, store.__getitem__, pairs, matching, execution)
+        models, colours = [one.camera for one in cameras], _colours(made / "images", names, found)
+        images = colmap.PosedImages(names, models, number, world_from_camera, found, colours)
         written = [path.relative_to(made) for path in _WRITERS[kind](made, images)]
         run_record.write_run_json(made / _RECORD, {"vplog": __version__, "format": 1, "files": files_in(made)})
     return [str(out / path) for path in written]
 
 
+@dataclass(frozen=True, eq=False)
+class _PosedCamera:
+    """A camera's V pictures at the keyframes."""
+
+    log: Log
+    camera: Camera
+    folder: str
+    """Of its pictures, in that of all; empty where it is alone."""
+    keyframe: Ints
+    """(V,) increasing."""
+    stamp_ns: Ints
+    """(V,)"""
+    world_from_camera: Floats
+    """(V, 4, 4)."""
+
+
+def _cameras(folder: Path, record: dict[str, Any], topics: logs.TopicChoice, log: Path | None) -> list[_PosedCamera]:
+    """The cameras of a run: the first by the poses of the keyframes, the others by the trajectory at their stamps."""
+    keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
+    drive, names = reopened(record, log, topics), record.get("cameras") or []
+    first, several = drive.camera(), len(names) > 1
+    poses, rows = world_from_body @ first.body_from_camera, np.arange(len(keyframes.stamp_ns))
+    found = [_PosedCamera(drive, first, _folder(first.name) if several else "", rows, keyframes.stamp_ns, poses)]
+    for topic in names[1:]:
+        trajectory, odometry = tables.read_trajectory(folder / "trajectory.parquet")
+        other = reopened(record, log, topics.of_camera(topic))
+        row, pictures = pictures_at(keyframes, other.stamps(), odometry)
+        bodies = se3.interpolate_at(trajectory.stamp_ns, trajectory.world_from_body, pictures.stamp_ns)
+        camera = other.camera()
+        poses = bodies @ camera.body_from_camera
+        found.append(_PosedCamera(other, camera, _folder(camera.name), row, pictures.stamp_ns, poses))
+    return found
+
+
+def _folder(name: str) -> str:
+    """A camera's folder: its topic, as one name."""
+    return re.sub(r"\W+", "_", name).strip("_")
+
+
 def _pictures(
-    drive: Log, stamp_ns: Ints, pipeline: Pipeline, made: Path, store: FeatureStore, execution: Execution
+    one: _PosedCamera, pipeline: Pipeline, made: Path, store: FeatureStore, execution: Execution
 ) -> list[str]:
     """Write the pictures and store their features; the pictures' names."""
-    (made / "images").mkdir()
+    (made / "images" / one.folder).mkdir(parents=True)
 
     def work(encoded: EncodedFrame) -> tuple[str, Features]:
         frame = encoded.decode(colour=True)
-        name = f"{frame.stamp_ns}.jpg"
+        name = f"{one.folder}/{frame.stamp_ns}.jpg".removeprefix("/")
         (made / "images" / name).write_bytes(jpeg(np.asarray(frame.colour)[..., ::-1], _QUALITY))
         return name, describe(pipeline.features, replace(frame, depth=None))
 
     names = []
-    found = execution.map(work, drive.frames(stamp_ns), ahead=2)
-    for name, features in execution.counted("pictures", found, len(stamp_ns)):
+    found = execution.map(work, one.log.frames(one.stamp_ns), ahead=2)
+    for name, features in execution.counted("pictures", found, len(one.stamp_ns)):
         store.append(features)
         names.append(name)
     return names

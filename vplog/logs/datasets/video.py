@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -108,12 +109,12 @@ class VideoFrames:
         kinds = bytes(WHOLE_KEY if one.key else PLAIN for one in packets)
         self._video = VideoStream(self._codec, self._packet, len(packets), self._decoder, rows, kinds)
 
-    @property
+    @cached_property
     def stamp_ns(self) -> Ints:
         """(F,) since the first frame."""
-        return np.array(
-            [int((tick - self._ticks[0]) * 10**9 * self._tick_s) for tick in self._ticks.tolist()], np.int64
-        )
+        first, *_ = ticks = self._ticks.tolist()  # Python's integers do not overflow
+        times, parts = 10**9 * self._tick_s.numerator, self._tick_s.denominator
+        return np.array([(tick - first) * times // parts for tick in ticks], np.int64)
 
     def image(self, row: int) -> Bytes:
         """(H, W) uint8 grey; (0, 0) where it does not decode. Rows are best read in increasing order."""
@@ -183,7 +184,7 @@ class VideoFrames:
                 packet.pts = packet.dts = number
             with suppress(self._av.error.FFmpegError):
                 found += [frame.pts for frame in decoder.decode(packet)]
-        lost = [number for number in range(len(self._packets)) if number not in {*found}]
+        lost = sorted({*range(len(self._packets))} - {*found})
         order = list[int]()
         for number in found:
             while lost and self._packets[number].key and lost[0] < number:
