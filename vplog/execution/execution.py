@@ -70,7 +70,7 @@ class Execution:
 @cache
 def _blas() -> ThreadpoolController:
     """The BLAS that numpy has loaded, whose idle threads spin: products of a few ms cost ten times their time."""
-    import numpy  # noqa: F401, ICN001
+    import numpy  # noqa: F401
 
     return ThreadpoolController()
 
