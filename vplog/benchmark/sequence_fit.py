@@ -30,7 +30,8 @@ def sequence_warning(pairs: Pairs, settings: SequenceSettings, has_truth: bool) 
         [share for query in queries.tolist() if (share := _on_a_line(pairs, query, settings)) is not None]
     )
     ratio = _rows_a_view(pairs)
-    off = 0.0 if ratio is None else max(settings.slowest - ratio, ratio - settings.fastest, 0.0) * (settings.length // 2)
+    off = 0.0 if ratio is None else max(settings.slowest - ratio, ratio - settings.fastest, 0.0)
+    off *= settings.length // 2
     wide = float(np.median(pairs.stop - pairs.first)) / 2 if len(pairs.first) else 0.0
     if not len(shares) or (np.median(shares) >= 0.5 and off <= _OFF_ROWS + wide):
         return []
