@@ -202,6 +202,11 @@ class CodedState(PlaceState, Protocol):
         ...
 
     @property
+    def references(self) -> Sequence[data.Reference]:
+        """The images of its library."""
+        ...
+
+    @property
     def pairing(self) -> Any:
         """Codes of two places that are compared."""
         ...

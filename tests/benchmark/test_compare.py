@@ -417,6 +417,13 @@ def test_sequences_that_do_not_fit_are_warned_of(step: int, said: str) -> None:
     assert bool(sequence_warning(pairs, fitting, has_truth=True)) == (step != 3)
 
 
+@pytest.mark.parametrize(("tolerance", "warned"), [(0, True), (2, False)])
+def test_a_short_sequence_that_ends_off_its_line_is_warned_of(tolerance: int, warned: bool) -> None:
+    """Of five views the two beside the middle are a row off a line of 1, and the outer ones two."""
+    pairs = index_pairs(2 * np.arange(20), np.arange(40), tolerance)
+    assert bool(sequence_warning(pairs, SequenceSettings(length=5), has_truth=True)) == warned
+
+
 def test_folders_are_labels(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
     """Four views a place, in folders; `study` takes them too, and a table of pairs of two drives both ways."""
     sets = [tmp_path / name for name in ("one", "two")]

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 WALKS = ("gardens_day_left", "gardens_day_right", "gardens_night_right")
 LOSS = 0.01
-LOSSES = (LOSS, 0.05, 0.2)
+LOSSES = (LOSS, 0.02, 0.05, 0.1, 0.2)
 TOLERANCE = 2.0
 """Frames; the walks are aligned to that."""
 SEEDS = 3

@@ -29,6 +29,7 @@ PICTURES = [
     (["61_0.png", "60_1.png"], ["cam0_60_1.png", "cam0_61_1.png"], [[1], [0]]),
     (["hall/0.png", "hall/1.png", "lift/0.png"], ["lift/00.png", "lift/01.png", "hall/01.png"], [[], [2], [0]]),
     (["left/4.png"], ["right/04.png", "right/05.png"], [[0]]),
+    (["60_917.png", "61_924.png"], ["cam_60_12_b.png", "cam_61_13_b.png", "cam_62_14_b.png"], [[0], [1]]),
 ]
 """Names of query and map, and the rows of the same picture."""
 METRES_A_DEGREE = 6_378_137.0 * np.pi / 180.0
@@ -92,6 +93,47 @@ def test_numbers_in_names_are_of_one_place_in_them(query: list[str], other: list
     """A second number, of a camera or a crop, counts no pictures."""
     here, there = (Recorded("", np.arange(len(names)), names=names) for names in (query, other))
     assert found_rows(TruthChoice("index"), here, there) == rows
+
+
+@pytest.mark.parametrize(
+    ("query", "other"),
+    [
+        (["img_5_v2.png"], ["1.png", "2.png", "5.png"]),
+        (["frame_1000_cam1.png"], ["frame_1004_cam1.png"]),
+        (["5.png"], ["2_5_left.png", "5_9_left.png"]),
+        (["1_7.png", "2_8.png"], ["a_7_1.png", "a_8_9.png"]),
+    ],
+)
+def test_it_is_not_guessed_which_number_counts(query: list[str], other: list[str]) -> None:
+    here, there = (Recorded("", np.arange(len(names)), names=names) for names in (query, other))
+    for pair in ((here, there), (there, here)):
+        with pytest.raises(TruthError, match="not clear which of them count"):
+            found_rows(TruthChoice("index"), *pair)
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_names_of_two_schemes_pair_the_same_pictures_or_none(seed: int) -> None:
+    """Numbers of cameras, sizes, clocks and scores stand before and after the one that counts."""
+    rng = np.random.default_rng(seed)
+
+    def scheme() -> tuple[str, str]:
+        before = str(rng.choice(["", "img", "cam0_", "2016-04-21_", "run3-", "{clock}_"]))
+        return before, str(rng.choice(["", "_v2", "_512x512", " (1)", "_{score}", "_{clock}"]))
+
+    def pictures(before: str, after: str) -> tuple[list[str], Any]:
+        frames = np.sort(rng.choice(60, rng.integers(1, 40) if rng.random() < 0.7 else 1, replace=False))
+        parts = [{"clock": 5000 + 7 * frame, "score": rng.integers(1000)} for frame in frames.tolist()]
+        pairs = zip(frames.tolist(), parts, strict=True)
+        return [f"{before.format(**part)}{frame:04}{after.format(**part)}.png" for frame, part in pairs], frames
+
+    one = scheme()
+    (query, here), (other, there) = pictures(*one), pictures(*(one if rng.random() < 0.5 else scheme()))
+    try:
+        logs = (Recorded("", np.arange(len(names)), names=names) for names in (query, other))
+        rows = found_rows(TruthChoice("index"), *logs)
+    except TruthError:
+        return
+    assert rows == [np.flatnonzero(there == frame).tolist() for frame in here]
 
 
 def test_odometry_of_both_drives() -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from vplog.execution.execution import Execution, logged_warnings
 
@@ -53,6 +54,17 @@ def test_libraries_start_no_threads_within_a_worker() -> None:
         assert set(Execution(2).map(lambda _: cv2.getNumThreads(), range(4))) == {1}
     finally:
         cv2.setNumThreads(before)
+
+
+def test_a_worker_has_one_thread_of_blas_and_the_caller_as_many_as_before() -> None:
+    def blas(_: int = 0) -> list[int]:
+        return [one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"]
+
+    np.ones((2, 2)) @ np.ones((2, 2))
+    with threadpool_limits(2, "blas"):
+        before = blas()
+        assert {count for found in Execution(2).map(blas, range(4)) for count in found} <= {1}
+        assert blas() == before
 
 
 def test_what_progress_or_work_raises_ends_the_work() -> None:

@@ -14,7 +14,7 @@ from vplog.geometry import se3
 from vplog.loops import localize as localize_module
 from vplog.loops import verify_metric
 from vplog.loops.landmarks import from_depth
-from vplog.loops.localize import KeyframeLandmarks, landmarks_from, localize
+from vplog.loops.localize import KeyframeLandmarks, localize
 from vplog.loops.undistort import rays
 from vplog.loops.verify import VerifySettings
 
@@ -33,8 +33,8 @@ def place(world: Scene, world_from_body: Floats, rng: np.random.Generator) -> Ke
     found = from_depth(rays(LENS, own.points), own.depth_m.astype(np.float64), LENS, SETTINGS.landmarks)
     rows = np.flatnonzero(found.known)
     sigma = np.sqrt(found.covariance[rows, 2, 2])
-    landmarks = landmarks_from(own.rows(rows), sigma, LENS, SETTINGS.landmarks.pixel_sigma, True)
-    return KeyframeLandmarks(world_from_body @ LENS.body_from_camera, own.rows(rows), landmarks)
+    world_from_camera = world_from_body @ LENS.body_from_camera
+    return KeyframeLandmarks(world_from_camera, own.rows(rows), sigma, LENS, SETTINGS.landmarks.pixel_sigma, True)
 
 
 def test_poses_are_as_sure_as_their_covariance_says() -> None:
@@ -111,7 +111,8 @@ def test_places_that_cannot_be_rivals_change_no_verdict(monkeypatch: pytest.Monk
         solved.clear()
         found.append([localize(picture, LENS, places, SETTINGS) for picture, places in worlds])
         counts.append(len(solved))
-        monkeypatch.setattr(localize_module, "_may_be_rival", lambda *_: True)
+        for test in ("_may_be_rival", "_is_far"):
+            monkeypatch.setattr(localize_module, test, lambda *_: True)
     assert [one.verdict for one in found[0]] == [one.verdict for one in found[1]]
     assert {Verdict.ACCEPTED, Verdict.INCONSISTENT} == {one.verdict for one in found[0]}
     for fast, slow in zip(*found, strict=True):
@@ -134,9 +135,5 @@ def test_a_keyframe_without_landmarks_is_passed_over() -> None:
     rng = np.random.default_rng(5)
     world = scene(rng)
     sound = place(world, pose(0.0), rng)
-    blind = replace(
-        sound, features=sound.features.rows(slice(0)), landmarks=landmarks_from(
-            sound.features.rows(slice(0)), np.empty(0), LENS, 0.7, True
-        ),
-    )  # fmt: skip
+    blind = replace(sound, features=sound.features.rows(slice(0)), sigma=np.empty(0))
     assert localize(view(world, pose(0.2), LENS, rng), LENS, [blind, sound], SETTINGS).verdict is Verdict.ACCEPTED

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from vplog.data import Ranking
 from vplog.execution.execution import Execution
 from vplog.maps.condensation.own_queries import PASSES, OwnPlaces, later_passes
 from vplog.maps.condensation.redundancy import OwnQueries, RemovalCandidates, remove_cross_validated, remove_redundant
-from vplog.maps.condensation.references import by_coverage
+from vplog.maps.condensation.references import removal_order
 from vplog.maps.joining.candidate_drives import places_of
 from vplog.maps.search.query import open_map
 from vplog.maps.storage import map_store
@@ -25,12 +26,15 @@ from vplog.maps.storage.map_store import Store
 from vplog.places.bobb import NOBODY
 from vplog.places.code_search import build_lists
 from vplog.results import tables
+from vplog.testing.pictures import reference
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
     from conftest import Said
+
+    from vplog.data import Reference
 
     Verb = Callable[..., Said]
 
@@ -113,7 +117,20 @@ def test_references_go_by_how_many_each_place_is_left_with() -> None:
     references = np.array([[0, 1, 2], [0, 1, 2], [0, 1, NOBODY], [0, 1, NOBODY], [3, NOBODY, NOBODY]], np.uint16)
     weights = np.where(references == NOBODY, 0, 9).astype(np.uint8)
     lists = build_lists(references, weights, np.zeros((*references.shape, 1), np.uint8), 5, 2)
-    assert by_coverage(lists).tolist() == [4, 2, 0, 3, 1]
+    assert removal_order(lists, references_of("abcde")).tolist() == [4, 2, 0, 3, 1]
+
+
+def test_references_go_at_even_steps_of_each_drive() -> None:
+    """Of nine that all places name alike every other one, and none of two that are left at the end."""
+    references = np.tile(np.arange(9, dtype=np.uint16), (4, 1))
+    lists = build_lists(references, np.full((4, 9), 9, np.uint8), np.zeros((4, 9, 1), np.uint8), 9, 2)
+    assert removal_order(lists, references_of("aaaaaaabb"))[:4].tolist() == [0, 2, 4, 6]
+    assert sorted(removal_order(lists, references_of("aaaaaaaaa"))[:5].tolist()) == [0, 2, 4, 6, 8]
+
+
+def references_of(drives: str) -> list[Reference]:
+    """References of these drives, in their order."""
+    return [replace(reference(0), drive=drive, stamp_ns=row) for row, drive in enumerate(drives)]
 
 
 def test_places_that_later_drives_pass_without_finding_them_fade() -> None:

@@ -17,8 +17,8 @@ _OFF_ROWS = 1
 
 
 def sequence_warning(pairs: Pairs, settings: SequenceSettings, has_truth: bool) -> list[str]:
-    """A sentence where most windows of the truth hold few true pairs on any line that is tried, or nothing is known of
-    it; none where sequences fit."""
+    """A sentence where most windows of the truth hold few true pairs on any line that is tried, or end off it, or
+    nothing is known of it; none where sequences fit."""
     length = f"--sequence {settings.length}"
     if settings.length == 1:
         return []
@@ -29,9 +29,12 @@ def sequence_warning(pairs: Pairs, settings: SequenceSettings, has_truth: bool) 
     shares = np.array(
         [share for query in queries.tolist() if (share := _on_a_line(pairs, query, settings)) is not None]
     )
-    if not len(shares) or np.median(shares) >= 0.5:
-        return []
     ratio = _rows_a_view(pairs)
+    off = 0.0 if ratio is None else max(settings.slowest - ratio, ratio - settings.fastest, 0.0)
+    off *= settings.length // 2
+    wide = float(np.median(pairs.stop - pairs.first)) / 2 if len(pairs.first) else 0.0
+    if not len(shares) or (np.median(shares) >= 0.5 and off <= _OFF_ROWS + wide):
+        return []
     advance = "run back or jump" if ratio is None else f"advance by {ratio:.2g} frames of the map a frame of the query"
     remedy = "Leave --sequence out"
     if ratio is not None and 0.1 <= ratio <= 9:
@@ -39,7 +42,7 @@ def sequence_warning(pairs: Pairs, settings: SequenceSettings, has_truth: bool) 
     tried = f"{settings.slowest:g} to {settings.fastest:g}"
     return [
         f"{length} harms here: true matches {advance}, and lines of {tried} are tried. In half of the windows "
-        f"{np.median(shares):.0%} of the views or fewer are on such a line. {remedy}."
+        f"{np.median(shares):.0%} of the views or fewer are within a frame of such a line. {remedy}."
     ]
 
 

@@ -10,28 +10,53 @@ import numpy as np
 
 from vplog.data import Floats, Ints
 from vplog.errors import TruthError
+from vplog.evaluate.pairs import position_pairs
 from vplog.geometry.utm_name import FORM, utm_name
 
+_NUMBER = re.compile(r"\d+")
 _MOST_DEG = 1e4
 """Degrees; a heading beyond is something else."""
 _DIGITS = 9
 """Longest number that counts images; longer ones are times."""
 
 
-def numbers_of(query: Sequence[str], match: Sequence[str]) -> tuple[Ints, Ints, bool] | None:
-    """(Q,) and (M,) numbers in the names of two sets: the last that no other of its set has, at one place from the end
-    where both have one there; and whether folders are part of them, as where each counts its own images.
+def numbers_of(query: Sequence[str], match: Sequence[str], tolerance: int = 0) -> tuple[Ints, Ints, bool] | None:
+    """(Q,) and (M,) numbers in the names of two sets that no other name of the set has, and whether folders are part of
+    them, as where each counts its own images.
 
     None where one has no such number, or its names are times, or the sets share no folder by which they could meet.
+    Raises TruthError where several numbers may be meant, and pair the images differently.
     """
     of_query, of_match = ({str(PurePosixPath(name).parent) for name in names} for names in (query, match))
     number = {folder: at for at, folder in enumerate(sorted(of_query | of_match))}
     for by_folder in (False, True) if of_query & of_match else (False,):
         here, there = (_own_numbers(names, number if by_folder else {}) for names in (query, match))
         if here and there:
-            both = min(here.keys() & there.keys(), default=None)
-            return here[min(here) if both is None else both], there[min(there) if both is None else both], by_folder
+            alike = len({_NUMBER.sub("0", PurePosixPath(name).stem) for name in (*query, *match)}) == 1
+            return *_meant(here, there, alike, tolerance, f"{query[-1]} and {match[-1]}"), by_folder
     return None
+
+
+def _meant(
+    here: Mapping[int, Ints], there: Mapping[int, Ints], alike: bool, tolerance: int, names: str
+) -> tuple[Ints, Ints]:
+    """The numbers, of those by their place from the end, that pair two sets: those that pair most of the smaller one,
+    where others pair it differently and not half as many. In names that are alike they are at one place. Raises
+    TruthError where that is not clear."""
+    places = [(a, b) for a in here for b in there]
+    if len(places) > 1:
+        pairs = {(a, b): position_pairs(here[a][:, None], there[b][:, None], tolerance) for a, b in places}
+        if alike and any(pairs[a, b].count for a, b in places if a == b):
+            pairs = {(a, b): one for (a, b), one in pairs.items() if a == b}
+        places.sort(key=lambda at: pairs[at].count if at in pairs else -1, reverse=True)
+        best, least = pairs[places[0]], max(2.0, min(len(here[places[0][0]]), len(there[places[0][1]])) / 2)
+        others = [one.count for one in pairs.values() if one != best]
+        if others and (best.positive.sum() < least or best.count <= 2 * max(others)):
+            raise TruthError(
+                f"--truth index: names such as {names} have several numbers, and it is not clear which of them count "
+                "the places. Give the pairs in a table with the header `query,match`: --truth FILE.csv."
+            )
+    return here[places[0][0]], there[places[0][1]]
 
 
 def _own_numbers(names: Sequence[str], folders: Mapping[str, int]) -> dict[int, Ints]:
@@ -40,7 +65,7 @@ def _own_numbers(names: Sequence[str], folders: Mapping[str, int]) -> dict[int, 
     paths = [PurePosixPath(name) for name in names]
     if any(re.fullmatch(r"\d+\.\d+", path.stem) for path in paths):
         return {}
-    found, own = [re.findall(r"\d+", path.stem) for path in paths], dict[int, Ints]()
+    found, own = [_NUMBER.findall(path.stem) for path in paths], dict[int, Ints]()
     first = [2 * 10**_DIGITS * folders.get(str(path.parent), 0) for path in paths]
     for at in range(1, 1 + min(map(len, found), default=0)):
         column = [numbers[-at] for numbers in found]

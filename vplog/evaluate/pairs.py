@@ -31,6 +31,11 @@ class Pairs:
     def __len__(self) -> int:
         return len(self.start) - 1
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Pairs) and all(map(np.array_equal, vars(self).values(), vars(other).values()))
+
+    __hash__ = None
+
     @property
     def positive(self) -> Bools:
         """(Q,) queries that have a true row."""

@@ -126,7 +126,7 @@ def _all_frames(query: Log, other: Log) -> tuple[Bools, Bools]:
 def _by_index(choice: TruthChoice, query: Log, other: Log) -> _Found:
     """By the numbers in file names, or by rows where these have none."""
     tolerance, names = choice.tolerance or 0, (query.file_names(), other.file_names())
-    numbers = None if names[0] is None or names[1] is None else numbers_of(names[0], names[1])
+    numbers = None if names[0] is None or names[1] is None else numbers_of(names[0], names[1], tolerance)
     by = "frame number, counted from 0 in each drive"
     here, there = (np.arange(len(log.stamps())) for log in (query, other))
     if numbers is not None:

@@ -8,7 +8,10 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TypeVar
+
+from threadpoolctl import ThreadpoolController
 
 In = TypeVar("In")
 Out = TypeVar("Out")
@@ -47,11 +50,11 @@ class Execution:
     def map(self, work: Callable[[In], Out], items: Iterable[In], ahead: int = 4) -> Iterator[Out]:
         """work(item) of every item, in order, with at most `ahead` items a thread read but not yet given out.
 
-        OpenCV and faiss start no threads of their own within `work`.
+        OpenCV, faiss and BLAS start no threads of their own within `work`.
         """
         waiting: deque[Future[Out]] = deque()
-        threads = max(self.threads, 1)
-        with ThreadPoolExecutor(threads, initializer=_one_thread_each) as pool:
+        threads, blas = max(self.threads, 1), _blas().limit(limits=1, user_api="blas")
+        with blas, ThreadPoolExecutor(threads, initializer=_one_thread_each) as pool:
             try:
                 for item in items:
                     waiting.append(pool.submit(work, item))
@@ -62,6 +65,14 @@ class Execution:
             finally:
                 for future in waiting:
                     future.cancel()
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """The BLAS that numpy has loaded, whose idle threads spin: products of a few ms cost ten times their time."""
+    import numpy  # noqa: F401
+
+    return ThreadpoolController()
 
 
 def _one_thread_each() -> None:

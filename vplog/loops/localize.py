@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +25,11 @@ if TYPE_CHECKING:
     _Agreeing = tuple[Floats, Floats, Ints]
     """Landmarks (A, 3), their covariance (A, 3, 3), and the picture's features (A,) that match them."""
 
+_GROUP = 3
+"""Places that are verified before it is decided whether others are."""
+_ENOUGH = 2
+"""Times the inliers that a pose needs, with which it needs no more places: more landmarks then add nothing that the
+shared error of calibration and map leaves."""
 _RIVAL_SIGMA = 3.0
 """Standard deviations, of a count of matches, by which a pose must have more inliers than another one elsewhere."""
 _PROGRESS = (
@@ -41,9 +47,25 @@ class KeyframeLandmarks:
     world_from_camera: Floats
     """(4, 4)."""
     features: Features
-    """(L,) their descriptors, and where they are in the keyframe's image."""
-    landmarks: Landmarks
-    """(L,) in the keyframe's camera."""
+    """(L,) their descriptors, and where they are in the keyframe's image, all with depths."""
+    sigma: Floats
+    """(L,) standard deviation of the inverse depths in 1/m."""
+    camera: Camera
+    pixel_sigma: float
+    measured: bool
+    """By a sensor, or by odometry's metres."""
+
+    @cached_property
+    def landmarks(self) -> Landmarks:
+        """(L,) in the keyframe's camera."""
+        rays, rho = undistort.rays(self.camera, self.features.points), 1.0 / self.features.depth_m.astype(np.float64)
+        covariance = with_rho(rays, self.sigma**2, self.camera, self.pixel_sigma)
+        known = np.isfinite(rays).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)) & (rho > 0) & (self.sigma > 0)
+        return Landmarks(rho, rays, covariance, known, len(rho), self.measured)
+
+    def reach_m(self, max_depths: float) -> float:
+        """How far off the keyframe a picture may be that is `max_depths` times a landmark's depth away from it."""
+        return max_depths * float(self.features.depth_m.max(initial=0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,22 +119,14 @@ class _Query:
         return verify_metric.solve(landmarks, rows, own, self.rays[mine], self.camera, noise, metric, start)
 
 
-def landmarks_from(features: Features, sigma: Floats, camera: Camera, pixel_sigma: float, measured: bool) -> Landmarks:
-    """The landmarks of a keyframe's features (L,), all with depths, whose inverses have standard deviations `sigma`
-    (L,) in 1/m; `measured` by a sensor, or by odometry's metres."""
-    rays, rho = undistort.rays(camera, features.points), 1.0 / features.depth_m.astype(np.float64)
-    covariance = with_rho(rays, sigma**2, camera, pixel_sigma)
-    known = np.isfinite(rays).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)) & (rho > 0) & (sigma > 0)
-    return Landmarks(rho, rays, covariance, known, len(rho), measured)
-
-
 def localize(
     features: Features, camera: Camera, places: Sequence[KeyframeLandmarks], settings: VerifySettings
 ) -> Localization:
     """The pose of a picture by its features (M,) and the places that it may be of, likeliest first.
 
-    Each place is verified by itself; the pose with most inliers starts a fit to the landmarks of all places that agree
-    with it. Where another pose elsewhere has as many, the picture is at neither.
+    Each place is verified by itself, three at a time; once a pose has twice the inliers that it needs, those alone that
+    may have a rival of it. The pose with most inliers starts a fit to the landmarks of all these places that agree with
+    it. Where another pose elsewhere has as many, the picture is at neither.
     """
     if camera.matrix is None:
         return Localization(Verdict.NO_CALIBRATION, -1, 0, 0)
@@ -129,30 +143,38 @@ def localize(
 
 
 def _verified(query: _Query, places: Sequence[KeyframeLandmarks]) -> list[_Fit]:
-    """The picture against each place, most matches first. Once there is a pose, a place that cannot have a rival of it
-    has no pose of its own and adds the landmarks that agree; at another that pose is tried before any is sampled."""
-    matched = [_matched(query, place) for place in places]
+    """The picture against the places, in groups by likelihood, of each the one with most matches first. Once there is a
+    pose, a place that cannot have a rival of it has no pose of its own and adds the landmarks that agree, unless there
+    are enough; at another that pose is tried before any is sampled."""
     fits, best = list[_Fit](), None
-    for number in sorted(range(len(places)), key=lambda number: -len(matched[number][0])):
-        place, fit = places[number], _Fit(number, *matched[number], Pose(Verdict.TOO_FEW_INLIERS, 0, 0.0))
-        if best is None or _may_be_rival(query, fit, place, best, places[best.place].world_from_camera):
-            fit = _fitted(query, fit, place, None if best is None else best.world_from_camera)
-        if fit.world_from_camera is not None and (best is None or fit.pose.inliers > best.pose.inliers):
-            best = fit
-        fits.append(fit)
+    for first in range(0, len(places), _GROUP):
+        group = range(first, min(first + _GROUP, len(places)))
+        if best is not None and best.pose.inliers >= _ENOUGH * query.settings.metric.min_inliers:
+            group = [number for number in group if _is_far(places[number], places[best.place], query.settings)]
+        matched = {number: _matched(query, places[number]) for number in group}
+        for number in sorted(matched, key=lambda number: -len(matched[number][0])):
+            place, fit = places[number], _Fit(number, *matched[number], Pose(Verdict.TOO_FEW_INLIERS, 0, 0.0))
+            if best is None or _may_be_rival(query, fit, place, best, places[best.place]):
+                fit = _fitted(query, fit, place, None if best is None else best.world_from_camera)
+            if fit.world_from_camera is not None and (best is None or fit.pose.inliers > best.pose.inliers):
+                best = fit
+            fits.append(fit)
     return sorted(fits, key=lambda fit: fit.place)
 
 
-def _may_be_rival(query: _Query, fit: _Fit, place: KeyframeLandmarks, best: _Fit, anchor: Floats) -> bool:
-    """Whether a place's matches may give a pose elsewhere with as many inliers as the best one has, which is of the
-    place with the camera `anchor` (4, 4): whether so many disagree with it, and a pose may be so far off."""
-    metric, start, least = query.settings.metric, best.pose.match_from_query, _rival_inliers(best.pose.inliers)
-    if start is None or best.world_from_camera is None or len(fit.mine) <= least:
+def _is_far(place: KeyframeLandmarks, best: KeyframeLandmarks, settings: VerifySettings) -> bool:
+    """Whether a pose by a place's landmarks may be elsewhere than one near the `best` place."""
+    apart, metric = np.linalg.norm(place.world_from_camera[:3, 3] - best.world_from_camera[:3, 3]), settings.metric
+    return bool(apart + place.reach_m(metric.max_depths) >= metric.max_distance_m)
+
+
+def _may_be_rival(query: _Query, fit: _Fit, place: KeyframeLandmarks, best: _Fit, of: KeyframeLandmarks) -> bool:
+    """Whether a place's matches may give a pose elsewhere with as many inliers as the best one has, which is `of`
+    another place: whether so many disagree with it, and a pose may be so far off."""
+    start, least = best.pose.match_from_query, _rival_inliers(best.pose.inliers)
+    if start is None or len(fit.mine) <= least or not _is_far(place, of, query.settings):
         return False
-    apart = np.linalg.norm(place.world_from_camera[:3, 3] - best.world_from_camera[:3, 3])
-    if apart + metric.max_depths / place.landmarks.rho[fit.rows].min() < metric.max_distance_m:
-        return False
-    return len(fit.mine) - len(_agreeing(query, fit, place, anchor, start)[2]) > least
+    return len(fit.mine) - len(_agreeing(query, fit, place, of.world_from_camera, start)[2]) > least
 
 
 def _matched(query: _Query, place: KeyframeLandmarks) -> tuple[Ints, Ints]:

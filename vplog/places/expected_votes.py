@@ -37,18 +37,17 @@ def agreement(here, there, weight, reach, floor):
     `floor` of the weight is kept in any case.
     """
     E = weight.shape[0]
-    result = np.empty(E, np.float32)
+    moved, others = there - here, np.zeros(E)
     scale = 1.0 / (2.0 * reach * reach)
     for a in range(E):
-        s = 0.0
-        for b in range(E):
-            dx = (there[a, 0] - here[a, 0]) - (there[b, 0] - here[b, 0])
-            dy = (there[a, 1] - here[a, 1]) - (there[b, 1] - here[b, 1])
+        for b in range(a + 1, E):
+            dx, dy = moved[a, 0] - moved[b, 0], moved[a, 1] - moved[b, 1]
             q = (dx * dx + dy * dy) * scale
-            if b != a and q < 8.0:  # exp(-8) = 3e-4: nothing beyond
-                s += weight[b] * np.exp(-q)
-        result[a] = weight[a] * (floor + (1.0 - floor) * (1.0 - np.exp(-s)))
-    return result
+            if q < 8.0:  # exp(-8) = 3e-4: nothing beyond
+                agrees = np.exp(-q)
+                others[a] += weight[b] * agrees
+                others[b] += weight[a] * agrees
+    return (weight * (floor + (1.0 - floor) * (1.0 - np.exp(-others)))).astype(np.float32)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -20,7 +20,14 @@ import numpy as np
 from vplog.data import Bools
 from vplog.errors import SettingsError
 from vplog.execution.execution import Execution
-from vplog.maps.condensation.own_queries import OwnAnswers, OwnPlaces, query_own_places, read_own_places, search_of
+from vplog.maps.condensation.own_queries import (
+    OwnAnswers,
+    OwnPlaces,
+    query_own_places,
+    read_own_places,
+    search_of,
+    shown_by_others,
+)
 from vplog.maps.condensation.redundancy import RemovalCandidates, remove_cross_validated
 from vplog.maps.condensation.references import remove_references
 from vplog.maps.merge import copy_library, put_library
@@ -100,7 +107,7 @@ def condense_places(
     if isinstance(state, CodedState):
         places, answers, small = remove_references(places, answers, state, distance_m, most_lost // 2, execution)
     every = np.arange(len(posed))
-    removable, along_m = posed & (np.isin(every, answers.place) | answers.faded), np.cumsum(places.steps_m())
+    removable, along_m = shown_by_others(places, distance_m) | (posed & answers.faded), np.cumsum(places.steps_m())
     total = int(removable.sum())
     most_lost -= len(whole_answers.place) - len(answers.place)
     candidates = RemovalCandidates(places.drive, along_m, removable, answers.faded)

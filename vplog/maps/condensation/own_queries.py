@@ -183,6 +183,16 @@ def query_own_places(
     return OwnAnswers(place, queries, (later_passes(places, distance_m) >= PASSES) & ~matched)
 
 
+def shown_by_others(places: OwnPlaces, distance_m: float) -> Bools:
+    """(N,) places with another within the distance."""
+    found = np.zeros(len(places.drive), np.bool_)
+    for frame in np.unique(places.frame[places.frame >= 0]).tolist():
+        rows = np.flatnonzero(places.frame == frame)
+        position = places.pose[rows, :3, 3]
+        found[rows] = KDTree(position).query(position, 2)[0][:, 1] <= distance_m
+    return found
+
+
 def later_passes(places: OwnPlaces, distance_m: float) -> Ints:
     """(N,) later drives that came by each place, within the distance and looking the same way."""
     passes = np.zeros(len(places.drive), np.int64)

@@ -143,25 +143,32 @@ class _Remaining:
 
 
 @dataclass(eq=False)
-class _Gaps:
-    """Distances between the places of drives that are left, each drive's in a row."""
+class Gaps:
+    """Distances between the places, or references, of drives that are left, each drive's in a row."""
 
     along_m: Floats
+    ends: Floats
+    """(N, 2) where the drive of each begins and ends."""
     before: Ints
     """(N,) the place before each in its drive; itself where it is the first."""
     after: Ints
 
     @classmethod
-    def of(cls, drive: Ints, along_m: Floats) -> _Gaps:
+    def of(cls, drive: Ints, along_m: Floats) -> Gaps:
         every = np.arange(len(drive))
         first, last = (np.diff(drive, **ends) != 0 for ends in ({"prepend": -1}, {"append": -1}))
-        return cls(along_m, np.where(first, every, every - 1), np.where(last, every, every + 1))
+        number = np.cumsum(first) - 1
+        ends = np.column_stack([along_m[first][number], along_m[last][number]])
+        return cls(along_m, ends, np.where(first, every, every - 1), np.where(last, every, every + 1))
 
-    def without(self, place: int) -> float:
-        """The gap that the removal of a place leaves; at the end of a drive twice the distance to the next one."""
-        before, after = int(self.before[place]), int(self.after[place])
-        gap = self.along_m[after] - self.along_m[before]
-        return float(gap if before < place < after else 2 * gap)
+    def without(self, places: Ints) -> Floats:
+        """The gaps that the removal of each of some places leaves: at the end of a drive twice the distance from there
+        to the next one, infinite where there is none."""
+        before, after = self.before[places], self.after[places]
+        start, end = self.ends[places].T
+        is_first, is_last = before == places, after == places
+        gap = np.where(is_last, end, self.along_m[after]) - np.where(is_first, start, self.along_m[before])
+        return np.where(is_first & is_last, np.inf, np.where(is_first | is_last, 2 * gap, gap))
 
     def remove(self, place: int) -> None:
         before, after = int(self.before[place]), int(self.after[place])
@@ -206,11 +213,12 @@ def remove_redundant(
     drive = places.drive
     remaining = _Remaining(queries, np.ones(len(drive), np.bool_))
     judging = remaining if judges is None else _Remaining(judges, np.ones(len(drive), np.bool_))
-    gaps, left, lost, order, losses = _Gaps.of(drive, places.along_m), np.bincount(drive), 0, list[int](), list[int]()
+    gaps, left, lost, order, losses = Gaps.of(drive, places.along_m), np.bincount(drive), 0, list[int](), list[int]()
 
     def key(place: int) -> tuple[float, int, float, int]:
         queries_lost, drop = remaining.cost(place)
-        gap = 0.0 if places.faded[place] and queries_lost <= 0 else round(gaps.without(place), _MILLIMETRES)
+        spare = places.faded[place] and queries_lost <= 0
+        gap = 0.0 if spare else round(float(gaps.without(np.array(place))), _MILLIMETRES)
         return gap, queries_lost, drop, place
 
     heap = [key(place) for place in np.flatnonzero(places.removable).tolist()]

@@ -16,7 +16,7 @@ from vplog.data import Floats
 from vplog.errors import ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
-from vplog.loops.localize import KeyframeLandmarks, landmarks_from
+from vplog.loops.localize import KeyframeLandmarks
 from vplog.maps.geo_bounds import earth_of_run
 from vplog.maps.joining.drive_pairs import known_camera
 from vplog.maps.joining.joint_record import Component, joint_components, keyframe_poses
@@ -63,8 +63,8 @@ class Landmarked(NamedTuple):
         """The landmarks of a keyframe. Raises ResultError where their file is damaged."""
         (features, sigma), camera = self.table[row], self.table.camera
         measured, pixel_sigma = self.table.scale != "odometry", settings.landmarks.pixel_sigma
-        landmarks = landmarks_from(features, sigma, camera, pixel_sigma, measured)
-        return KeyframeLandmarks(self.world_from_body[row] @ camera.body_from_camera, features, landmarks)
+        world_from_camera = self.world_from_body[row] @ camera.body_from_camera
+        return KeyframeLandmarks(world_from_camera, features, sigma, camera, pixel_sigma, measured)
 
 
 @dataclass(eq=False)
