@@ -21,9 +21,9 @@ from vplog.places import expected_votes
 from vplog.places.code_search import BLOCK, CodeIndex, CodeLists, Place, build_lists
 from vplog.places.columns import RecordState, from_column, to_column
 from vplog.places.library_files import RelearnedSettings
-from vplog.places.matches import PATCH_WEIGHT, Matcher, Matches, Once, WeighedMatchSettings, index_references
+from vplog.places.matches import PATCH_WEIGHT, KindWeights, Matcher, Matches, Once, WeighedMatchSettings, index_references
 from vplog.places.overlap import list_shared
-from vplog.places.self_recognition import patches_mislead
+from vplog.places.self_recognition import misleading_patches
 
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution
@@ -114,20 +114,26 @@ class BobbSettings(WeighedMatchSettings, RelearnedSettings):
     def prepare(self, references: Iterable[Reference], execution: Execution) -> BobbState:
         """`learn` without the index, which the first image to describe makes: comparing places needs none."""
         matcher = index_references(references, self)
+        if isinstance(self.patch_weight, tuple) and len(self.patch_weight) != len(matcher):
+            raise LibraryError(
+                f"places.patch_weight has {len(self.patch_weight)} numbers for {len(matcher)} reference images. Give one "
+                "for each, or a single one."
+            )
         if len(matcher) >= NOBODY:
             raise LibraryError(
                 f"A library may have {NOBODY - 1} reference images, this one {len(matcher)}. Set library.size lower."
             )
 
-        def votes(weights: tuple[float, float]) -> Floats:
+        def votes(weights: KindWeights) -> Floats:
             found = execution.map(lambda one: matcher.match(one.features, weights).votes(), matcher.references)
             return np.array(list(found))
 
         def weights() -> Weights:
             if self.patch_weight is not None:
-                return Weights.of((1.0, self.patch_weight), votes((1.0, self.patch_weight)), self.popularity)
+                given = 1.0, np.broadcast_to(self.patch_weight, len(matcher))
+                return Weights.of(given, votes(given), self.popularity)
             keypoints, patches = votes((1.0, 0.0)), votes((0.0, 1.0))
-            used = 0.0 if patches_mislead(keypoints, patches, matcher.references) else PATCH_WEIGHT
+            used = np.where(misleading_patches(keypoints, patches, matcher.references), 0.0, PATCH_WEIGHT)
             return Weights.of((1.0, used), keypoints + used * patches, self.popularity)
 
         return BobbState(self, matcher, Once(weights))
@@ -137,13 +143,12 @@ class BobbSettings(WeighedMatchSettings, RelearnedSettings):
 class Weights:
     """Weights of the kinds of matches and of the references, by a library's own images."""
 
-    kinds: tuple[float, float]
-    """Weight of a match of keypoints, and of one of patches."""
+    kinds: KindWeights
     rarity: Floats
     """(L,) weight of each reference."""
 
     @classmethod
-    def of(cls, kinds: tuple[float, float], votes: Floats, popularity: float) -> Weights:
+    def of(cls, kinds: KindWeights, votes: Floats, popularity: float) -> Weights:
         """With the votes (L, L) of each reference for the others."""
         return cls(kinds, _rarity(votes / np.maximum(votes.sum(axis=1, keepdims=True), 1e-9), popularity))
 
@@ -284,8 +289,9 @@ class BobbState(RecordState):
         return build_lists(references, weights, boxes, len(self.matcher), BLOCK)
 
     def subset(self, references: Ints, execution: Execution) -> BobbState:
-        """The recogniser with some of the references alone, in their order, and the weight of patches as it is."""
-        settings = self.settings.model_copy(update={"patch_weight": self.weights().kinds[1]})
+        """The recogniser with some of the references alone, in their order, and the weights of patches as they are."""
+        retained = np.broadcast_to(self.weights().kinds[1], len(self.matcher))[references]
+        settings = self.settings.model_copy(update={"patch_weight": tuple(retained.tolist())})
         return settings.prepare([self.references[row] for row in references.tolist()], execution)
 
     def on_subset(self, column: pa.Array, references: Ints) -> pa.Array:
