@@ -21,7 +21,15 @@ from vplog.places import expected_votes
 from vplog.places.code_search import BLOCK, CodeIndex, CodeLists, Place, build_lists
 from vplog.places.columns import RecordState, from_column, to_column
 from vplog.places.library_files import RelearnedSettings
-from vplog.places.matches import PATCH_WEIGHT, KindWeights, Matcher, Matches, Once, WeighedMatchSettings, index_references
+from vplog.places.matches import (
+    PATCH_WEIGHT,
+    KindWeights,
+    Matcher,
+    Matches,
+    Once,
+    WeighedMatchSettings,
+    index_references,
+)
 from vplog.places.overlap import list_shared
 from vplog.places.self_recognition import misleading_patches
 
@@ -116,8 +124,8 @@ class BobbSettings(WeighedMatchSettings, RelearnedSettings):
         matcher = index_references(references, self)
         if isinstance(self.patch_weight, tuple) and len(self.patch_weight) != len(matcher):
             raise LibraryError(
-                f"places.patch_weight has {len(self.patch_weight)} numbers for {len(matcher)} reference images. Give one "
-                "for each, or a single one."
+                f"places.patch_weight has {len(self.patch_weight)} numbers for {len(matcher)} reference images. "
+                "Give one for each, or a single one."
             )
         if len(matcher) >= NOBODY:
             raise LibraryError(
@@ -322,6 +330,18 @@ class BobbState(RecordState):
             return overlap, overlap * weights[rows, ranks] * weights[others, other_ranks]
 
         return list_shared(np.where(references == NOBODY, -1, references.astype(np.int64)), query, match, compare)
+
+    def evidence(self, query: Place, match: Place) -> str:
+        """Kinds of features that the references count which most of the score of two places is of."""
+        shared, mine, theirs = np.intersect1d(query.references, match.references, return_indices=True)
+        known = shared != NOBODY
+        worth = query.weights[mine[known]].astype(np.int64) * match.weights[theirs[known]]
+        if not worth.any():
+            return ""
+        if self.settings.features == 0:
+            return "patches"
+        used = np.broadcast_to(self.weights().kinds[1], len(self.matcher))[shared[known]] > 0
+        return "keypoints and patches" if 2 * worth[used].sum() > worth.sum() else "keypoints"
 
     def checked(self, fields: Sequence[Any]) -> list[Any]:
         """Raises LibraryError where there is no such box, too."""

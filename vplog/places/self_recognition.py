@@ -61,12 +61,14 @@ def margin(votes: Floats, near: Bools) -> Floats:
 
 
 def misleading_patches(keypoints: Floats, patches: Floats, references: Sequence[Reference]) -> Bools:
-    """(L,) references around which neighbours stand out less with patches than without, by the (L, L) votes of each
-    kind. Of several drives in one map each part is decided by itself."""
+    """(L,) references around which neighbours stand out less with patches than without, on average by more than its
+    standard error (Breiman et al., Classification and Regression Trees, 1984, section 3.4.3), by the (L, L) votes of
+    each kind. Of several drives in one map each part is decided by itself."""
     near = neighbours(references)
     gain = margin(keypoints + PATCH_WEIGHT * patches, near) - margin(keypoints, near)
     around = neighbours(references, _AROUND) | np.eye(len(gain), dtype=bool)
-    return np.where(around, gain, 0.0).sum(axis=1) < 0.0
+    total, squares = np.where(around, gain, 0.0).sum(axis=1), np.where(around, gain**2, 0.0).sum(axis=1)
+    return total < -np.sqrt(np.maximum(squares - total**2 / around.sum(axis=1), 0.0))
 
 
 def recognised_shares(references: Sequence[Reference], execution: Execution) -> dict[str, float]:
