@@ -26,8 +26,11 @@ MOST = 16 * PAPER_SIZE
 """Largest number of references that is taken unasked: their features are 80 MB, and indexed in a minute."""
 _NEAR = 2
 """References before and after one that count as its neighbours: a random choice leaves gaps in between."""
-_AROUND = 25
-"""References before and after one whose evidence on patches is taken together: 50 tell, and a storey has as many."""
+_AROUND = 50
+"""References before and after one whose evidence on patches is taken together: a hundred, as many as the paper's
+library of a drive."""
+_SIGNIFICANT = 1.645
+"""Standard errors of a mean that chance takes it below zero in one of twenty cases."""
 _STRONGEST = 200
 """Keypoints that count for a library's size: half of what describes a place, for half of the time."""
 NO_IMAGE = np.zeros((1, 1), np.uint8)
@@ -61,14 +64,13 @@ def margin(votes: Floats, near: Bools) -> Floats:
 
 
 def misleading_patches(keypoints: Floats, patches: Floats, references: Sequence[Reference]) -> Bools:
-    """(L,) references around which neighbours stand out less with patches than without, on average by more than its
-    standard error (Breiman et al., Classification and Regression Trees, 1984, section 3.4.3), by the (L, L) votes of
-    each kind. Of several drives in one map each part is decided by itself."""
+    """(L,) references around which neighbours stand out significantly less with patches than without, by the (L, L)
+    votes of each kind. Of several drives in one map each part is decided by itself."""
     near = neighbours(references)
     gain = margin(keypoints + PATCH_WEIGHT * patches, near) - margin(keypoints, near)
     around = neighbours(references, _AROUND) | np.eye(len(gain), dtype=bool)
     total, squares = np.where(around, gain, 0.0).sum(axis=1), np.where(around, gain**2, 0.0).sum(axis=1)
-    return total < -np.sqrt(np.maximum(squares - total**2 / around.sum(axis=1), 0.0))
+    return total < -_SIGNIFICANT * np.sqrt(np.maximum(squares - total**2 / around.sum(axis=1), 0.0))
 
 
 def recognised_shares(references: Sequence[Reference], execution: Execution) -> dict[str, float]:
