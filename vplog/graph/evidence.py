@@ -163,11 +163,20 @@ def log_tails(chi2: Floats, d: int) -> float:
     return float(np.logaddexp.reduce(gain)) - math.log(len(gain))
 
 
-def log_student(factors: Factors, weight: Floats, poses: Floats, multiple: Floats) -> float:
-    """Log of how much likelier the residuals of the closures of positive weight are where their noise is Student's t in
-    place of normal.
+class StudentT(NamedTuple):
+    """Residuals of closures of positive weight where their noise is Student's t in place of normal; see `student_t`."""
 
-    `multiple` (E,) is by what the factors have the sigma of single closures multiplied already; NaN where that is open.
+    log_gain: float
+    """Log of how much likelier they are."""
+    multiple: Floats
+    """(E,) expected noise of each closure as a multiple of the sigma that they have on average; 1 elsewhere."""
+
+
+def student_t(factors: Factors, weight: Floats, poses: Floats, multiple: Floats) -> StudentT:
+    """The residuals of the closures of positive weight where their noise is Student's t.
+
+    `multiple` (E,) is by what the factors have the sigma of each closure multiplied already. The closer to those that
+    come out, the better the gain: it is exact for each closure given the others.
 
     Each is compared with the prediction of all others, so those of closures that nothing checks tell nothing. t is a
     normal distribution whose variance is drawn for each closure (Lange, Little and Taylor, Robust statistical modeling
@@ -177,19 +186,18 @@ def log_student(factors: Factors, weight: Floats, poses: Floats, multiple: Float
     closures = tension(factors, weight, poses, loops)
     gain = np.empty((len(loops), len(_MULTIPLES)))
     for column, times in enumerate(_MULTIPLES.tolist()):
-        less = 1.0 - times**2
+        less = 1.0 - (times / multiple[loops, None]) ** 2
         ratio = 1.0 - closures.redundancy * less  # of the variances of a residual's prediction error
         gain[:, column] = -0.5 * (np.log(ratio) + closures.whitened**2 * less / ratio).sum(1)
-    known = np.isfinite(multiple[loops])
-    gain[known] = np.where(_nearest_multiple(multiple[loops[known]])[:, None] == _MULTIPLES, 0.0, -np.inf)
     most = gain.max(1, keepdims=True)
-    density = np.log(np.maximum(np.exp(gain - most) @ _STUDENT.T, 1e-300)).sum(0) + most.sum()
-    return float(np.logaddexp.reduce(density)) - math.log(len(density))
-
-
-def _nearest_multiple(multiple: Floats) -> Floats:
-    """(K,) the nearest of `_MULTIPLES` to each."""
-    return _MULTIPLES[np.abs(np.log(multiple)[:, None] - np.log(_MULTIPLES)).argmin(1)]
+    likelihood = np.exp(gain - most)
+    density = np.maximum(likelihood @ _STUDENT.T, 1e-300)
+    total = np.log(density).sum(0) + most.sum()
+    log_gain = float(np.logaddexp.reduce(total))
+    share = (np.exp(total - log_gain) / density) @ _STUDENT * likelihood  # (K, 23) probability of each multiple
+    expected = np.ones(len(weight))
+    expected[loops] = 1.0 / np.sqrt(share @ _MULTIPLES**-2.0)
+    return StudentT(log_gain - math.log(len(total)), expected)
 
 
 def log_room(graph: PoseGraph, places: Floats) -> float:

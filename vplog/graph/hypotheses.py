@@ -16,7 +16,7 @@ import numpy as np
 from vplog.errors import GraphError
 from vplog.graph.build import informed
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, is_loop, residual_sigma
-from vplog.graph.evidence import Accidents, agreeing, log_evidence, log_room, log_student, log_tails, runs
+from vplog.graph.evidence import Accidents, agreeing, log_evidence, log_room, log_tails, runs, student_t
 from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
 from vplog.graph.least_squares import Objective, descend
@@ -73,12 +73,6 @@ class Hypothesis:
     sigmas: Sigmas
     log_evidence: float
 
-    def by_heavy_tails(self, factors: Factors, multiple: Floats) -> float:
-        """By how much the evidence grows where the noise of closures is Student's t; see `log_student`."""
-        of_loops = (residual_sigma(factors.graph, self.poses) ** 2)[~factors.graph.odometry & (self.weight > 0)]
-        log_normal = log_tails(of_loops, degrees_of_freedom(factors.graph))
-        return log_student(factors, self.weight, self.poses, multiple) - log_normal
-
 
 def best_hypothesis(
     graph: PoseGraph, optimiser: Optimiser, cost: Cost | None = None, log_odds: Floats | None = None
@@ -117,17 +111,8 @@ def best_hypothesis(
 
 
 def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: Cost | None) -> list[Hypothesis]:
-    """The hypothesis with the closures that it predicts within the noise that the log claims, where noise of heavy
-    tails makes that likelier: estimated from those that fit best, noise is too small for the others. No margin is asked
-    for, since none of them pulls far.
-
-    The poses of greatest density are near those where they err as the others do, or those where they err as claimed.
-    """
-
-    def value(one: Hypothesis, factors: Factors, multiple: Floats) -> float:
-        other = 0.0 if cost is None else cost(factors, one.weight, one.poses)
-        return one.log_evidence + one.by_heavy_tails(factors, multiple) - other
-
+    """The hypothesis with the closures that it predicts within the noise that the log claims, unless noise of heavy
+    tails makes that unlikely: estimated from those that fit best, noise is too small for the others."""
     rejected = np.flatnonzero(best.weight == 0)
     if not len(rejected) or not isinstance(optimiser, GncSettings):
         return []
@@ -138,19 +123,28 @@ def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: 
         return []
     weight = np.array(best.weight)
     weight[within] = 1.0
-    more, at, unknown = (
-        _refit(claimed, weight, best.poses, best.sigmas),
-        AtSigmas.of(claimed, best.sigmas),
-        weight * np.nan,
-    )
-    information, multiple = at.factors.graph.information.copy(), unknown.copy()
-    information[within], multiple[within] = claimed.graph.information[within], 1.0 / best.sigmas.of_closures
-    wide = replace(at, factors=replace(at.factors, graph=replace(at.factors.graph, information=information)))
-    values = (
-        value(more, _times(claimed, more.sigmas), unknown),
-        value(wide.hypothesis(weight, best.poses), wide.factors, multiple),
-    )
-    return [more] if max(values) > value(best, at.factors, unknown) else []
+    more = _refit(claimed, weight, best.poses, best.sigmas)
+    likeliest = max(_log_student(claimed, replace(more, sigmas=sigmas), cost) for sigmas in (best.sigmas, more.sigmas))
+    return [more] if likeliest > _log_student(claimed, best, cost) - _VERY_STRONG else []
+
+
+def _log_student(claimed: Factors, one: Hypothesis, cost: Cost | None) -> float:
+    """The log evidence of the hypothesis, less the cost, where the noise of closures is Student's t of its sigmas.
+
+    Each closure has the noise that is likeliest for it, by turns with the poses (expectation maximisation).
+    """
+    at, poses, multiple, found = AtSigmas.of(claimed, one.sigmas), one.poses, np.ones(len(one.weight)), -math.inf
+    graph = at.factors.graph
+    of_loops = ~graph.odometry & (one.weight > 0)
+    for _ in range(_ROUNDS):
+        information = graph.information / multiple[:, None, None] ** 2
+        factors = replace(at.factors, graph=replace(graph, information=information))
+        normal = replace(at, factors=factors).hypothesis(one.weight, poses)
+        residuals = student_t(factors, one.weight, normal.poses, multiple)
+        chi2 = (residual_sigma(factors.graph, normal.poses) ** 2)[of_loops]
+        found = normal.log_evidence - log_tails(chi2, degrees_of_freedom(graph)) + residuals.log_gain
+        poses, multiple = normal.poses, residuals.multiple
+    return found - (0.0 if cost is None else cost(at.factors, one.weight, poses))
 
 
 def _recognised(
