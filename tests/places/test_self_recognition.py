@@ -52,7 +52,7 @@ def _walk(rng: np.random.Generator, length: int) -> list[Features]:
 
 
 def _patch_weights(references: list[Reference], patch_weight: float | None = None) -> NDArray:
-    return BobbSettings(patch_weight=patch_weight).learn(references, Execution()).weights().kinds[1]
+    return BobbSettings(patch_weight=patch_weight).learn(references, Execution()).weights().patches
 
 
 def test_neighbours_are_of_one_drive_and_near_in_time() -> None:
@@ -129,10 +129,10 @@ def test_a_part_of_a_library_keeps_the_weights_of_patches(tmp_path: Path) -> Non
     state = BobbSettings().learn([replace(one, image=image) for one in _tower_and_street(3)], Execution())
     rows = np.array([1, 3, 25, 26])
     part = state.subset(rows, Execution())
-    assert part.weights().kinds[1].tolist() == [0.0, 0.0, PATCH_WEIGHT, PATCH_WEIGHT]
+    assert part.weights().patches.tolist() == [0.0, 0.0, PATCH_WEIGHT, PATCH_WEIGHT]
     part.save(tmp_path / "library")
     loaded = BobbSettings().load(tmp_path / "library", Execution())
-    assert loaded.weights().kinds[1].tolist() == part.weights().kinds[1].tolist()
+    assert loaded.weights().patches.tolist() == part.weights().patches.tolist()
     with pytest.raises(LibraryError, match="4 numbers for 2 reference images"):
         part.settings.learn(part.references[:2], Execution())
 

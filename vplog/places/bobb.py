@@ -138,27 +138,28 @@ class BobbSettings(WeighedMatchSettings, RelearnedSettings):
 
         def weights() -> Weights:
             if self.patch_weight is not None:
-                given = 1.0, np.broadcast_to(self.patch_weight, len(matcher))
-                return Weights.of(given, votes(given), self.popularity)
+                given = np.broadcast_to(self.patch_weight, len(matcher))
+                return Weights.of(given, votes((1.0, given)), self.popularity)
             keypoints, patches = votes((1.0, 0.0)), votes((0.0, 1.0))
             used = np.where(misleading_patches(keypoints, patches, matcher.references), 0.0, PATCH_WEIGHT)
-            return Weights.of((1.0, used), keypoints + used * patches, self.popularity)
+            return Weights.of(used, keypoints + used * patches, self.popularity)
 
         return BobbState(self, matcher, Once(weights))
 
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """Weights of the kinds of matches and of the references, by a library's own images."""
+    """Weights of the references, by a library's own images."""
 
-    kinds: KindWeights
+    patches: Floats
+    """(L,) weight of a match of patches on each; one of keypoints weighs 1."""
     rarity: Floats
     """(L,) weight of each reference."""
 
     @classmethod
-    def of(cls, kinds: KindWeights, votes: Floats, popularity: float) -> Weights:
+    def of(cls, patches: Floats, votes: Floats, popularity: float) -> Weights:
         """With the votes (L, L) of each reference for the others."""
-        return cls(kinds, _rarity(votes / np.maximum(votes.sum(axis=1, keepdims=True), 1e-9), popularity))
+        return cls(patches, _rarity(votes / np.maximum(votes.sum(axis=1, keepdims=True), 1e-9), popularity))
 
 
 def _rarity(explained: Floats, power: float) -> Floats:
@@ -203,7 +204,7 @@ class BobbState(RecordState):
         references = np.full(s.references, NOBODY, np.uint16)
         weights = np.zeros(s.references, np.uint8)
         boxes = np.full((s.references, s.boxes), NOWHERE, np.uint8)
-        matches = self.matcher.match(features, self.weights().kinds)
+        matches = self.matcher.match(features, (1.0, self.weights().patches))
         for j, (reference, share, here, there, agreed) in enumerate(self._retrieve(matches)):
             references[j], weights[j] = reference, max(round(255 * share**s.share_power), 1)
             boxes[j] = expected_votes.best_boxes(
@@ -262,7 +263,7 @@ class BobbState(RecordState):
 
     def voting_maps(self, features: Features, references: Sequence[int]) -> list[Floats]:
         """(36, 64) expected vote at the middle of every cell, by the closed form of `expected_votes`."""
-        matches = self.matcher.match(features, self.weights().kinds)
+        matches = self.matcher.match(features, (1.0, self.weights().patches))
         return [self._voting_map(matches, reference) for reference in references]
 
     def _voting_map(self, matches: Matches, reference: int) -> Floats:
@@ -298,8 +299,8 @@ class BobbState(RecordState):
 
     def subset(self, references: Ints, execution: Execution) -> BobbState:
         """The recogniser with some of the references alone, in their order, and the weights of patches as they are."""
-        retained = np.broadcast_to(self.weights().kinds[1], len(self.matcher))[references]
-        settings = self.settings.model_copy(update={"patch_weight": tuple(retained.tolist())})
+        patch_weight = tuple(self.weights().patches[references].tolist())
+        settings = self.settings.model_copy(update={"patch_weight": patch_weight})
         return settings.prepare([self.references[row] for row in references.tolist()], execution)
 
     def on_subset(self, column: pa.Array, references: Ints) -> pa.Array:
@@ -340,7 +341,7 @@ class BobbState(RecordState):
             return ""
         if self.settings.features == 0:
             return "patches"
-        used = np.broadcast_to(self.weights().kinds[1], len(self.matcher))[shared[known]] > 0
+        used = self.weights().patches[shared[known]] > 0
         return "keypoints and patches" if 2 * worth[used].sum() > worth.sum() else "keypoints"
 
     def checked(self, fields: Sequence[Any]) -> list[Any]:
