@@ -112,6 +112,19 @@ def test_each_drive_of_a_library_decides_on_its_patches_in_any_order(seed: int) 
     assert weights.tolist() == np.where(order < 24, 0.0, PATCH_WEIGHT).tolist()
 
 
+def test_evidence_is_what_counts_on_the_references_that_two_places_share() -> None:
+    references = _tower_and_street(1)
+    state = BobbSettings().learn(references, Execution())
+    storey, next_door, street = (state.describe(references[row].features) for row in (4, 5, 40))
+    assert state.evidence(storey, next_door) == "keypoints"
+    assert state.evidence(street, street) == "keypoints and patches"
+    assert state.evidence(storey, state.describe(nothing())) == ""
+    alone = [replace(one, features=one.features.rows(slice(0))) for one in references[:24]]
+    patches = BobbSettings(features=0, patch_weight=1.0).learn(alone, Execution())
+    place = patches.describe(alone[4].features)
+    assert patches.evidence(place, place) == "patches"
+
+
 def test_places_of_one_log_decide_by_what_is_around_them() -> None:
     count = 300
     references = [_at(stamp) for stamp in range(count)]

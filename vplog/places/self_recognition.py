@@ -26,11 +26,11 @@ MOST = 16 * PAPER_SIZE
 """Largest number of references that is taken unasked: their features are 80 MB, and indexed in a minute."""
 _NEAR = 2
 """References before and after one that count as its neighbours: a random choice leaves gaps in between."""
-_AROUND = 50
-"""References before and after one whose evidence on patches is taken together: a hundred, as many as the paper's
-library of a drive."""
-_SIGNIFICANT = 1.645
-"""Standard errors of a mean that chance takes it below zero in one of twenty cases."""
+_AROUND = 25
+"""References before and after one whose evidence on patches is taken together: fewer tell too little, and more blur where
+one drive or storey ends and another begins."""
+_SIGNIFICANT = 1.282
+"""Standard errors by which chance takes a mean below zero in one of ten cases."""
 _STRONGEST = 200
 """Keypoints that count for a library's size: half of what describes a place, for half of the time."""
 NO_IMAGE = np.zeros((1, 1), np.uint8)
