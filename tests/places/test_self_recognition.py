@@ -93,7 +93,7 @@ def test_one_image_lost_by_chance_does_not_switch_patches_off() -> None:
     wrong[3, 30] = 5.0
     assert not misleading_patches(sound, wrong, references).any()
     wrong[np.arange(3, 9), 30] = 5.0
-    assert misleading_patches(sound, wrong, references).all()
+    assert misleading_patches(sound, wrong, references)[:30].all()
 
 
 def _tower_and_street(seed: int) -> list[Reference]:

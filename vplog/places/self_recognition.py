@@ -27,8 +27,8 @@ MOST = 16 * PAPER_SIZE
 _NEAR = 2
 """References before and after one that count as its neighbours: a random choice leaves gaps in between."""
 _AROUND = 25
-"""References before and after one whose evidence on patches is taken together: fewer tell too little, and more blur where
-one drive or storey ends and another begins."""
+"""References before and after one whose evidence on patches is taken together: fewer tell too little, and more blur
+where one drive or storey ends and another begins."""
 _SIGNIFICANT = 1.282
 """Standard errors by which chance takes a mean below zero in one of ten cases."""
 _STRONGEST = 200
