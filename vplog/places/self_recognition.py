@@ -49,28 +49,28 @@ def neighbours(references: Sequence[Reference], reach: int = _NEAR) -> Bools:
     return near
 
 
-def recognised(votes: Floats, near: Bools) -> Bools:
-    """(L,) references that most `votes` (L, L) of go to a neighbour; an image's votes for itself do not count."""
-    others = np.where(np.eye(len(votes), dtype=bool), 0.0, votes)
-    best = np.arange(len(votes)), others.argmax(axis=1)
-    return near[best] & (others[best] > 0)
-
-
 def margin(votes: Floats, near: Bools) -> Floats:
-    """(L,) by how much the best neighbour explains a reference better than the best other does, -1..1 of their sum."""
+    """(L,) by how much the best neighbour explains a reference better than the best other does, -1..1 of their sum: a
+    reference is recognised where that is positive. An image's votes (L, L) for itself do not count."""
     others = np.where(np.eye(len(votes), dtype=bool), 0.0, votes)
     neighbour, stranger = np.where(near, others, 0.0).max(axis=1), np.where(near, 0.0, others).max(axis=1)
     return (neighbour - stranger) / np.maximum(neighbour + stranger, 1e-9)
 
 
 def misleading_patches(keypoints: Floats, patches: Floats, references: Sequence[Reference]) -> Bools:
-    """(L,) references around which neighbours stand out significantly less with patches than without, by the (L, L)
-    votes of each kind. Of several drives in one map each part is decided by itself."""
+    """(L,) references around which fewer are recognised with patches than without, and with significantly less margin,
+    by the (L, L) votes of each kind. Of several drives in one map each part is decided by itself."""
     near = neighbours(references)
-    gain = margin(keypoints + PATCH_WEIGHT * patches, near) - margin(keypoints, near)
-    around = neighbours(references, _AROUND) | np.eye(len(gain), dtype=bool)
-    total, squares = np.where(around, gain, 0.0).sum(axis=1), np.where(around, gain**2, 0.0).sum(axis=1)
-    return total < -_SIGNIFICANT * np.sqrt(np.maximum(squares - total**2 / around.sum(axis=1), 0.0))
+    without, together = margin(keypoints, near), margin(keypoints + PATCH_WEIGHT * patches, near)
+    around = neighbours(references, _AROUND) | np.eye(len(near), dtype=bool)
+
+    def summed(values: Floats) -> Floats:
+        return np.where(around, values, 0.0).sum(axis=1)
+
+    gain, recognised = together - without, np.sign(together) - np.sign(without)
+    total, squares = summed(gain), summed(gain**2)
+    error = np.sqrt(np.maximum(squares - total**2 / around.sum(axis=1), 0.0))
+    return (summed(recognised) < 0.0) & (total < -_SIGNIFICANT * error)
 
 
 def recognised_shares(references: Sequence[Reference], execution: Execution) -> dict[str, float]:
@@ -79,7 +79,7 @@ def recognised_shares(references: Sequence[Reference], execution: Execution) -> 
         return {}
     matcher = index_references(references, WeighedMatchSettings(features=_STRONGEST, patch_weight=0.0))
     votes = execution.map(lambda one: matcher.match(one.features, (1.0, 0.0)).votes(), matcher.references)
-    found, drives = recognised(np.array(list(votes)), neighbours(references)), np.array([r.drive for r in references])
+    found, drives = margin(np.array(list(votes)), neighbours(references)) > 0, np.array([r.drive for r in references])
     return {name: float(found[drives == name].mean()) for name in np.unique(drives).tolist()}
 
 
