@@ -26,11 +26,13 @@ MOST = 16 * PAPER_SIZE
 """Largest number of references that is taken unasked: their features are 80 MB, and indexed in a minute."""
 _NEAR = 2
 """References before and after one that count as its neighbours: a random choice leaves gaps in between."""
-_AROUND = 25
-"""References before and after one whose evidence on patches is taken together: fewer tell too little, and more blur
-where one drive or storey ends and another begins."""
-_SIGNIFICANT = 1.282
-"""Standard errors by which chance takes a mean below zero in one of ten cases."""
+_AROUND = 25, 50, 100
+"""References before and after one whose evidence on patches is taken together, as many as tell most: few where a drive
+or storey ends and another begins, many where each tells little."""
+_SAME_PLACE = 0.5
+"""Of the keypoints' votes for the best neighbour: with so many, another reference may show the same place."""
+_SIGNIFICANT = 1.645
+"""Standard deviations that chance exceeds in one of twenty cases."""
 _STRONGEST = 200
 """Keypoints that count for a library's size: half of what describes a place, for half of the time."""
 NO_IMAGE = np.zeros((1, 1), np.uint8)
@@ -49,28 +51,38 @@ def neighbours(references: Sequence[Reference], reach: int = _NEAR) -> Bools:
     return near
 
 
-def margin(votes: Floats, near: Bools) -> Floats:
-    """(L,) by how much the best neighbour explains a reference better than the best other does, -1..1 of their sum: a
-    reference is recognised where that is positive. An image's votes (L, L) for itself do not count."""
+def margin(votes: Floats, near: Bools, place: Bools | None = None) -> Floats:
+    """(L,) by how much the best neighbour explains a reference better than the best stranger does, -1..1 of their sum.
+
+    A reference is recognised where that is positive. An image's votes (L, L) for itself do not count; strangers are
+    those that are not of the same `place`, by default all but the neighbours.
+    """
     others = np.where(np.eye(len(votes), dtype=bool), 0.0, votes)
-    neighbour, stranger = np.where(near, others, 0.0).max(axis=1), np.where(near, 0.0, others).max(axis=1)
+    neighbour = np.where(near, others, 0.0).max(axis=1)
+    stranger = np.where(near if place is None else place, 0.0, others).max(axis=1)
     return (neighbour - stranger) / np.maximum(neighbour + stranger, 1e-9)
 
 
 def misleading_patches(keypoints: Floats, patches: Floats, references: Sequence[Reference]) -> Bools:
-    """(L,) references around which fewer are recognised with patches than without, and with significantly less margin,
-    by the (L, L) votes of each kind. Of several drives in one map each part is decided by itself."""
+    """(L,) references around which significantly fewer are recognised with patches than without (McNemar's test), and
+    with less margin, by the (L, L) votes of each kind.
+
+    Of several drives in one map each part is decided by itself. A reference that keypoints find may show the same place
+    on the way back, and is no stranger.
+    """
     near = neighbours(references)
-    without, together = margin(keypoints, near), margin(keypoints + PATCH_WEIGHT * patches, near)
-    around = neighbours(references, _AROUND) | np.eye(len(near), dtype=bool)
-
-    def summed(values: Floats) -> Floats:
-        return np.where(around, values, 0.0).sum(axis=1)
-
-    gain, recognised = together - without, np.sign(together) - np.sign(without)
-    total, squares = summed(gain), summed(gain**2)
-    error = np.sqrt(np.maximum(squares - total**2 / around.sum(axis=1), 0.0))
-    return (summed(recognised) < 0.0) & (total < -_SIGNIFICANT * error)
+    neighbour = np.where(near, keypoints, 0.0).max(axis=1, keepdims=True)
+    place = near | ((keypoints > 0) & (keypoints >= _SAME_PLACE * neighbour))
+    without, together = margin(keypoints, near, place), margin(keypoints + PATCH_WEIGHT * patches, near, place)
+    gain, change = together - without, (np.sign(together) - np.sign(without)) / 2.0
+    most, less = np.zeros(len(near)), np.zeros(len(near), bool)
+    for reach in _AROUND:
+        around = neighbours(references, reach) | np.eye(len(near), dtype=bool)
+        mean, lost, changed = (np.where(around, one, 0.0).sum(axis=1) for one in (gain, -change, np.abs(change)))
+        errors = np.sign(lost) * np.maximum(np.abs(lost) - 1.0, 0.0) / np.sqrt(np.maximum(changed, 1.0))
+        most = np.where(np.abs(errors) > np.abs(most), errors, most)
+        less = mean < 0.0 if reach == _AROUND[0] else less
+    return less & (most > _SIGNIFICANT)
 
 
 def recognised_shares(references: Sequence[Reference], execution: Execution) -> dict[str, float]:
