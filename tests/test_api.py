@@ -22,7 +22,7 @@ import vplog
 from tests.batch.test_batch import QUICK
 from tests.maps.bucket import serving
 from vplog import errors
-from vplog.batch.worker import Drive
+from vplog.batch.worker import DriveState
 from vplog.execution.process_pool import OwnProcesses
 from vplog.results.run_record import read_run_json
 from vplog.storage.remote_path import local_output, located
@@ -296,7 +296,7 @@ def test_examples_for_schedulers(
 
     def computed(*arguments: Any, **more: Any) -> dict[str, Any]:
         on_drive = batch.bind(*arguments, **more).arguments.get("on_drive", lambda _: None)
-        on_drive(Drive("a", "a.mcap", "computed"))
+        on_drive(DriveState("a", "a.mcap", "computed"))
         return {"drives": [{"drive": "a", "state": "computed", "error": ""}], "failed": 0}
 
     def evaluated(*arguments: Any, **more: Any) -> dict[str, Any]:

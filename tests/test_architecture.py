@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 import vplog
-from vplog.pipeline import Pipeline, load_pipeline, pipeline_folder
+from vplog.pipeline import STAGES, Pipeline, load_pipeline, pipeline_folder
 from vplog.settings import load_yaml
 
 if TYPE_CHECKING:
@@ -125,6 +125,17 @@ def test_no_stage_asks_for_a_certain_recogniser() -> None:
 def test_the_check_sees_imports() -> None:
     assert "loops" in parts_used(PACKAGE / "pipeline.py")
     assert "pipeline" in parts_used(PACKAGE / "cli/main.py")
+
+
+def test_run_reads_like_the_algorithm() -> None:
+    """A screen of steps: no lambda, no record, no name of a step as text."""
+    tree = ast.parse((PACKAGE / "pipeline.py").read_text(encoding="utf-8"))
+    [run] = [one for one in tree.body if isinstance(one, ast.FunctionDef) and one.name == "run"]
+    assert run.end_lineno is not None
+    assert run.end_lineno - run.lineno < 60
+    parts = list(ast.walk(run))
+    assert not [part for part in parts if isinstance(part, ast.Lambda | ast.Dict)]
+    assert not {part.value for part in parts if isinstance(part, ast.Constant)}.intersection(STAGES)
 
 
 def test_only_the_graph_knows_gtsam() -> None:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from vplog.batch.worker import Drive
+    from vplog.batch.worker import DriveState
     from vplog.benchmark.compare import Comparison
     from vplog.data import Camera
     from vplog.logs import TopicChoice
@@ -336,8 +336,8 @@ def compare(
     chosen = None if truth is None else TruthChoice(os.fspath(truth), *bounds)
     with limited(threads), ExitStack() as stack:
         references = None if library is None else stack.enter_context(local_copy(located(library)))
-        place, parts, kept = None if out is None else located(out), _topics(topics), CacheChoice(cache, cache_gb)
-        options = CompareOptions(references, library_size, library_seed, min_gap, sequence, place, parts, kept)
+        place, parts, features = None if out is None else located(out), _topics(topics), CacheChoice(cache, cache_gb)
+        options = CompareOptions(references, library_size, library_seed, min_gap, sequence, place, parts, features)
         names = split_methods(methods) if isinstance(methods, str) else methods
         drives = located(query), None if map is None else located(map)
         settled = _pipeline(pipeline, settings)
@@ -364,7 +364,7 @@ def batch(
     dry_run: bool = False,
     cost_per_cpu_hour: float | None = None,
     progress: Progress = silent,
-    on_drive: Callable[[Drive], None] = lambda _: None,
+    on_drive: Callable[[DriveState], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Compute many drives into one growing map, each log in a process of its own, here or on a Ray cluster.
 

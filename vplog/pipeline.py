@@ -37,7 +37,7 @@ from vplog.run import provenance
 from vplog.run.back_end import solve
 from vplog.run.cameras import View, describe_cameras, name_shared, read_cameras, verify_cameras
 from vplog.run.decisions import DecisionSettings, decide, read_decisions
-from vplog.run.false_rate import rate_closures
+from vplog.run.false_rate import RatingSettings, rate_closures
 from vplog.run.feature_extraction import decoded, extract
 from vplog.run.keyframes import KeyframeSettings
 from vplog.run.odometry import read
@@ -87,11 +87,11 @@ class Pipeline(Settings):
     """Images of the camera in result.mcap and report.html."""
 
     @property
-    def null_pairs(self) -> FalseRateSettings:
-        """`false_rate`, without mirrored candidates where features are not SIFT: only its descriptors are mirrored
-        without the image."""
+    def rating(self) -> RatingSettings:
+        """How closures are rated: without mirrored candidates where features are not SIFT, as only its descriptors are
+        mirrored without the image."""
         mirrored = {} if self.features.kind == "sift" else {"null_pairs": 0}
-        return self.false_rate.model_copy(update=mirrored)
+        return RatingSettings(self.false_rate.model_copy(update=mirrored), self.propose, self.noise)
 
     @model_validator(mode="before")
     @classmethod
@@ -203,9 +203,7 @@ def run(
         if len(views) > 1:
             closures = do(verify_cameras, closures, views, state, pipeline)
         pictures, rows = [view.pictures for view in views], [view.row for view in views]
-        closures = do(
-            rate_closures, closures, odometry, pictures, rows, pipeline.null_pairs, pipeline.propose, pipeline.noise
-        )  # fmt: skip
+        closures = do(rate_closures, closures, odometry, pictures, rows, pipeline.rating)
         if decisions is not None:
             closures = do(decide, closures, decisions, drive)
         closures = name_shared(closures, state, views)

@@ -28,7 +28,7 @@ from vplog.batch import batch
 from vplog.batch.batch import run_batch
 from vplog.batch.engine import BatchOptions, LocalEngine, as_completed, open_engine
 from vplog.batch.plan import DriveInput, PlannedDrive, absolute_log, name_of
-from vplog.batch.worker import Drive, Outcome, Task, compute_drive
+from vplog.batch.worker import DriveState, Outcome, Task, compute_drive
 from vplog.demo.record import IMAGE
 from vplog.errors import LibraryError, LogError, ResultError, SettingsError
 from vplog.execution.process_pool import OwnProcesses, ProcessExpired
@@ -292,7 +292,7 @@ def test_a_drive_is_tried_again_where_that_may_help_and_stops_no_other(tmp_path:
     })  # fmt: skip
     topics, pipeline = TopicChoice(), load_pipeline("default")
     tasks = [Task(name, name, tmp_path, tmp_path, pipeline, topics, 1, {}) for name in engine.fates]
-    told: list[Drive] = []
+    told: list[DriveState] = []
     found = as_completed(cast("LocalEngine", engine), tasks, BatchOptions(2, on_drive=told.append))
     ended = {task.drive: (outcome.error, attempts) for task, outcome, attempts in found}
     assert ended == {

@@ -23,7 +23,7 @@ from tests.conftest import TINY
 from vplog.batch import ray_cluster, ray_engine
 from vplog.batch.batch import run_batch
 from vplog.batch.engine import BatchOptions
-from vplog.batch.ray_cluster import Head
+from vplog.batch.ray_cluster import ClusterHead
 from vplog.batch.ray_engine import translated
 from vplog.demo import SMALL, make_drive
 from vplog.errors import SettingsError
@@ -169,7 +169,7 @@ def test_a_lost_head_fails_what_waits_for_it(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(ray_cluster, "_LOST_S", 0.3)
     ended = threading.Event()
     with socket.create_server(("127.0.0.1", 0)) as server:
-        head = Head(f"127.0.0.1:{server.getsockname()[1]}")
+        head = ClusterHead(f"127.0.0.1:{server.getsockname()[1]}")
         watch = threading.Thread(target=head.watch, args=(ended,), daemon=True)
         watch.start()
         early = head.future()

@@ -21,7 +21,7 @@ from vplog.cli import printing
 from vplog.demo.record import IMAGE
 from vplog.results import tables
 from vplog.results.run_record import read_run_json
-from vplog.run.report import Outcome, outcome_of
+from vplog.run.report import RunOutcome, outcome_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -193,14 +193,14 @@ def test_the_outcome_is_that_of_the_tables(finished: Path) -> None:
 @pytest.mark.parametrize(
     ("outcome", "gps", "said"),
     [
-        (Outcome(0.0, 0, 0), None, "the trajectory is the odometry's. No closure passed."),
-        (Outcome(1.234, 1, 1), None, "the trajectory moved by up to 1.23 m, by 1 closure at 1 place"),
-        (Outcome(5.0, 12, 3), {}, "the trajectory moved by up to 5.00 m, by 12 closures at 3 places"),
-        (Outcome(5.0, 2, 2), {"fixes": 3}, "by 2 closures at 2 places and the satellite fixes"),
-        (Outcome(5.0, 0, 0), {"fixes": 3}, "moved by up to 5.00 m, by the satellite fixes"),
+        (RunOutcome(0.0, 0, 0), None, "the trajectory is the odometry's. No closure passed."),
+        (RunOutcome(1.234, 1, 1), None, "the trajectory moved by up to 1.23 m, by 1 closure at 1 place"),
+        (RunOutcome(5.0, 12, 3), {}, "the trajectory moved by up to 5.00 m, by 12 closures at 3 places"),
+        (RunOutcome(5.0, 2, 2), {"fixes": 3}, "by 2 closures at 2 places and the satellite fixes"),
+        (RunOutcome(5.0, 0, 0), {"fixes": 3}, "moved by up to 5.00 m, by the satellite fixes"),
     ],
 )
-def test_what_came_of_a_run_is_said_in_metres(outcome: Outcome, gps: Any, said: str) -> None:
+def test_what_came_of_a_run_is_said_in_metres(outcome: RunOutcome, gps: Any, said: str) -> None:
     assert printing._outcome_text(outcome, {"gps": gps, "solution": {"reason": "No closure passed."}}).endswith(said)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from vplog.batch.worker import Drive
+from vplog.batch.worker import DriveState
 from vplog.cli import progress
 from vplog.cli.progress import Events, Progress
 from vplog.pipeline import STAGES
@@ -109,8 +109,8 @@ def test_the_time_to_the_end_is_learned_from_the_latest_run_beside(tmp_path: Pat
 
 def test_a_drive_of_a_batch_has_its_event_and_its_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shown = Progress(namespace(tmp_path / "e"))
-    shown.print_drive(Drive("a", "a.mcap", "started", 1))
-    shown.print_drive(Drive("a", "a.mcap", "failed", 1, 2.0, error="Damaged.", fault="input"))
+    shown.print_drive(DriveState("a", "a.mcap", "started", 1))
+    shown.print_drive(DriveState("a", "a.mcap", "failed", 1, 2.0, error="Damaged.", fault="input"))
     first, second = (one | {"time_s": 0} for one in told(tmp_path / "e"))
     assert first == {"event": "drive_started", "time_s": 0, "drive": "a", "log": "a.mcap", "attempt": 1}
     assert second == first | {

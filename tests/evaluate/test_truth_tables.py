@@ -205,7 +205,7 @@ class _Attack:
     ("values", "said"),
     [
         (ragged((_Attack(), [1])), "asks for 'open'"),
-        (ragged((0, [0.5])), "BINFLOAT"),
+        (ragged((0, [0.5])), "does not hold whole numbers alone"),
         (ragged((0, ["a"])), "does not hold whole numbers alone"),
         (ragged((0, [4])), "4 is not a frame of the map, whose 4 frames"),
         (ragged((-1, [0])), "-1 is not a frame of the query"),
@@ -239,6 +239,17 @@ def test_damaged_arrays(tmp_path: Path) -> None:
             read_array(path, 3, 4)
         except TruthError as error:
             assert "\n" not in str(error)
+
+
+def test_a_query_without_its_matches_is_damage(tmp_path: Path) -> None:
+    path = tmp_path / "truth.npy"
+    values = np.empty(3, object)
+    values[:] = [0, [1], 2]
+    with path.open("wb") as stream:
+        np.lib.format.write_array_header_1_0(stream, {"descr": "|O", "fortran_order": False, "shape": (2, 2)})
+        pickle.dump(values, stream, 4)
+    with pytest.raises(TruthError, match="is not an array of whole numbers that can be read"):
+        read_array(path, 3, 4)
 
 
 def test_a_file_that_is_far_too_large_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ from tests.maps.joining.test_join import digests
 from vplog.data import Ranking
 from vplog.execution.execution import Execution
 from vplog.maps.condensation.own_queries import PASSES, OwnPlaces, later_passes
-from vplog.maps.condensation.redundancy import OwnQueries, remove_cross_validated, remove_redundant
+from vplog.maps.condensation.redundancy import OwnQueries, RemovalCandidates, remove_cross_validated, remove_redundant
 from vplog.maps.condensation.references import by_coverage
 from vplog.maps.joining.candidate_drives import places_of
 from vplog.maps.search.query import open_map
@@ -65,7 +65,7 @@ def test_no_more_queries_are_lost_than_may_be(most: int) -> None:
     """Answers among the places that stay are those of a search among them alone, however short the lists were."""
     at, queries = line(np.random.default_rng(1), 60, 3.0)
     every = np.ones(60, np.bool_)
-    removal = remove_redundant(queries, np.zeros(60, np.int64), at, every, ~every, most)
+    removal = remove_redundant(queries, RemovalCandidates(np.zeros(60, np.int64), at, every, ~every), most)
     kept = every.copy()
     kept[removal.places] = False
 
@@ -81,7 +81,7 @@ def test_no_more_queries_are_lost_than_may_be(most: int) -> None:
     assert 10 < len(removal.places) < 59
     rest = np.sort(removal.places[:10])
     assert np.diff(rest).min() > 1, "no gap is left while there are smaller ones"
-    longer = remove_redundant(queries, np.zeros(60, np.int64), at, every, ~every, most + 3)
+    longer = remove_redundant(queries, RemovalCandidates(np.zeros(60, np.int64), at, every, ~every), most + 3)
     assert longer.places[: len(removal.places)].tolist() == removal.places.tolist()
 
 
@@ -93,7 +93,7 @@ def test_a_drive_not_seen_loses_no_more_than_is_stated() -> None:
         rng = np.random.default_rng(seed)
         at, queries = line(rng, 80, 3.0)
         _, others = line(rng, 80, 3.0)
-        about = np.zeros(80, np.int64), at, every, ~every, stated
+        about = RemovalCandidates(np.zeros(80, np.int64), at, every, ~every), stated
         for folds, removal in (
             (True, remove_cross_validated(queries, at % 2 == 0, *about)[0]),
             (False, remove_redundant(queries, *about)),

@@ -15,10 +15,10 @@ import pytest
 from tests.maps.runs import map_of_run, put_rows
 from vplog.execution.execution import Execution
 from vplog.maps.search.query import MapQuery, search
+from vplog.maps.search.sequences import LineSearch
 from vplog.maps.storage import map_store
 from vplog.maps.storage.layout import drive_names
 from vplog.pipeline import load_pipeline
-from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record, tables
 from vplog.storage.json_records import CHECKSUM
 
@@ -84,7 +84,7 @@ def test_the_best_of_the_drives_are_those_of_one_index(root: Path, library: str)
         owner += [number] * len(places)
         rows += list(range(len(places)))
     index = state.index(known)
-    answers, _ = search(store, store.drives(), state, views, MapQuery(7), SequenceSettings(length=1), Execution(2))
+    answers, _ = search(store, store.drives(), state, views, MapQuery(7), LineSearch(), Execution(2))
     for at, view in enumerate(views):
         ranking = index.query(view, 7)
         count = answers.count[at]

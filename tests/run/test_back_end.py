@@ -16,10 +16,10 @@ from vplog.run.back_end import solve
 
 if TYPE_CHECKING:
     from tests.graph.drive import Drive
-    from vplog.run.back_end import Solved
+    from vplog.run.back_end import BackEndResult
 
 
-def solved(drive: Drive, claimed: float, aside_m: float = 0.0) -> Solved:
+def solved(drive: Drive, claimed: float, aside_m: float = 0.0) -> BackEndResult:
     """The drive with a constant covariance so many times its true one, its closures moved aside."""
     loops = is_loop(drive.graph)
     measured = drive.graph.a_from_b[loops].copy()

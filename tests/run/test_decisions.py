@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from conftest import Said
 
     from vplog.demo.record import Drive
-    from vplog.run.back_end import Solved
+    from vplog.run.back_end import BackEndResult
 
 HEADER = "query,match,decision,who,when,reason\n"
 KEYFRAMES = ring(40).keyframes
@@ -68,7 +68,7 @@ def test_a_file_that_does_not_fit_is_refused_with_its_line(text: str, what: str,
     assert what in str(error.value)
 
 
-def decided(row: int, verdict: Verdict, aside_m: float = 0.0) -> Solved:
+def decided(row: int, verdict: Verdict, aside_m: float = 0.0) -> BackEndResult:
     """A drive of two laps with 60 true closures, one of which is decided and may be moved."""
     drive = ring(240, 60, seed=4)
     loops = ~drive.graph.odometry

@@ -41,7 +41,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
 
 
 @dataclass(frozen=True, eq=False)
-class Calibrated(pictures.Drive):
+class Calibrated(pictures.PictureLog):
     """A log without odometry, whose camera is calibrated and has depth."""
 
     depth: bool = True

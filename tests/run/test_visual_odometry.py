@@ -14,7 +14,7 @@ from vplog.demo.settings import DemoSettings
 from vplog.geometry import se3
 from vplog.graph.refine import Refined
 from vplog.graph.variance_components import Sigmas, claimed_times
-from vplog.run.back_end import Solved, keyframe_covariances
+from vplog.run.back_end import BackEndResult, keyframe_covariances
 from vplog.run.visual_odometry.sensor import disparities, follow
 from vplog.run.visual_odometry.visual import visual_odometry
 
@@ -131,7 +131,7 @@ def test_closures_do_not_make_odometry_of_the_same_images_surer_than_it_claims()
     sigmas = Sigmas(0.1, 0.1)
     solution = Solution(poses, np.ones(len(edges_a)), 0.0, 0.0, 0, True, "")
     refined = Refined(claimed_times(graph, sigmas), solution, sigmas, 1.0, None, np.zeros(0), None)
-    solved = Solved(None, refined, Trajectory(np.arange(count), poses), "increments", [])  # type: ignore[arg-type]
+    solved = BackEndResult(None, refined, Trajectory(np.arange(count), poses), "increments", [])  # type: ignore[arg-type]
     own, shared = (keyframe_covariances(replace(solved, of_images=of_images)) for of_images in (False, True))
     assert own is not None and shared is not None
     ratio = np.sqrt(np.trace(shared[5, 3:, 3:]) / np.trace(own[5, 3:, 3:]))

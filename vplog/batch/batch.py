@@ -17,7 +17,7 @@ from vplog.batch.engine import BatchOptions, LocalEngine, as_completed, open_eng
 from vplog.batch.log_hashes import NAME, known_hashes
 from vplog.batch.map_library import map_library
 from vplog.batch.plan import DriveInput, PlannedDrive, common_record, plan_drives, with_topics
-from vplog.batch.worker import Drive, Outcome, Task, made_by
+from vplog.batch.worker import DriveState, Outcome, Task, made_by
 from vplog.cache.input_hashes import bytes_of
 from vplog.errors import ResultError, SettingsError, VplogError
 from vplog.execution.execution import Execution
@@ -83,10 +83,10 @@ def run_batch(
         hashes = known_hashes(given, store.root / NAME, execution)
         common = common_record(pipeline, digest) | versions.result()
         plan = plan_drives(store, given, common, hashes)
-        done = dict[str, Drive]()
+        done = dict[str, DriveState]()
         for one in plan:
             if one.state != "compute":
-                done[one.drive] = Drive(
+                done[one.drive] = DriveState(
                     one.drive, one.record["log"], one.state, error=one.error, fault="input" if one.error else ""
                 )  # fmt: skip
             if one.state == "failed":
@@ -142,7 +142,7 @@ def run_batch(
     }
 
 
-def write_failures(store: Store, done: Mapping[str, Drive]) -> None:
+def write_failures(store: Store, done: Mapping[str, DriveState]) -> None:
     """Note the failures of this batch in the map, beside those of other drives."""
     changes = dict[str, dict[str, Any] | None]()
     for drive, one in done.items():
@@ -151,7 +151,7 @@ def write_failures(store: Store, done: Mapping[str, Drive]) -> None:
     store.update_failures(changes)
 
 
-def _write_failures(store: Store, done: Mapping[str, Drive]) -> list[str]:
+def _write_failures(store: Store, done: Mapping[str, DriveState]) -> list[str]:
     """`write_failures`; a warning where a full disk refuses it, which must not cost the answer."""
     try:
         write_failures(store, done)
@@ -160,9 +160,9 @@ def _write_failures(store: Store, done: Mapping[str, Drive]) -> list[str]:
     return []
 
 
-def _duplicate_recordings(outcomes: Sequence[Drive], inputs: Sequence[dict[str, str]]) -> list[str]:
+def _duplicate_recordings(outcomes: Sequence[DriveState], inputs: Sequence[dict[str, str]]) -> list[str]:
     """A warning for each recording that the map has under several names: closures between them mean nothing."""
-    common: dict[tuple[str, ...], list[Drive]] = {}
+    common: dict[tuple[str, ...], list[DriveState]] = {}
     for one, content in zip(outcomes, inputs, strict=True):
         if content and one.state != "failed" and "://" not in one.log:  # of those the bytes are not known
             common.setdefault(tuple(sorted(content.values())), []).append(one)
@@ -246,7 +246,7 @@ def _divide_cores(workers: Engine, jobs: int | None, drives: int) -> tuple[int, 
     return each, jobs or workers.concurrency(each)
 
 
-def _publish(store: Store, task: Task, outcome: Outcome, attempts: int) -> Drive:
+def _publish(store: Store, task: Task, outcome: Outcome, attempts: int) -> DriveState:
     drive = task.drive
     if not outcome.error:
         try:
@@ -256,4 +256,4 @@ def _publish(store: Store, task: Task, outcome: Outcome, attempts: int) -> Drive
     if outcome.error:
         shutil.rmtree(task.folder, ignore_errors=True)
     state = "failed" if outcome.error else "computed"
-    return replace(Drive.after(task, state, attempts, outcome), drive=drive)
+    return replace(DriveState.after(task, state, attempts, outcome), drive=drive)

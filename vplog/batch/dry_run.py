@@ -7,25 +7,22 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog import logs
-from vplog.batch.plan import common_record, plan_drives, with_topics
+from vplog.batch.plan import DriveInput, PlannedDrive, common_record, plan_drives, with_topics
 from vplog.batch.worker import made_by
 from vplog.cache.input_hashes import bytes_of, files_of
 from vplog.errors import ResultError, VplogError
+from vplog.execution.execution import Execution
 from vplog.maps.storage import map_store
+from vplog.maps.storage.map_store import Store
+from vplog.pipeline import Pipeline
 from vplog.places.library_files import read_library_record
 from vplog.results import run_record
 from vplog.run.provenance import stat_of
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.urls import shown
-
-if TYPE_CHECKING:
-    from vplog.batch.plan import DriveInput, PlannedDrive
-    from vplog.execution.execution import Execution
-    from vplog.maps.storage.map_store import Store
-    from vplog.pipeline import Pipeline
 
 _CPU_S_PER_IMAGE = 0.35
 """s of a core for each image where the map has no drive that says it: KITTI 00 at 5 Hz takes 0.33 (850 images)."""

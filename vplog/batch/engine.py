@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from vplog.batch.worker import Drive, Outcome, Task, compute_drive
+from vplog.batch.worker import DriveState, Outcome, Task, compute_drive
 from vplog.errors import SettingsError, VplogError
 from vplog.execution.process_limits import OVER_MEMORY, OVER_TIME
 from vplog.execution.process_pool import OwnProcesses, ProcessExpired
@@ -46,7 +46,7 @@ class BatchOptions:
     """Whether closures join what the map has at the end."""
     keep_cache: bool = False
     """Whether results of stages stay in MAP/.cache, so that other settings do not need the images again."""
-    on_drive: Callable[[Drive], None] = lambda _: None
+    on_drive: Callable[[DriveState], None] = lambda _: None
     """Called with each drive as it starts, is to be tried again, and ends."""
 
 
@@ -82,7 +82,7 @@ def as_completed(engine: Engine, tasks: Sequence[Task], options: BatchOptions) -
         # without `jobs` one stands in line behind each, so that no core waits for this loop
         while waiting and len(running) < (jobs or 2 * engine.concurrency(waiting[0][0].threads)):
             task, attempt = waiting.popleft()
-            options.on_drive(Drive(task.drive, shown(task.log), "started", attempt))
+            options.on_drive(DriveState(task.drive, shown(task.log), "started", attempt))
             running[engine.start(task)] = task, attempt, time.monotonic()
         for future in wait(running, return_when=FIRST_COMPLETED).done:
             task, attempt, began_s = running.pop(future)
@@ -91,7 +91,7 @@ def as_completed(engine: Engine, tasks: Sequence[Task], options: BatchOptions) -
                 outcome = replace(outcome, seconds=round(time.monotonic() - began_s, 3))
             if outcome.retryable and attempt <= options.retries:
                 waiting.append((task, attempt + 1))
-                options.on_drive(Drive.after(task, "retried", attempt, outcome))
+                options.on_drive(DriveState.after(task, "retried", attempt, outcome))
             else:
                 yield task, outcome, attempt
 

@@ -58,7 +58,7 @@ def _named_truths(path: Path) -> dict[str, str]:
 
 
 def _groups(drives: Iterable[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Of all drives that have figures, and of those with one tag or version: how many, means, and false closures."""
+    """Number, means and false closures of all drives that have figures, and of those with one tag or version."""
     groups: dict[str, list[dict[str, Any]]] = {"all": []}
     for one in drives:
         if not one["error"]:

@@ -62,7 +62,7 @@ def connected(address: str | None, threads: int) -> Iterator[Any]:
             ray.shutdown()
 
 
-class Head:
+class ClusterHead:
     """The head of a cluster: whether it is there, and the futures that fail along with it."""
 
     def __init__(self, address: str) -> None:
@@ -103,9 +103,9 @@ class Head:
 
 
 @contextmanager
-def watched_head(ray: Any) -> Iterator[Head]:
+def watched_head(ray: Any) -> Iterator[ClusterHead]:
     """The head of the cluster that this process is connected to."""
-    head, ended = Head(ray.get_runtime_context().gcs_address), threading.Event()
+    head, ended = ClusterHead(ray.get_runtime_context().gcs_address), threading.Event()
     watch = threading.Thread(target=head.watch, args=(ended,), daemon=True)
     watch.start()
     try:

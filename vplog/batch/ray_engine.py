@@ -13,22 +13,19 @@ from concurrent.futures import BrokenExecutor, Executor, Future, InvalidStateErr
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
-from vplog.batch.ray_cluster import Head, connected, watched_head
+from vplog.batch.ray_cluster import ClusterHead, connected, watched_head
 from vplog.batch.worker import Outcome, Task, compute_drive, made_by
 from vplog.errors import SettingsError, VplogError
 from vplog.results import run_record
-from vplog.run.feature_extraction import Part, compute_part, missing_parts, parts_of, put_part
+from vplog.run.feature_extraction import ExtractionPart, compute_part, missing_parts, parts_of, put_part
 from vplog.run.provenance import library_of
 from vplog.storage.remote_path import located
-from vplog.storage.scratch import files_in, packed, pieces, scratch, unpacked, write_pieces
+from vplog.storage.scratch import Bytes, files_in, packed, pieces, scratch, unpacked, write_pieces
 from vplog.version import __version__
 
-if TYPE_CHECKING:
-    from vplog.storage.scratch import Bytes
-
-    Files = tuple[tuple[str, tuple[Any, ...]], ...]
+Files = tuple[tuple[str, tuple[Any, ...]], ...]
 
 _OTHER = "{} has another vplog, or other packages, than the machine of the batch. Install the same there."
 _PROBE_S = 60.0
@@ -57,7 +54,7 @@ def ray_engine(address: str | None, threads: int, folder: Path | None) -> Iterat
 class RayEngine:
     """The cluster that this process is connected to; it computes drives elsewhere and brings their run folders here."""
 
-    def __init__(self, ray: Any, head: Head, is_ours: bool) -> None:
+    def __init__(self, ray: Any, head: ClusterHead, is_ours: bool) -> None:
         self._ray, self._head, self._is_ours, self._shares_disk = ray, head, is_ours, False
         self.executor = RayExecutor(ray, head)  # a core each
         # a process of its own for each drive, so that memory is given back
@@ -91,7 +88,7 @@ class RayEngine:
         parts = self._parts(task) if task.in_parts and self.cores > self.max_cores else []
         return self.executor.follow(drive.remote(compute_remote_drive, task, self._library[1], parts))
 
-    def _parts(self, task: Task) -> list[tuple[Part, Any]]:
+    def _parts(self, task: Task) -> list[tuple[ExtractionPart, Any]]:
         """The parts of a drive that are to be extracted, and the task of each, which gives its bytes."""
         try:
             found = parts_of(located(task.log), task.pipeline, task.topics, task.cache)
@@ -174,7 +171,7 @@ class RayEngine:
 class RayExecutor(Executor):
     """Ray tasks as `concurrent.futures` has them, with so many cores each."""
 
-    def __init__(self, ray: Any, head: Head, cores: int = 1) -> None:
+    def __init__(self, ray: Any, head: ClusterHead, cores: int = 1) -> None:
         self._head, self._task = head, ray.remote(num_cpus=cores)(call)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -251,14 +248,16 @@ def node_name() -> str:
     return f"{platform.node()}/{ray.get_runtime_context().get_node_id()[:6]}"
 
 
-def compute_remote_part(part: Part, wanted: dict[str, Any]) -> bytes:
+def compute_remote_part(part: ExtractionPart, wanted: dict[str, Any]) -> bytes:
     """A stretch of a drive's frames. `wanted` is what the batch computes with. Raises VplogError."""
     if made_by() != wanted:
         raise VplogError(_OTHER.format(node_name()))
     return compute_part(part)
 
 
-def compute_remote_drive(task: Task, library: dict[str, Bytes], parts: list[tuple[Part, Any]]) -> RemoteOutcome:
+def compute_remote_drive(
+    task: Task, library: dict[str, Bytes], parts: list[tuple[ExtractionPart, Any]]
+) -> RemoteOutcome:
     """A drive with everything on this machine's own disk; its run folder goes into the object store.
 
     Parts that other tasks compute are waited for, one after the other, while Ray lends out this task's cores.

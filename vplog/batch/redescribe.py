@@ -8,12 +8,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog import logs
 from vplog.batch.batch import run_batch, write_failures
+from vplog.batch.engine import BatchOptions
 from vplog.batch.plan import DriveInput
-from vplog.batch.worker import Drive
+from vplog.batch.worker import DriveState
 from vplog.errors import LogError, SettingsError
 from vplog.execution.execution import Execution
 from vplog.maps.import_places import PLACES_ONLY
@@ -22,6 +23,7 @@ from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import skip_damaged
 from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.layout import ABOUT
+from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline
 from vplog.places.library_files import read_library_record
 from vplog.results import run_record
@@ -29,10 +31,6 @@ from vplog.run.provenance import stored_log
 from vplog.run.reference_library import build_library
 from vplog.storage.remote_path import local_copy
 from vplog.storage.scratch import scratch
-
-if TYPE_CHECKING:
-    from vplog.batch.engine import BatchOptions
-    from vplog.maps.storage.map_store import Store
 
 
 def redescribe_map(
@@ -49,7 +47,7 @@ def redescribe_map(
     with map_store.reading(root) as store:
         head = store.head()
         drives, topics = skip_damaged(store, lambda: _drives_of(store))
-        damaged = {drive: Drive(drive, "", "failed", error=why) for drive, why in store.damaged.items()}
+        damaged = {drive: DriveState(drive, "", "failed", error=why) for drive, why in store.damaged.items()}
         _bring_caches(store.root, target)
     outcomes, missing, joined, join_error = [], damaged, None, ""
     inputs = dict[str, DriveInput]()
@@ -64,7 +62,7 @@ def redescribe_map(
                 log, "Its log", f"Put it back, and give the same command again, or add it: vplog batch LOG -o {target}"
             )
         except LogError as error:
-            missing[drive] = Drive(drive, log, "failed", error=str(error))
+            missing[drive] = DriveState(drive, log, "failed", error=str(error))
         else:
             choice = logs.TopicChoice.read(topics[drive] or {}, f"{root}: {drive}/run.json")
             about = {name: drives[drive][name] for name in ABOUT[1:] if name in drives[drive]}

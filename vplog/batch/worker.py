@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from vplog.execution.cores import limited
 from vplog.execution.execution import Execution
 from vplog.execution.process_limits import process_limits
 from vplog.execution.timing import peak_memory_mb
+from vplog.logs import TopicChoice
 from vplog.maps.import_places import write_places_run
 from vplog.maps.search.query import describe_log
 from vplog.maps.storage import layout
@@ -29,12 +30,9 @@ from vplog.results import run_record, tables
 from vplog.run import provenance
 from vplog.run.odometry import check_metric, is_metric
 from vplog.run.run_folder import CacheOptions
+from vplog.stages import Log
 from vplog.storage.remote_path import located
 from vplog.storage.urls import shown
-
-if TYPE_CHECKING:
-    from vplog.logs import TopicChoice
-    from vplog.stages import Log
 
 
 @dataclass(frozen=True)
@@ -90,7 +88,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Drive:
+class DriveState:
     """State of one log in a batch; `seconds` to `warnings` as in the Outcome of the last attempt."""
 
     drive: str
@@ -109,7 +107,7 @@ class Drive:
     warnings: Sequence[str] = ()
 
     @classmethod
-    def after(cls, task: Task, state: str, attempts: int, outcome: Outcome) -> Drive:
+    def after(cls, task: Task, state: str, attempts: int, outcome: Outcome) -> DriveState:
         """The drive of a task with this outcome of an attempt."""
         names = (one.name for one in fields(cls)[4:])
         return cls(task.drive, shown(task.log), state, attempts, **{name: getattr(outcome, name) for name in names})

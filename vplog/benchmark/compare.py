@@ -11,9 +11,10 @@ from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from vplog import logs
 from vplog.benchmark.answers import answers_table, file_stem, write_answers
@@ -25,9 +26,12 @@ from vplog.benchmark.sequence_fit import sequence_warning
 from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal, references_of
 from vplog.data import Float32s, Ints, Reference
 from vplog.errors import SettingsError, TruthError
+from vplog.evaluate.pairs import Pairs
 from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, no_truth, open_truth
+from vplog.evaluate.retrieval import Ranks
 from vplog.execution.execution import Execution, logged_warnings
 from vplog.logs import EVERY_IMAGE
+from vplog.pipeline import Pipeline
 from vplog.places.library_files import check_descriptors, load_references, references_hash
 from vplog.places.network_vector import OnnxSettings
 from vplog.places.plugin import PluginSettings
@@ -36,16 +40,9 @@ from vplog.places.self_recognition import MOST, NO_IMAGE, add_until_enough
 from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record
 from vplog.results.staging import check_contents, staged
+from vplog.stages import Log
 from vplog.storage.scratch import replacing
 from vplog.version import __version__
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from vplog.evaluate.pairs import Pairs
-    from vplog.evaluate.retrieval import Ranks
-    from vplog.pipeline import Pipeline
-    from vplog.stages import Log
 
 
 @dataclass(frozen=True, eq=False)

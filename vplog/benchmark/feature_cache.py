@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,15 +17,13 @@ from vplog.cache.input_hashes import stat_signature
 from vplog.cache.stage_cache import file_name, key_of, sealed
 from vplog.cache.user_cache import cache_folder, max_bytes, trim
 from vplog.data import Bytes, Features, Float32s, Ints
+from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
+from vplog.logs import TopicChoice
 from vplog.results.previews import PictureSettings
 from vplog.run.feature_extraction import PART_KEYFRAMES, described, image_topics, is_whole
+from vplog.stages import Extractor, Log
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
-    from vplog.logs import TopicChoice
-    from vplog.stages import Extractor, Log
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -17,10 +17,8 @@ import pyarrow as pa
 
 from vplog.data import Bytes, Closures
 from vplog.results import tables
+from vplog.stages import PlaceState
 from vplog.storage.image_file import decode_image
-
-if TYPE_CHECKING:
-    from vplog.stages import PlaceState
 
 T = TypeVar("T")
 

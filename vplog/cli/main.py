@@ -24,7 +24,7 @@ from vplog.cli.parser import Parser, flag, option, place
 from vplog.cli.printing import print_json, print_result, print_status
 from vplog.cli.progress import Progress, events_of
 from vplog.cli.results import add_results
-from vplog.errors import LogError, VplogError, plural, was_interrupted
+from vplog.errors import LogError, VplogError, causes, plural, was_interrupted
 from vplog.execution.cores import available, limited
 from vplog.execution.execution import Execution
 from vplog.storage.urls import without_secrets
@@ -120,21 +120,16 @@ def _interrupted_by(number: signal.Signals) -> Iterator[None]:
     """SIGTERM, as schedulers and containers send it, ends the verb as Ctrl-C: workers and scratch files are removed."""
 
     def end(*_: object) -> NoReturn:
-        _ended.append(number)
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(number)
 
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    _ended.clear()
     before = signal.signal(number, end)
     try:
         yield
     finally:
         signal.signal(number, before)
-
-
-_ended: list[signal.Signals] = []
 
 
 def _flush() -> None:
@@ -150,10 +145,11 @@ def _flush() -> None:
 
 def _interrupted(arguments: argparse.Namespace, error: BaseException) -> NoReturn:
     again = f". Go on with: vplog run --resume -o {shlex.quote(str(arguments.shown))}"
-    kept = f"finished results in the output folder are kept{again if getattr(arguments, 'resume', False) else ''}"
-    known = getattr(error, "__notes__", [kept])
+    default = f"finished results in the output folder are kept{again if getattr(arguments, 'resume', False) else ''}"
+    known = getattr(error, "__notes__", [default])
     print_status(without_secrets(f"interrupted; {known[-1]}", arguments.command))
-    sys.exit(128 + (_ended.pop() if _ended else signal.SIGINT))
+    numbers = (one.args[0] for one in causes(error) if isinstance(one, KeyboardInterrupt) and one.args)
+    sys.exit(128 + next(numbers, signal.SIGINT))
 
 
 def _fail(arguments: argparse.Namespace, message: str) -> NoReturn:
@@ -317,10 +313,10 @@ def _parser() -> argparse.ArgumentParser:
     root = Parser(prog="vplog", description=about)
     root.add_argument("-V", "--version", action="version", version=f"vplog {__version__}")
     common = argparse.ArgumentParser(add_help=False)
-    said = common.add_argument_group("output and errors")
-    flag(said, "--json", "print one JSON object")
-    flag(said, "--debug", "show the traceback of an error")
-    option(said, "--events", parser.output_file, "FILE", "write progress as JSON lines, each as it happens")
+    output_group = common.add_argument_group("output and errors")
+    flag(output_group, "--json", "print one JSON object")
+    flag(output_group, "--debug", "show the traceback of an error")
+    option(output_group, "--events", parser.output_file, "FILE", "write progress as JSON lines, each as it happens")
     topics = parser.topic_options()
     threads = argparse.ArgumentParser(add_help=False)
     work = threads.add_argument_group("execution")

@@ -21,7 +21,7 @@ from vplog.errors import plural
 from vplog.storage.urls import printable, without_secrets
 
 if TYPE_CHECKING:
-    from vplog.run.report import Outcome
+    from vplog.run.report import RunOutcome
 
 
 _UNMOVED_M = 1e-3
@@ -146,7 +146,7 @@ def print_info(found: dict[str, Any]) -> None:
         print(f"{'run' if found['ready'] else 'this works':10} {found['command']}")
 
 
-def print_run(out: Path, record: dict[str, Any], outcome: Outcome, truth: str | Path = "FILE.tum") -> None:
+def print_run(out: Path, record: dict[str, Any], outcome: RunOutcome, truth: str | Path = "FILE.tum") -> None:
     """`outcome` is that of the run folder; `out` is what the user called it; `truth` is the file to compare it with."""
     from vplog.data import Verdict
 
@@ -165,7 +165,7 @@ def print_run(out: Path, record: dict[str, Any], outcome: Outcome, truth: str | 
     print_next(f"{out}/report.html in a browser, {out}/result.mcap in Foxglove", *commands)
 
 
-def _outcome_text(outcome: Outcome, record: dict[str, Any]) -> str:
+def _outcome_text(outcome: RunOutcome, record: dict[str, Any]) -> str:
     if outcome.moved_m < _UNMOVED_M:  # the reason is what the user needs, whatever its words
         return f"the trajectory is the odometry's. {record['solution']['reason'].strip()}"
     causes = [f"{plural(outcome.closures, 'closure')} at {plural(outcome.places, 'place')}"] if outcome.closures else []
@@ -505,10 +505,11 @@ def print_condensed(found: dict[str, Any]) -> None:
     ]  # fmt: skip
     print_table(("drive", "places", "kept", "faded", "kB", "kept kB"), rows)
     warn(found["warnings"])
-    asked, recall, places, size = found["queries"], found["recall"], found["places"], found["descriptor_bytes"]
+    queries, recall, places, size = found["queries"], found["recall"], found["places"], found["descriptor_bytes"]
     print(
-        f"own queries  {asked['places']}: {asked['by_other_drives']} answered by other drives, "
-        f"{asked['by_own_drive']} by their own, {asked['alone']} by no other place, within {found['distance_m']:g} m"
+        f"own queries  {queries['places']}: {queries['by_other_drives']} answered by other drives, "
+        f"{queries['by_own_drive']} by their own, {queries['alone']} by no other place, "
+        f"within {found['distance_m']:g} m"
     )
     after = f"{recall['after']:.4f} after, by queries that did not choose what goes"
     print(f"recall       {recall['before']:.4f} before, {after}; {found['loss']:g} may be lost")

@@ -19,7 +19,7 @@ from vplog.errors import ResultError, VplogError, was_interrupted
 from vplog.storage.urls import without_secrets
 
 if TYPE_CHECKING:
-    from vplog.batch.worker import Drive
+    from vplog.batch.worker import DriveState
 
 LINE_EVERY_S = 60.0
 """s between lines on a stderr that is no terminal."""
@@ -219,7 +219,7 @@ class Progress:
             [f"{where}{items}", *etas, *([] if all_left is None else [f"{_minutes(all_left)} to the end"])]
         )
 
-    def print_drive(self, drive: Drive) -> None:
+    def print_drive(self, drive: DriveState) -> None:
         """An event for each change of a drive of a batch; where there are no bars a line as it ends or is tried again,
         as in the log of a job of the night."""
         about: dict[str, Any] = {"drive": drive.drive, "log": drive.log, "attempt": drive.attempts}

@@ -7,16 +7,13 @@ the street, counter-clockwise from the middle of the southern side; lateral is m
 from __future__ import annotations
 
 from itertools import accumulate
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vplog.data import Floats, Ints
+from vplog.demo.settings import DemoSettings
 from vplog.geometry.geodesy import geodetic
 from vplog.geometry.se3 import between, exp, log, pose, so3_exp
-
-if TYPE_CHECKING:
-    from vplog.demo.settings import DemoSettings
 
 START_NS = 1_700_000_000_000_000_000
 """Stamp of the first odometry sample; any date serves."""

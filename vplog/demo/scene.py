@@ -7,18 +7,16 @@ a homography of its texture, so a pixel costs one 3x3 product.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 
 from vplog.data import Bytes, Camera, Float32s, Floats, Int32s, Ints
 from vplog.demo import route
+from vplog.demo.settings import DemoSettings
 from vplog.demo.world import Quads, World, build_world, traffic
 from vplog.geometry.se3 import inverse, pose, so3_exp, transform
-
-if TYPE_CHECKING:
-    from vplog.demo.settings import DemoSettings
 
 CAMERA_FRAME = "camera_optical"
 REAR_FRAME = "rear_optical"

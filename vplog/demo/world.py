@@ -10,16 +10,14 @@ import string
 from collections.abc import Iterator
 from functools import lru_cache
 from itertools import pairwise, product
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from vplog.data import Bytes, Float32s, Floats, Int32s, Ints
 from vplog.demo.route import axis_point, lap_length
-
-if TYPE_CHECKING:
-    from vplog.demo.settings import DemoSettings
+from vplog.demo.settings import DemoSettings
 
 PX_PER_M = 48
 """Scale of walls and objects: at the default 640 px and 80 degrees a wall 8 m away is seen at this scale."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,14 +13,12 @@ from vplog.data import Bools, Floats, Gps, Ints, Trajectory
 from vplog.errors import TruthError
 from vplog.evaluate import pairs
 from vplog.evaluate.image_names import folders_of, numbers_of, utm_of
+from vplog.evaluate.pairs import Pairs
 from vplog.evaluate.truth import local_enu, read_truth
 from vplog.evaluate.truth_tables import labels_by_row, listed_rows, read_array, read_table
 from vplog.geometry import se3
+from vplog.stages import Log
 from vplog.storage.urls import shown
-
-if TYPE_CHECKING:
-    from vplog.evaluate.pairs import Pairs
-    from vplog.stages import Log
 
 DISTANCE_M = 6.0
 """m; two poses closer than this show the same place: a lane and a half, the radius of the field's KITTI protocols."""

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import csv
-import pickletools
+import io
+import pickle
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from vplog.data import Ints
 from vplog.errors import TruthError, VplogError, nearest_path
 from vplog.evaluate.image_names import row_finder
-
-if TYPE_CHECKING:
-    from vplog.stages import Log
+from vplog.stages import Log
 
 _LINE_LIMIT = 4096
 """Characters: two paths; a file without line ends is not read whole."""
@@ -137,7 +136,7 @@ def read_array(path: Path, queries: int, matches: int) -> Ints:
     """(P, 2) pairs of a NumPy file, frame numbers below `queries` and `matches`: (P, 2) whole numbers, VPR-Bench's rows
     of a query and the list of its matches, a list of matches for each query, or a matrix of queries by matches.
 
-    No pickle is executed. Raises TruthError.
+    Nothing that a pickle names is imported or called. Raises TruthError.
     """
     try:
         _check_size(path)
@@ -164,10 +163,8 @@ def _array(stream: BinaryIO) -> Any:
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, kind = read(stream)
     if kind.hasobject:
-        values = _literals(stream)
-        return (
-            [values[at : at + 2] for at in range(0, len(values), 2)] if shape[1:] == (2,) else list(enumerate(values))
-        )
+        values = _unpickled(stream.read())
+        return list(zip(values[::2], values[1::2], strict=True) if shape[1:] == (2,) else enumerate(values))
     stream.seek(0)
     values = np.load(stream, allow_pickle=False)
     if values.dtype.kind not in "iub" or values.ndim != 2:
@@ -191,85 +188,41 @@ def _pairs(values: Any, path: Path) -> Ints:
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
-class _Name(str):
-    """A name that a pickle asks for; it is compared, never looked up."""
+def _unpickled(data: bytes) -> Any:
+    """The lists and numbers of a pickled array. Nothing that it names is imported or called: what it may name is taken
+    for a class of this call. Raises ValueError and others for anything else."""
 
-    __slots__ = ()
+    class Kind:
+        """A type of whole numbers or objects."""
 
+        def __init__(self, name: str, *_: Any) -> None:
+            self.name = name.lstrip("<>=|")
+            if self.name[:1] not in ("i", "u", "O", "b"):
+                raise ValueError(f"it holds {self.name[:40]!r}")
 
-def _literals(stream: BinaryIO) -> list[Any]:  # noqa: PLR0912 (a case an opcode)
-    """The content of a pickled array of numbers and lists, from the opcodes: nothing is imported or called.
+        def __setstate__(self, state: Any) -> None:
+            self.name = (">" if state[1] == ">" else "<") + self.name
 
-    Raises ValueError for anything else.
-    """
-    stack: list[Any] = []
-    marks: list[int] = []
-    memo: dict[int, Any] = {}
-    for opcode, argument, _ in pickletools.genops(stream):
-        match opcode.name:
-            case "PROTO" | "FRAME":
-                pass
-            case "STOP":
-                return stack.pop()
-            case "MARK":
-                marks.append(len(stack))
-            case "GLOBAL":
-                stack.append(_Name(str(argument).rpartition(" ")[2]))
-            case "STACK_GLOBAL":
-                stack[-2:] = [_Name(stack[-1])]
-            case "MEMOIZE":
-                memo[len(memo)] = stack[-1]
-            case "PUT" | "BINPUT" | "LONG_BINPUT":
-                memo[int(str(argument))] = stack[-1]
-            case "GET" | "BINGET" | "LONG_BINGET":
-                stack.append(memo[int(str(argument))])
-            case "NONE" | "NEWTRUE" | "NEWFALSE":
-                stack.append({"NONE": None, "NEWTRUE": True, "NEWFALSE": False}[opcode.name])
-            case "EMPTY_LIST" | "EMPTY_TUPLE":
-                stack.append([])
-            case "APPEND":
-                item = stack.pop()
-                stack[-1].append(item)
-            case "APPENDS" | "LIST" | "TUPLE":
-                at = marks.pop()
-                stack[at:], items = [], stack[at:]
-                stack[-1].extend(items) if opcode.name == "APPENDS" else stack.append(items)
-            case "TUPLE1" | "TUPLE2" | "TUPLE3":
-                count = int(opcode.name[-1])
-                stack[-count:] = [stack[-count:]]
-            case "REDUCE":
-                stack[-2:] = [_called(*stack[-2:])]
-            case "BUILD":
-                state = stack.pop()
-                _build(stack[-1], state)
-            case _ if argument is not None and isinstance(argument, int | str | bytes):
-                stack.append(argument)
-            case name:
-                raise ValueError(f"it has {name}, which no list of numbers needs")
-    raise ValueError("it ends early")
+    class Values(list[Any]):
+        """An array as the list of its values."""
 
+        def __init__(self, *_: Any) -> None:
+            super().__init__()
 
-def _called(name: Any, given: Any) -> Any:
-    """The value that one of the four calls in a pickled array stands for."""
-    if not isinstance(name, _Name):
-        raise ValueError("it calls what is no name")
-    match str(name):
-        case "_reconstruct":
-            return []
-        case "dtype" if str(given[0]).lstrip("<>=|")[:1] in ("i", "u", "O", "b"):
-            return [str(given[0])]
-        case "scalar":
-            return int(np.frombuffer(given[1], np.dtype(given[0][0]))[0])
-        case "encode":
-            return str(given[0]).encode("latin1")
-    raise ValueError(f"it asks for {str(name)[:40]!r}")
+        def __setstate__(self, state: Any) -> None:
+            """`state` is version, shape, type, order and content."""
+            numbers = isinstance(state[4], bytes)
+            self.extend(np.frombuffer(state[4], state[2].name).tolist() if numbers else state[4])
 
+    def scalar(kind: Kind, data: bytes) -> int:
+        return int(np.frombuffer(data, kind.name)[0])
 
-def _build(made: Any, state: Any) -> None:
-    """Fill an array with (version, shape, type, order, content); of a type the byte order is all that matters."""
-    if made and isinstance(made[0], str):
-        made[0] = (">" if state[1] == ">" else "<") + made[0].lstrip("<>=|")
-    elif isinstance(state[4], bytes):
-        made.extend(np.frombuffer(state[4], np.dtype(state[2][0])).tolist())
-    else:
-        made.extend(state[4])
+    named = {"_reconstruct": Values, "ndarray": Values, "dtype": Kind, "scalar": scalar, "encode": str.encode}
+
+    class Unpickler(pickle._Unpickler):  # that of C allocates what a damaged file claims
+        def find_class(self, module: str, name: str) -> Any:
+            if name not in named:
+                raise ValueError(f"it asks for {name[:40]!r}")
+            return named[name]
+
+    return Unpickler(io.BytesIO(data)).load()

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-if TYPE_CHECKING:
-    from vplog.data import Bools, Bytes, Float32s, Frame, Ints
+from vplog.data import Bools, Bytes, Float32s, Frame, Ints
 
 _FADE = 1 / 16
 """Share of an image's longer side over which the fill goes over from its border to the mean: an edge would be a

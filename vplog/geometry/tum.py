@@ -5,18 +5,14 @@ from __future__ import annotations
 import io
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vplog.data import Floats, Ints, Trajectory
-from vplog.errors import nearest_path
+from vplog.errors import VplogError, nearest_path
 from vplog.geometry import se3
 from vplog.storage.remote_path import reason
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from vplog.errors import VplogError
 
 _LINE_LIMIT = 4096
 """Characters; eight numbers take about 200, and a file without line ends is not read whole."""

@@ -16,6 +16,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, S, V, X
 from scipy import sparse
 
+from vplog.data import SCALE_WANDER
 from vplog.geometry import se3
 
 if TYPE_CHECKING:
@@ -33,8 +34,6 @@ _ACCEL_WALK, _GYRO_WALK = 0.003, 0.0002
 """Random walks of the biases, m/s^3/sqrt(Hz) and rad/s^2/sqrt(Hz): an ADIS16448's, the gyroscope's ten times."""
 _ACCEL_BIAS, _GYRO_BIAS = 0.2, 0.02
 """Sigmas of the biases at the start: m/s^2 of a MEMS that no one calibrated; rad/s about what the images say."""
-_WANDER = 0.01
-"""Standard deviation of the log of a single camera's scale after a unit, growing as the root of the way."""
 _ACROSS = 1.0
 """That across a break, and of the first unit in m (times three)."""
 _HUBER = 2.0
@@ -196,7 +195,7 @@ def _linear(states: States, poses: Floats, scale: Floats, spread: float, metric:
         if not states.broken[j]:
             noise = size * float(np.sqrt(np.trace(states.covariance[j, 3:, 3:]) / 3.0) + _SHARE * way)
             rows.append(([(b, eye), (a, -eye), (b + 9, -steps[i][:, None])], -lever[i], noise))
-        across = _ACROSS if states.broken[j] else spread * _WANDER * (way + 1e-3) ** 0.5
+        across = _ACROSS if states.broken[j] else spread * SCALE_WANDER * (way + 1e-3) ** 0.5
         rows.append(([(b + 9, np.ones((1, 1))), (a + 9, -np.ones((1, 1)))], np.zeros(1), across * size))
         rows.append(([(b + 6, eye), (a + 6, -eye)], np.zeros(3), spread * _TILT))
         if states.broken[j] and one is None:
@@ -336,7 +335,7 @@ def _add(graph: gtsam.NonlinearFactorGraph, states: States, i: int, metric: bool
     j, isotropic = i + 1, gtsam.noiseModel.Isotropic.Sigma
     moved = se3.between(states.cameras[i], states.cameras[j])
     way = float(np.linalg.norm(moved[:3, 3]))
-    across = _ACROSS if states.broken[j] else _WANDER * (way + 1e-3) ** 0.5
+    across = _ACROSS if states.broken[j] else SCALE_WANDER * (way + 1e-3) ** 0.5
     wander = isotropic(1, 1e-6 if metric else across)
     graph.add(gtsam.BetweenFactorVector(S(i), S(j), np.zeros(1), wander))
     one = states.imu[j]

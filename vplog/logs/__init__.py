@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
 from vplog.logs.topic_selection import EVERY_IMAGE, TopicChoice
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from vplog.stages import Log
+from vplog.stages import Log
 
 __all__ = ["EVERY_IMAGE", "TopicChoice", "below", "check", "is_image_file", "open", "open_drive", "open_images"]
 __all__ += ["summary"]

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import yaml
 
-from vplog.data import Odometry
+from vplog.data import Floats, Odometry
 from vplog.errors import LogError, nearest_path
 from vplog.geometry import se3
 from vplog.geometry.tum import read_tum
-from vplog.logs.calibrations.camera import BadCalibrationError
+from vplog.logs.calibrations.camera import BadCalibrationError, CalibratedCamera
 from vplog.logs.calibrations.text_kinds import colmap_binary, colmap_text, kitti_cameras
 from vplog.logs.calibrations.yaml_kinds import load_tree, yaml_cameras
 from vplog.logs.continuity import without_jumps
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vplog.data import Floats
-    from vplog.logs.calibrations.camera import CalibratedCamera
-    from vplog.logs.formats.container import Notes
-    from vplog.logs.topic_selection import TopicChoice
+from vplog.logs.formats.container import Notes
+from vplog.logs.topic_selection import TopicChoice
 
 _LARGEST = 1_000_000
 """Bytes; a calibration has some kB, and the parser is not to be blown up."""

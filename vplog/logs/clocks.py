@@ -9,12 +9,10 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from vplog.data import Ints
+from vplog.data import Ints
 
 LEAST_JUMP_NS = 1_000_000_000
 """ns; their difference changes by less than a second when a computer is busy, and by hours when a clock is set."""

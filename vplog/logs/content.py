@@ -4,28 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import compress
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Floats, Gps, Ints, Odometry, OdometrySource
 from vplog.errors import LogError, plural
 from vplog.logs.continuity import without_jumps
-from vplog.logs.formats.container import Notes
+from vplog.logs.formats.container import Channel, Container, Contents, Notes, Place
 from vplog.logs.gather import TopicCollector
+from vplog.logs.messages.records import CalibrationMessage
 from vplog.logs.odometry_sources import choose_odometry, other_sources, rank_sources, read_sources
 from vplog.logs.recorder_clock import correct_clock_steps
 from vplog.logs.stamps import nearest, set_common_clock
 from vplog.logs.tf_odometry import FrameTree
-
-if TYPE_CHECKING:
-    from vplog.data import Floats, Gps, Ints, Odometry, OdometrySource
-    from vplog.logs.formats.container import Channel, Container, Contents, Place
-    from vplog.logs.messages.records import CalibrationMessage
-    from vplog.logs.topic_selection import Selection
+from vplog.logs.topic_selection import Selection
 
 
 @dataclass(frozen=True)
-class Content:
+class LogContent:
     """The result of the pass."""
 
     stamp_ns: Ints
@@ -72,7 +68,7 @@ class Content:
         """The frame that the odometry moves, empty where it has no name."""
         return self.frames[-1] if self.frames else ""
 
-    def between(self, start_s: float | None, stop_s: float | None) -> Content:
+    def between(self, start_s: float | None, stop_s: float | None) -> LogContent:
         """With the images from `start_s` up to `stop_s`, s after the first; all if None. Raises LogError for none."""
         if start_s is None and stop_s is None:
             return self
@@ -82,7 +78,7 @@ class Content:
             raise LogError(f"No image is left by --start and --stop: the last one is at {since_s[-1]:.1f} s.")
         return self.with_images(inside)
 
-    def with_images(self, wanted: np.ndarray) -> Content:
+    def with_images(self, wanted: np.ndarray) -> LogContent:
         """With those of the images for which (F,) `wanted` is true."""
         places = list(compress(self.places, wanted))
         companions = {part: list(compress(found, wanted)) for part, found in self.companions.items()}
@@ -96,7 +92,7 @@ _TOGETHER_NS = 5_000_000
 """ns that the images of a pair may be apart: 5 cm at 10 m/s, a tenth of a usual baseline."""
 
 
-def read_content(container: Container, contents: Contents, chosen: Selection, notes: Notes) -> Content:
+def read_content(container: Container, contents: Contents, chosen: Selection, notes: Notes) -> LogContent:
     """Read the chosen topics once; what had to be repaired or left out is noted."""
     read = TopicCollector(chosen)
     stamped = [channel for channel in read.by_channel if channel.encoding in ("cdr", "ros1")]
@@ -149,7 +145,7 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     imu = (read.imu.frame, *read.imu.finish(notes)) if chosen.imu is not None and odometry is None else None
     calibrations = read.calibrations(chosen.camera_info, "image", notes)
     right_calibration = next(iter(read.calibrations(chosen.right_info, "right", notes)), None)
-    return Content(
+    return LogContent(
         stamp_ns, places, read.images["image"].stream, rows, scan_ns, scan_places, companions, calibrations,
         right_calibration, odometry, frames, gps, imu, tree, read.skew_ms(), chosen, [source for source, _ in sources],
         rates_hz,

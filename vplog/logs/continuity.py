@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from vplog.data import Floats, Ints, Odometry
 from vplog.errors import plural
 from vplog.geometry import se3
-
-if TYPE_CHECKING:
-    from vplog.data import Floats, Ints, Odometry
-    from vplog.logs.formats.container import Notes
+from vplog.logs.formats.container import Notes
 
 _ACCELERATION_M_S2 = 10.0
 """m/s^2; tyres hold 1 g, and little has more for longer than a moment:"""

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 
-from vplog.data import RECEIVER_SIGMA_M, Odometry
+from vplog.data import RECEIVER_SIGMA_M, Floats, Gps, Ints, Odometry
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
-
-if TYPE_CHECKING:
-    from vplog.data import Floats, Gps, Ints
 
 _LONGEST_S = 1.0
 """s; over a longer gap the last velocity is not held, as of a recorder that was paused."""
@@ -132,11 +129,11 @@ def _smoothed(at_s: Floats, places: Floats, variance: Floats) -> _Smooth:
     count, steps = len(at_s), np.diff(at_s)
     weight, period = 1.0 / variance.mean(1), float(np.median(steps))
     middle = (steps[1:] + steps[:-1]) / 2
-    bend = scipy.sparse.diags_array(
+    curvature = scipy.sparse.diags_array(
         [1 / (steps[:-1] * middle), -(1 / steps[:-1] + 1 / steps[1:]) / middle, 1 / (steps[1:] * middle)],
         offsets=[0, 1, 2], shape=(count - 2, count),
     )  # fmt: skip
-    energy = (bend.T @ scipy.sparse.diags_array(middle) @ bend).tocsr()
+    energy = (curvature.T @ scipy.sparse.diags_array(middle) @ curvature).tocsr()
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (count, _PROBES))
     found, right = list[tuple[float, _Smooth]](), weight[:, None] * np.concatenate([places, signs], axis=1)
     for window_s in period * np.geomspace(*_WINDOWS):

@@ -5,19 +5,20 @@ from __future__ import annotations
 import os
 import re
 import weakref
+from collections.abc import Sequence
 from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from vplog.errors import LogError, nearest_path, plural
 from vplog.logs import image_folder
 from vplog.logs.datasets import colmap, euroc, kitti, tum_rgbd, utm_images, video, vslam_lab
 from vplog.logs.datasets.images import read as read_images
-from vplog.logs.datasets.streams import DataSetContainer
+from vplog.logs.datasets.streams import DataSet, DataSetContainer
 from vplog.logs.formats import mcap_file, ros1_bag, sqlite_bag
 from vplog.logs.formats.compression import fetched, unpacked
-from vplog.logs.formats.container import Notes
+from vplog.logs.formats.container import Container, Contents, Notes
 from vplog.logs.formats.mcap_file import McapFile
 from vplog.logs.formats.ros1_bag import Ros1Bag
 from vplog.logs.formats.ros2_folder import (
@@ -30,15 +31,8 @@ from vplog.logs.formats.ros2_folder import (
 from vplog.logs.formats.sqlite_bag import SqliteBag
 from vplog.logs.messages.records import kind_of
 from vplog.logs.recorded_log import RecordedLog
-from vplog.logs.topic_selection import EVERY_IMAGE
+from vplog.logs.topic_selection import EVERY_IMAGE, TopicChoice
 from vplog.storage.remote_path import RemotePath, located, names_below
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from vplog.logs.datasets.streams import DataSet
-    from vplog.logs.formats.container import Container, Contents
-    from vplog.logs.topic_selection import TopicChoice
 
 _RESULTS = {"run.json": "a run", "map.json": "a map", "library.json": "a library"}
 _MAGIC = {mcap_file.MAGIC: "mcap", ros1_bag.MAGIC: "ros1", sqlite_bag.MAGIC: "db3", b"\x28\xb5\x2f\xfd": "zstd"}

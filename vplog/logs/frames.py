@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from av import VideoFrame
 
     from vplog.data import Bools, Bytes, Camera, Float32s, Floats
-    from vplog.logs.content import Content
+    from vplog.logs.content import LogContent
     from vplog.logs.formats.container import Channel, Container, Notes, Octets, Place
     from vplog.logs.masks import Mask
     from vplog.logs.messages.pixels import Levels
@@ -215,7 +215,9 @@ def warped(image: Bytes, affine: Floats | None, camera: Camera) -> Bytes:
 class ImageReader:
     """Reads images by their place in the container."""
 
-    def __init__(self, container: Container, image: Channel | None, codec: str, content: Content, notes: Notes) -> None:
+    def __init__(
+        self, container: Container, image: Channel | None, codec: str, content: LogContent, notes: Notes
+    ) -> None:
         """`codec` is FFmpeg's decoder where the topic of the images is a video, else empty."""
         self._container, self._image = container, image
         self._video = None if image is None or not codec else self._stream(image, codec, content, notes)
@@ -278,7 +280,7 @@ class ImageReader:
             raise first
         return None
 
-    def _stream(self, image: Channel, codec: str, content: Content, notes: Notes) -> VideoStream:
+    def _stream(self, image: Channel, codec: str, content: LogContent, notes: Notes) -> VideoStream:
         places, images = content.stream, {*content.stream_rows.tolist()}
 
         def payload(row: int) -> bytes | None:
@@ -293,7 +295,7 @@ class ImageReader:
         decoder = partial(video.new_decoder, codec, image.topic, notes.add, advice)
         return VideoStream(codec, payload, len(places), decoder)
 
-    def _from_first_key(self, video: VideoStream, content: Content, notes: Notes) -> Content:
+    def _from_first_key(self, video: VideoStream, content: LogContent, notes: Notes) -> LogContent:
         first = video.first_key()
         decodable = content.stream_rows >= (len(content.stream) if first is None else first)
         if self._image is not None and (lost := int((~decodable).sum())):

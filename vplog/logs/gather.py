@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Ints
 from vplog.errors import plural
-from vplog.logs.formats.container import BRIEF, Message, Notes
+from vplog.logs.formats.container import BRIEF, Channel, Message, Notes, Octets, Place
 from vplog.logs.formats.loss_account import LossRuns
 from vplog.logs.messages.decode import decode, read_poses, stamp_of
 from vplog.logs.messages.records import (
@@ -21,17 +21,13 @@ from vplog.logs.messages.records import (
     ImuMessage,
     PathMessage,
     PoseMessage,
+    Record,
     short_type,
 )
 from vplog.logs.stamps import NONE, Stamps, rate_hz
 from vplog.logs.tf_odometry import DynamicTransforms
+from vplog.logs.topic_selection import Selection
 from vplog.logs.tracks import FixTrack, ImuTrack, PoseTrack
-
-if TYPE_CHECKING:
-    from vplog.data import Ints
-    from vplog.logs.formats.container import Channel, Octets, Place
-    from vplog.logs.messages.records import Record
-    from vplog.logs.topic_selection import Selection
 
 _HEADER = 12
 """Bytes before the frame_id of a message with a header: encapsulation (CDR) or sequence number (ROS 1), and stamp."""

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import re
 import statistics
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
+from vplog.data import Ints
 from vplog.errors import LogError
 from vplog.logs.topic_selection import EVERY_IMAGE
 from vplog.storage.image_file import PNG, image_size
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
-
-    from vplog.data import Ints
 
 PERIOD_NS = 100_000_000
 """Time between images whose names hold no time: 10 Hz, KITTI's rate."""

@@ -7,22 +7,18 @@ recorded image is called by its stamp in ns.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
+from vplog.data import Bools
 from vplog.errors import LogError, nearest_path, plural
+from vplog.logs.formats.container import Channel, Notes
 from vplog.logs.image_folder import is_image
 from vplog.storage.image_file import JPEG, BadImageError, decode_image, image_size
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from vplog.data import Bools
-    from vplog.logs.formats.container import Channel, Notes
 
 _HALF = 128
 _INVERTED = 0.5

@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
-from vplog.data import Imu, LogInfo, Topic, Trajectory
+from vplog.data import Bytes, Camera, Gps, Imu, Ints, Lidar, LogInfo, Odometry, Scan, Topic, Trajectory
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.calibration_file import SidecarFiles
 from vplog.logs.cameras import BODY, body_from_camera, camera_of
-from vplog.logs.content import read_content
-from vplog.logs.formats.container import Notes
+from vplog.logs.content import LogContent, read_content
+from vplog.logs.formats.container import Channel, Container, Contents, Notes
+from vplog.logs.formats.loss_account import TopicLoss
 from vplog.logs.formats.ros2_folder import messages_unpacked
 from vplog.logs.frames import ImageReader, RecordedFrame, size_of
 from vplog.logs.masks import masks_of
+from vplog.logs.messages.records import CalibrationMessage
 from vplog.logs.odometry_sources import PROPERTIES, is_truth
 from vplog.logs.rectification import (
     CHECKED_FRAMES,
     MOST_ROWS_PX,
     MOST_TURN_RAD,
     NoPairError,
+    Pair,
     Side,
     pair_of,
     row_error_px,
@@ -33,17 +37,6 @@ from vplog.logs.scans import ScanReader
 from vplog.logs.stamps import rows_of
 from vplog.logs.topic_candidates import read_candidates
 from vplog.logs.topic_selection import Candidate, TopicChoice, further_cameras, select, wheel_options
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from vplog.data import Bytes, Camera, Gps, Ints, Lidar, Odometry, Scan
-    from vplog.logs.content import Content
-    from vplog.logs.formats.container import Channel, Container, Contents
-    from vplog.logs.formats.loss_account import Loss
-    from vplog.logs.messages.records import CalibrationMessage
-    from vplog.logs.rectification import Pair
 
 _LISTED = 8
 """Topics that an error lists."""
@@ -70,7 +63,7 @@ class RecordedLog:
         return self._notes.lines
 
     @property
-    def losses(self) -> list[Loss]:
+    def losses(self) -> list[TopicLoss]:
         """Losses counted so far; complete once the log was read."""
         return self.account.losses
 
@@ -261,7 +254,7 @@ class RecordedLog:
         return ImageReader(self._container, image, known.codec if known else "", content, self._notes)
 
     @property
-    def _content(self) -> Content:
+    def _content(self) -> LogContent:
         return self._images.content
 
     def camera(self) -> Camera:

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
+from vplog.data import Bytes, Camera, Floats
 from vplog.geometry import se3
 from vplog.logs.cameras import is_rectified, resized
+from vplog.logs.messages.records import CalibrationMessage
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from vplog.data import Bytes, Camera, Floats
-    from vplog.logs.messages.records import CalibrationMessage
-
-    Maps = tuple[np.ndarray, np.ndarray]
+Maps = tuple[np.ndarray, np.ndarray]
 
 _BASELINES_M = (1e-3, 20.0)
 """m; endoscopes have 4 mm, stereo across a lorry's cab 2 m: anything outside is another unit, or another thing."""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from vplog.data import Ints, Scan
-    from vplog.logs.content import Content
+    from vplog.logs.content import LogContent
     from vplog.logs.formats.container import Container, Notes
 
 _BESIDE_NS = 10**9
@@ -32,7 +32,7 @@ _TRIED = 10
 class ScanReader:
     """Reads the scans of the selection's lidar by their place in the container; none where the log has odometry."""
 
-    def __init__(self, container: Container, content: Content, notes: Notes) -> None:
+    def __init__(self, container: Container, content: LogContent, notes: Notes) -> None:
         self._container, self._content, self._notes = container, content, notes
         self._channel = content.chosen.lidar if content.odometry is None else None
 

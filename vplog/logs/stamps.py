@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Floats, Ints
 from vplog.errors import LogError, plural
 from vplog.logs.clocks import (
     GAP_NS,
@@ -18,16 +19,11 @@ from vplog.logs.clocks import (
     LEAST_STEP_NS,
     STEP_PERIODS,
     Clock,
+    Repaired,
     align_clock,
 )
+from vplog.logs.formats.container import Notes
 from vplog.logs.formats.loss_account import runs_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from vplog.data import Floats, Ints
-    from vplog.logs.clocks import Repaired
-    from vplog.logs.formats.container import Notes
 
 NONE: Ints = np.zeros(0, np.int64)
 _LAST_NS = 2**63 - 1

@@ -4,21 +4,16 @@ from __future__ import annotations
 
 from array import array
 from collections import defaultdict, deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import Odometry
+from vplog.data import Floats, Ints, Odometry
 from vplog.geometry import se3
+from vplog.logs.formats.container import Notes
+from vplog.logs.messages.records import PoseMessage
 from vplog.logs.stamps import NONE, Stamps
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from vplog.data import Floats, Ints
-    from vplog.logs.formats.container import Notes
-    from vplog.logs.messages.records import PoseMessage
 
 _BODIES = ("base_link", "base_footprint")
 """Names of the body, ROS REP 105 and 120, in order of preference."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+from vplog.logs.formats.container import Channel, Container, Contents
 from vplog.logs.messages.decode import decode
 from vplog.logs.messages.pixels import is_depth, is_image, may_be_thermal
 from vplog.logs.messages.records import BadMessageError, CalibrationMessage, ImageMessage, kind_of
@@ -13,10 +13,6 @@ from vplog.logs.messages.video import codec_of
 from vplog.logs.tf_odometry import clean
 from vplog.logs.topic_selection import Candidate
 from vplog.storage.image_file import image_size
-
-if TYPE_CHECKING:
-    from vplog.logs.formats.container import Channel, Container, Contents
-
 
 _THERMAL = re.compile(r"therm|infra|lwir|flir|boson|lepton|(?<![a-z])ir(?![a-z])")
 """Words for thermal cameras: their kind, their band, and the most common makes."""

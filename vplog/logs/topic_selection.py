@@ -21,22 +21,18 @@ other parts the first by these rules does, unless TopicChoice names another:
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import Field
 
 from vplog.errors import LogError, nearest
+from vplog.logs.formats.container import Channel
 from vplog.logs.messages.records import GEOMETRY, NMEA, TWISTS, WHEELS, short_type
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from vplog.logs.formats.container import Channel
-
 
 EVERY_IMAGE = "*"
 """Choice of all images of a folder and of the folders in it, whatever their names and sizes."""

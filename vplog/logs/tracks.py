@@ -7,23 +7,19 @@ from array import array
 from collections import Counter
 from dataclasses import replace
 from itertools import compress, pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import RECEIVER_SIGMA_M, Gps, Odometry
+from vplog.data import RECEIVER_SIGMA_M, Bools, Floats, Gps, Ints, Odometry
 from vplog.errors import plural
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
+from vplog.logs.formats.container import Channel, Notes
 from vplog.logs.messages.decode import Poses
 from vplog.logs.messages.nmea import SENTENCES
+from vplog.logs.messages.records import FixMessage, ImuMessage, PoseMessage
 from vplog.logs.stamps import Stamps
 from vplog.logs.tf_odometry import are_usable, clean
-
-if TYPE_CHECKING:
-    from vplog.data import Bools, Floats, Ints
-    from vplog.logs.formats.container import Channel, Notes
-    from vplog.logs.messages.records import FixMessage, ImuMessage, PoseMessage
 
 _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 """ROS orders x y z, then rotations about X Y Z; vplog the other way."""

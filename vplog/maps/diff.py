@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from vplog.data import USED
+from vplog.data import USED, Closures, Floats, Ints
 from vplog.geometry import se3
 from vplog.maps.joining.joint_record import Component, joint_components, keyframe_poses
 from vplog.maps.storage.map_store import Store, reading
 from vplog.results import tables
 from vplog.storage.json_records import differences
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vplog.data import Closures, Floats, Ints
-
-    Pair = tuple[str, str]
+Pair = tuple[str, str]
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,25 +6,22 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vplog.data import Floats
 from vplog.errors import ResultError, SettingsError
 from vplog.execution.execution import Execution
-from vplog.maps.geo_bounds import earth_of_run, earth_record, in_box
+from vplog.maps.geo_bounds import Box, earth_of_run, earth_record, in_box
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
+from vplog.maps.storage.map_store import Store
 from vplog.results import tables
 from vplog.results.geo import Earth, on_earth
 from vplog.results.places_map import DrivePlaces, drive_header, names_of, read_places, write_map, write_places
 from vplog.results.run_record import read_single_run
 from vplog.storage.remote_path import local_copy
-
-if TYPE_CHECKING:
-    from vplog.maps.geo_bounds import Box
-    from vplog.maps.storage.map_store import Store
 
 _PLACES = ("keyframes.parquet", "descriptors.parquet")
 """Files of a run folder with its places: their poses and their descriptors."""

@@ -10,9 +10,10 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from vplog.data import EdgeKind, Keyframes, Odometry, PoseGraph, Solution, Trajectory
 from vplog.errors import LibraryError, ResultError
@@ -20,15 +21,11 @@ from vplog.execution.execution import Execution
 from vplog.loops.verify import no_closures
 from vplog.maps.geo_bounds import earth_from_record, earth_record
 from vplog.maps.storage import layout, map_store
+from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables
 from vplog.results.places_map import DrivePlaces, PlacesHeader, read_drives, read_places_header
 from vplog.storage.remote_path import original
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from vplog.maps.storage.map_store import Store
 
 PLACES_ONLY = "places_of"
 """Field in drive.json of such a drive: the file that it is from."""

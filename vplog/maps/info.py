@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog.errors import LibraryError, ResultError
 from vplog.maps.geo_bounds import bounds_of, is_finite
@@ -14,11 +14,9 @@ from vplog.maps.joining.joint_record import components_in, replaced_since
 from vplog.maps.storage import layout, map_store
 from vplog.maps.storage.contents import damage_warnings, library_mismatch, skip_damaged
 from vplog.maps.storage.damage import damaged_files, damaged_table
+from vplog.maps.storage.map_store import Store
 from vplog.places.library_files import read_library_record
 from vplog.storage.folders import regular_files
-
-if TYPE_CHECKING:
-    from vplog.maps.storage.map_store import Store
 
 _READ_AT_ONCE = 16
 """Drives: on an object store each is a request that takes some 20 to 50 ms."""

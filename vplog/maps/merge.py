@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog.errors import LibraryError, ResultError, SettingsError, nearest_path
 from vplog.execution.execution import Execution
@@ -18,14 +18,12 @@ from vplog.maps.storage import layout, map_store
 from vplog.maps.storage.contents import damage_warnings
 from vplog.maps.storage.damage import DamagedDriveError, damaged_files
 from vplog.maps.storage.layout import folder_name
+from vplog.maps.storage.map_store import Store
 from vplog.results import run_record
 from vplog.results.places_map import places_by_drive, read_places_header
 from vplog.storage.json_records import canonical_json
 from vplog.storage.remote_path import local_copy, original
 from vplog.storage.scratch import copy_folder
-
-if TYPE_CHECKING:
-    from vplog.maps.storage.map_store import Store
 
 
 def merge_maps(

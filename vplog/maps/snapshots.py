@@ -32,11 +32,11 @@ def vacuum_map(root: Path, hours: float) -> dict[str, Any]:
     with map_store.reading(root) as store:  # not a map: nothing is made
         store.head()
     with map_store.writing(root) as store:
-        kept = delta.is_kept(store)
-        if store.mirror is None and not kept:
+        has_delta = delta.is_present(store)
+        if store.mirror is None and not has_delta:
             raise ResultError(f"{root} is a folder without Delta tables, where nothing that is replaced stays.")
         own = Counter() if store.mirror is None else Counter(upload.vacuum(store.mirror, hours))
-        own += Counter(delta.vacuum(store, time.time() - hours * 3600) if kept else {})
+        own += Counter(delta.vacuum(store, time.time() - hours * 3600) if has_delta else {})
         return {"map": str(root), "hours": hours, "objects": own["objects"], "bytes": own["bytes"]}
 
 
@@ -47,7 +47,7 @@ def compact_map(root: Path) -> dict[str, Any]:
     with map_store.reading(root) as store:  # not a map: nothing is made
         store.head()
     with map_store.writing(root) as store:
-        if store.mirror is None and not delta.is_kept(store):
+        if store.mirror is None and not delta.is_present(store):
             raise ResultError(
                 f"{root} is a folder, where drives stay as they are, and has no Delta tables. To have some: vplog map "
                 f"delta {root}"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import pyarrow as pa
@@ -17,8 +17,9 @@ from pydantic import Field, model_validator
 
 from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.places import expected_votes
-from vplog.places.code_search import BLOCK, CodeIndex, CodeLists, Place, build_lists
+from vplog.places.code_search import BLOCK, CodeIndex, CodeLists, Pairing, Place, build_lists
 from vplog.places.columns import RecordState, from_column, to_column
 from vplog.places.library_files import RelearnedSettings
 from vplog.places.matches import (
@@ -32,10 +33,6 @@ from vplog.places.matches import (
 )
 from vplog.places.overlap import list_shared
 from vplog.places.self_recognition import misleading_patches
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
-    from vplog.places.code_search import Pairing
 
 NOBODY = 65_535
 """The number of no reference, where fewer than J share anything."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import Any, Literal, Self
 
 import numba
 import numpy as np
@@ -17,15 +17,12 @@ from pydantic import Field, PositiveFloat, model_validator
 
 from vplog.data import Boxes, Features, Float32s, Floats, Int32s, Ints, Reference, SharedReferences
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.places import library as lib
 from vplog.places import rvp
 from vplog.places.columns import RecordState
 from vplog.places.library_files import RelearnedSettings
 from vplog.places.overlap import BoxIndex, BoxPlace, list_shared
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
-
 
 _WHOLE_IMAGE = np.array([0.0, 0.0, 1.0, 1.0])
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numba
 import numpy as np
@@ -18,13 +18,11 @@ from pydantic import Field
 
 from vplog.data import Features, Float32s, Ranking, Reference
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.places.columns import from_lists, to_lists
 from vplog.places.dense import best_rows
 from vplog.places.library_files import ReferencesState, RelearnedSettings, keep_references
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary, postings
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
 
 _WORD_BYTES, _PLACE_BYTES = 3, 4
 """In a table: a word's number in two bytes and its count in one; where a place's list begins in four."""

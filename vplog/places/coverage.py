@@ -9,18 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numba
 import numpy as np
 import scipy
 
 from vplog.data import Bytes, Features, Float32s, Ints, Keyframes
+from vplog.execution.execution import Execution
 from vplog.places.library import Library, Words, WordSettings, hnsw, l1_distance
 from vplog.places.reference_choice import LEAST_SIZE, PAPER_SIZE, LibrarySettings, evenly
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
 
 STRONGEST = 200
 """Features of a frame that the choice is made by: a quarter of what describes a place is enough."""

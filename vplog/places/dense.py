@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numba
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from vplog.data import Bytes, Features, Float32s, Ranking
 from vplog.errors import LibraryError
 from vplog.places.columns import from_column, to_column
 from vplog.places.library_files import ReferencesState
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 
 def best_rows(score: Float32s, k: int) -> Ranking:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 import pyarrow as pa
@@ -21,6 +21,7 @@ from pydantic import Field, model_validator
 
 from vplog.data import Bools, Features, Float32s, Floats, Ranking, Reference
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.places.columns import from_lists, to_lists
 from vplog.places.dense import ranked
 from vplog.places.fabmap_model import (
@@ -35,10 +36,7 @@ from vplog.places.fabmap_model import (
 from vplog.places.library_files import ReferencesState, RelearnedSettings, keep_references
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary
 
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
-
-    Words = NDArray[np.uint16]
+Words = NDArray[np.uint16]
 
 _WORD_BYTES, _PLACE_BYTES = 2, 4
 """In a table: a word's number in two bytes; where a place's list begins in four."""

@@ -6,7 +6,7 @@ The energy of a bank of Gabor filters over the prefiltered image, averaged over 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from vplog.data import THUMBNAIL_SIDE, Bytes, Features, Float32s, Reference
+from vplog.execution.execution import Execution
 from vplog.places.dense import VectorState, nearness, thumbnail_of
 from vplog.places.library_files import RelearnedSettings, keep_references
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
 
 _PREFILTER_PAD, _PREFILTER_CYCLES, _LEAST_CONTRAST = 5, 4, 0.2
 """px mirrored around the image, cycles an image where the low-pass falls to half, and what is added to the contrast."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numba
 import numpy as np
@@ -18,17 +18,14 @@ import scipy
 from pydantic import Field
 
 from vplog.data import Bytes, Features, Float32s, Floats, Ints, Ranking, Reference
+from vplog.execution.execution import Execution
 from vplog.places.bobb import BobbSettings, BobbState
 from vplog.places.code_search import CodeIndex, Place
 from vplog.places.columns import from_column, to_column
 from vplog.places.dense import best_rows
 from vplog.places.library_files import ReferencesState, RelearnedSettings
-from vplog.places.matches import keypoints_of, patches_of
+from vplog.places.matches import Described, keypoints_of, patches_of
 from vplog.places.vocabulary import ROOT_STEPS, spread_rows
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
-    from vplog.places.matches import Described
 
 _STEPS = 4096
 """Steps of 1: values are rounded to whole ones before they are summed over features, so that sums stay below 2^53 and

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import faiss
 import numpy as np
@@ -16,11 +16,9 @@ from pydantic import Field
 
 from vplog.data import Bytes, Float32s, Int32s, Ints, Reference
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.places.library_files import keep_references
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
 
 
 class WordSettings(Settings):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 
 from vplog.data import Bytes, Features, Frame, Reference
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.features.onnx_model import NetworkSettings
 from vplog.places.dense import VectorState, unit
 from vplog.places.library_files import RelearnedSettings, keep_references
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
 
 MAX_DIMENSIONS = 2**16
 """Values of a vector: eight times those of the longest in the field, SALAD's 8448 (Izquierdo & Civera, CVPR 2024)."""

@@ -9,17 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
 from vplog.data import Reference
 from vplog.errors import SettingsError, nearest
+from vplog.execution.execution import Execution
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
-    from vplog.stages import PlaceState
+from vplog.stages import PlaceState
 
 GROUP = "vplog.recognisers"
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numba
 import numpy as np
@@ -19,9 +19,7 @@ from vplog.data import Float32s, Int32s, Ints, Ranking
 from vplog.execution.execution import Execution
 from vplog.places.dense import best_rows
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.stages import PlaceIndex
+from vplog.stages import PlaceIndex
 
 _BLOCK = 64
 """Queries worked on at once: enough for every thread, and few enough that memory is that of a few rows."""

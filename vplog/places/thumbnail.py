@@ -6,18 +6,16 @@ Milford & Wyeth, SeqSLAM: Visual route-based navigation for sunny summer days an
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numba
 import numpy as np
 import pyarrow as pa
 
 from vplog.data import THUMBNAIL_SIDE, Bytes, Features, Reference
+from vplog.execution.execution import Execution
 from vplog.places.dense import VectorState, thumbnail_of
 from vplog.places.library_files import RelearnedSettings, keep_references
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
 
 _WIDTH, _HEIGHT, _PATCH = 64, 32, 8
 """px, the paper's table I."""

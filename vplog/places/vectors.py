@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -19,15 +19,13 @@ from numpy.typing import NDArray
 
 from vplog.data import Features, Float32s, Ints, Reference
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.places.dense import VectorIndex, VectorState, nearness, products
 from vplog.places.library_files import RelearnedSettings, keep_references, references_hash
 from vplog.places.network_vector import MAX_DIMENSIONS
 from vplog.settings import FileName
+from vplog.stages import Log
 from vplog.storage.parquet_limits import open_table, read_table
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
-    from vplog.stages import Log
 
 _QUERIES, _DATABASE = "queries_descriptors.npy", "database_descriptors.npy"
 _COLUMNS = "stamp_ns (int64), vector (a list of floats), and drive (text) where it is of several drives"

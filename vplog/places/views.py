@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog.data import Features, Ints
+from vplog.execution.execution import Execution
 from vplog.geometry.masking import masked
 from vplog.stages import FrameState, Log, PlaceState, StoredState
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -17,12 +17,10 @@ from pydantic import Field
 
 from vplog.data import Features, Float32s, Reference
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.places.dense import VectorState, products, unit
 from vplog.places.library_files import RelearnedSettings, keep_references
 from vplog.places.vocabulary import Vocabulary, learn_vocabulary, root_sift, spread_rows
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
 
 _MAX_PCA_REFERENCES = 2000
 """Images that the PCA looks at, spread evenly over the references: its time grows with their cube, 1 s for these."""

@@ -7,7 +7,7 @@ centre is the same whatever the order of the sum, the number of threads or the m
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import faiss
 import numpy as np
@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 
 from vplog.data import Bytes, Float32s, Int32s, Ints
 from vplog.errors import LibraryError
+from vplog.execution.execution import Execution
 from vplog.places.library import hnsw
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
 
 ROOT_STEPS = np.float32(512)
 """Steps of 1 that roots of descriptors are whole multiples of: a byte of them reaches 0.498, and SIFT's own cut at 0.2

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import base64
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
 
+from vplog.data import Bools, Floats
 from vplog.results.report.charts import subsampled
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from vplog.data import Bools, Floats
 
 _MOST_AGREEING, _MOST_OTHERS = 80, 40
 """Lines, subsampled: more hide so small a picture."""

@@ -86,8 +86,8 @@ def read_pictures(path: Path) -> McapContent:
             if named := re.fullmatch(r"closure_(\d{1,9})", picture.frame_id):  # as older versions named the frame
                 rows.append(int(named[1]))
         named = list(zip(rows or _picture_rows(reader), pictures, strict=True))
-    kept = {row: data for row, data in named if row is not None}
-    return McapContent(kept, views, references, _gps(fixes) if fixes else None, thumbnails)
+    by_row = {row: data for row, data in named if row is not None}
+    return McapContent(by_row, views, references, _gps(fixes) if fixes else None, thumbnails)
 
 
 def read_fixes(path: Path) -> Gps | None:

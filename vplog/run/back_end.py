@@ -56,7 +56,7 @@ class BackEnd(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class BackEndResult:
     """Result of the back end."""
 
     closures: Closures
@@ -71,7 +71,9 @@ class Solved:
 
 
 @step("solve")
-def solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps | None, settings: BackEnd) -> Solved:
+def solve(
+    odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps | None, settings: BackEnd
+) -> BackEndResult:
     """The best trajectory of a drive; fixes are used with `gps.use`, and where they are the odometry. Raises GraphError
     where there is none."""
     covariance, noise_warnings, source = edge_covariance(odometry, keyframes.stamp_ns, settings.noise)
@@ -100,15 +102,15 @@ def solve(odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps
     for warning in warnings:
         _log.warning(warning)
     trajectory = correct_trajectory.correct_trajectory(odometry, keyframes, refined.solution.world_from_body)
-    return Solved(
+    return BackEndResult(
         judged_ledger(closures, graph, refined, rows), refined, trajectory, source, warnings, odometry.of_images
     )
 
 
 def _apart(broken: Ints, keyframes: Keyframes, graph: PoseGraph, solution: Solution) -> list[str]:
-    """A warning of the breaks of the odometry (edges) that no closure kept spans."""
-    kept = ~graph.odometry & (solution.weight > 0.5)
-    begin, end = (np.sort(rows[kept]) for rows in (graph.a, graph.b))
+    """A warning of the breaks of the odometry (edges) that no accepted closure spans."""
+    accepted = ~graph.odometry & (solution.weight > 0.5)
+    begin, end = (np.sort(rows[accepted]) for rows in (graph.a, graph.b))
     open_ = begin.searchsorted(broken, "right") == end.searchsorted(broken, "right")  # as many ended as had begun
     if not open_.any():
         return []
@@ -154,7 +156,7 @@ def by_odometry(graph: PoseGraph, closures: Closures, rows: Ints) -> NDArray[np.
     return result
 
 
-def about_gps(solved: Solved) -> dict[str, Any] | None:
+def about_gps(solved: BackEndResult) -> dict[str, Any] | None:
     """Field `gps` of run.json: number of inlier fixes, and the georeference of the trajectory's frame."""
     fixes, refined = solved.refined.fixes, solved.refined
     if fixes is None or refined.world_from_enu is None:
@@ -168,7 +170,7 @@ def about_gps(solved: Solved) -> dict[str, Any] | None:
     }
 
 
-def keyframe_covariances(solved: Solved) -> Floats | None:
+def keyframe_covariances(solved: BackEndResult) -> Floats | None:
     """(N, 6, 6) of the keyframes as the graph has them in the end, with the noise as estimated, the GPS fixes kept and
     the scales that are not known; None where edges and fixes do not determine them. Closures do not show odometry of
     the same images to be better than it claims: what calibration makes wrong is wrong alike in both."""

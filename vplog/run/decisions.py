@@ -5,17 +5,19 @@ from __future__ import annotations
 import csv
 import io
 import logging
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from vplog.cache.codecs import closures_codec
-from vplog.cache.steps import step
-from vplog.data import Verdict
+from vplog.cache.steps import Steps, step
+from vplog.data import Closures, Keyframes, Verdict
 from vplog.errors import SettingsError
 from vplog.evaluate.truth_tables import read_lines
+from vplog.execution.execution import Execution
 from vplog.loops.candidate import lenient
 from vplog.loops.propose import Proposals
 from vplog.loops.verify import verify_between
@@ -23,13 +25,6 @@ from vplog.run.keyframes import row_of
 from vplog.run.verification import DriveFeatures, calibrated, for_verification, merged
 from vplog.settings import FileName, Settings
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from vplog.cache.steps import Steps
-    from vplog.data import Closures, Keyframes
-    from vplog.execution.execution import Execution
 
 _log = logging.getLogger(__name__)
 _COLUMNS = ["query", "match", "decision", "who", "when", "reason"]

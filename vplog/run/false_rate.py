@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,10 +13,12 @@ from vplog.cache.steps import step
 from vplog.data import Bools, Closures, Ints, Keyframes, Odometry, Verdict
 from vplog.evaluate.body_truth import TruthAt
 from vplog.evaluate.closure_pose import pose_bounds, pose_errors
+from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.graph.build import build_graph
 from vplog.graph.consistency import OdometryChain
 from vplog.graph.noise import NoiseSettings, broken_edges, edge_covariance
+from vplog.loops.candidate import Drive
 from vplog.loops.false_rate import (
     MOST_APART,
     FalseRateSettings,
@@ -31,27 +33,37 @@ from vplog.loops.propose import Proposals, ProposeSettings, candidate_stops
 from vplog.loops.verify import verify_between
 from vplog.run.verification import DriveFeatures, for_verification
 
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
-    from vplog.loops.candidate import Drive
-
 _log = logging.getLogger(__name__)
 _FAR_M = 1e6
 """m between two pieces of a drive, of which nothing is known."""
 
 
+@dataclass(frozen=True)
+class RatingSettings:
+    """The settings that closures are rated by."""
+
+    false_rate: FalseRateSettings
+    propose: ProposeSettings
+    noise: NoiseSettings
+
+
 @step("p_false", lambda *_: closures_codec(), items=lambda closures, *_: len(closures))
 def rate_closures(
-    closures: Closures, odometry: Odometry, views: Sequence[DriveFeatures], rows: Sequence[Ints],
-    settings: FalseRateSettings, propose: ProposeSettings, noise: NoiseSettings, *, execution: Execution,
-) -> Closures:  # fmt: skip
+    closures: Closures,
+    odometry: Odometry,
+    views: Sequence[DriveFeatures],
+    rows: Sequence[Ints],
+    rating: RatingSettings,
+    *,
+    execution: Execution,
+) -> Closures:
     """The ledger with `p_false`, and with `rate` without what is likelier to be false, by pairs of all cameras.
 
     `views` are the pictures of each camera, the first one's at every keyframe, and `rows` the keyframes of each.
     """
     if not len(closures):
         return closures
-    reach_m = views[0].settings.metric.max_distance_m
+    reach_m, settings, noise = views[0].settings.metric.max_distance_m, rating.false_rate, rating.noise
     ruled_out = beyond_drift(closures, views[0].keyframes, odometry, noise, reach_m, settings.sigmas)
     left = np.flatnonzero(~ruled_out)
     count = min(max(null_pairs(evidence(closures), settings) - int(ruled_out.sum()), 0), len(left))
@@ -59,7 +71,7 @@ def rate_closures(
     mirror = _mirrored(closures.rows(chosen), [for_verification(view) for view in views], rows, execution)
     # a moving camera's landmarks come from these very neighbours, so that they tell little of other closures
     most = settings.certain_pairs // len(views) if {"depth", "stereo"} & set(closures.scale) else 0
-    certain = [_certain_pairs(view, odometry, propose, most, execution) for view in views]
+    certain = [_certain_pairs(view, odometry, rating.propose, most, execution) for view in views]
     known = [_by_odometry(one, view, noise, settings) for one, view in zip(certain, views, strict=True)]
     closures = with_p_false(closures, ruled_out, mirror, *map(np.concatenate, zip(*known, strict=True)))
     return closures if settings.rate is None else _admitted(closures, settings.rate, int(ruled_out.sum()), count)

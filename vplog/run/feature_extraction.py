@@ -85,7 +85,7 @@ class Extraction(Protocol):
 
 
 @dataclass(frozen=True)
-class Part:
+class ExtractionPart:
     """A stretch of a drive's keyframes; goes to another process as it is."""
 
     log: tuple[str, ...]
@@ -111,7 +111,7 @@ def parts_of(
     pipeline: Extraction,
     topics: logs.TopicChoice | None = None,
     cache: Path | None = None,
-) -> list[Part]:
+) -> list[ExtractionPart]:
     """The parts that a run of this drive extracts. With its cache, a log that was only touched is known by its content.
 
     Raises LogError where there is no such log, or nothing to extract in it.
@@ -123,12 +123,12 @@ def parts_of(
     return split_keyframes(path, topics, pipeline, keyframes, inputs_of(path, cache))
 
 
-def missing_parts(cache: Path, parts: Iterable[Part]) -> list[Part]:
+def missing_parts(cache: Path, parts: Iterable[ExtractionPart]) -> list[ExtractionPart]:
     """The parts that the cache does not hold, or not whole."""
     return [part for part in parts if not is_whole(cache / part.file, part.key, part.stamp_ns)]
 
 
-def compute_part(part: Part, execution: Execution = Execution()) -> bytes:
+def compute_part(part: ExtractionPart, execution: Execution = Execution()) -> bytes:
     """Decode and describe a part's keyframes: the bytes of its file. The same on any machine.
 
     Raises LogError where the log cannot be read, or is another one than `parts_of` saw.
@@ -140,7 +140,7 @@ def compute_part(part: Part, execution: Execution = Execution()) -> bytes:
     return sealed(part.key, _content(log, part, _frames(log, [part], execution)))
 
 
-def put_part(cache: Path, part: Part, data: bytes) -> None:
+def put_part(cache: Path, part: ExtractionPart, data: bytes) -> None:
     """Put what `compute_part` gave into a drive's cache, as a whole. Raises ResultError."""
     try:
         content_of(data, part.key)
@@ -168,7 +168,7 @@ def split_keyframes(
     settings: Extraction,
     keyframes: Keyframes,
     inputs: Inputs,
-) -> list[Part]:
+) -> list[ExtractionPart]:
     """The keyframes in parts. Raises LogError where there is only one."""
     stamp_ns = keyframes.stamp_ns
     if len(stamp_ns) < 2:
@@ -187,7 +187,7 @@ def split_keyframes(
     }
     stamps = [tuple(stamp_ns[at : at + PART_KEYFRAMES].tolist()) for at in range(0, len(stamp_ns), PART_KEYFRAMES)]
     return [
-        Part(paths, inputs.lengths, topics, settings, own, number, key_of({**alike, "stamps": own}))
+        ExtractionPart(paths, inputs.lengths, topics, settings, own, number, key_of({**alike, "stamps": own}))
         for number, own in enumerate(stamps)
     ]
 
@@ -290,7 +290,7 @@ def is_whole(
     return True
 
 
-def _content(log: Log, part: Part, frames: Iterable[Decoded]) -> bytes:
+def _content(log: Log, part: ExtractionPart, frames: Iterable[Decoded]) -> bytes:
     """Content of the file of a part; `frames` gives its keyframes in order, and maybe more."""
     found, lost = described(islice(frames, len(part.stamp_ns)), part.pipeline.pictures)
     account = getattr(log, "account", None)
@@ -318,7 +318,7 @@ def _count_losses(log: Log, undecodable: Iterable[tuple[str, int]]) -> None:
             account.add("undecodable_image", {topic: 1}, (topic, at), [(at, at)])
 
 
-def _frames(log: Log, parts: Sequence[Part], execution: Execution) -> Iterator[Decoded]:
+def _frames(log: Log, parts: Sequence[ExtractionPart], execution: Execution) -> Iterator[Decoded]:
     """The keyframes of some parts of a drive, decoded, with their features, in order."""
     stamp_ns = np.array([stamp_ns for part in parts for stamp_ns in part.stamp_ns], np.int64)
     settings = parts[0].pipeline

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,7 +14,9 @@ from vplog import logs
 from vplog.cache.code_hash import code_of
 from vplog.data import Features, Floats
 from vplog.errors import ResultError
+from vplog.execution.execution import Execution
 from vplog.features.store import FeatureStore
+from vplog.loops.candidate import Drive
 from vplog.loops.landmarks import landmarks_of
 from vplog.loops.undistort import project
 from vplog.loops.verify import VerifySettings, drive_of
@@ -26,10 +28,6 @@ from vplog.run.provenance import reopened
 from vplog.run.reextraction import ReextractedFeatures
 from vplog.storage.json_records import key_of
 from vplog.storage.scratch import scratch
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
-    from vplog.loops.candidate import Drive
 
 LANDMARKS = "landmarks.parquet"
 """Name of the file."""

@@ -6,15 +6,18 @@ import logging
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from vplog.cache.codecs import json_codec
+from vplog.cache.stage_cache import Inputs
 from vplog.cache.steps import Steps, step
-from vplog.data import Camera, Frame, Keyframes, Odometry
+from vplog.data import Camera, Frame, Imu, Keyframes, Odometry
 from vplog.errors import LogError, plural
+from vplog.execution.execution import Execution
 from vplog.geometry.masking import masked
+from vplog.logs import TopicChoice
 from vplog.logs.image_folder import PERIOD_NS
 from vplog.loops import undistort
 from vplog.run.feature_extraction import image_topics
@@ -23,13 +26,7 @@ from vplog.run.lidar_odometry import lidar_odometry, range_of
 from vplog.run.visual_odometry.inertial import SURE, with_imu
 from vplog.run.visual_odometry.metres import in_metres
 from vplog.run.visual_odometry.visual import visual_odometry
-
-if TYPE_CHECKING:
-    from vplog.cache.stage_cache import Inputs
-    from vplog.data import Imu
-    from vplog.execution.execution import Execution
-    from vplog.logs import TopicChoice
-    from vplog.stages import EncodedFrame, Log
+from vplog.stages import EncodedFrame, Log
 
 _log = logging.getLogger(__name__)
 _UNCALIBRATED = (

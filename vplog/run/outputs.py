@@ -15,7 +15,7 @@ from vplog.graph import consistency
 from vplog.graph.refine import about_odometry
 from vplog.results import g2o, mcap, run_record, tables
 from vplog.run import provenance
-from vplog.run.back_end import Solved, about_gps, keyframe_covariances
+from vplog.run.back_end import BackEndResult, about_gps, keyframe_covariances
 from vplog.run.figures.run_figures import (
     ClosureInputs,
     camera_thumbnails,
@@ -54,7 +54,7 @@ class Run:
     coverage: Coverage
     places: Sequence[Any]
     """Descriptors of the keyframes."""
-    solved: Solved
+    solved: BackEndResult
     views: Sequence[View]
     """The pictures of every camera, the first one's first."""
     record: dict[str, Any] = field(default_factory=dict)

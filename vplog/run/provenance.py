@@ -6,21 +6,18 @@ import platform
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog import logs
 from vplog.cache.code_hash import version
 from vplog.cache.input_hashes import bytes_of, files_of, stat_signature
 from vplog.errors import LogError, ResultError
 from vplog.results import run_record
+from vplog.settings import Settings
+from vplog.stages import Log
 from vplog.storage.json_records import key_of
 from vplog.storage.remote_path import local_copy, located, original, reason
 from vplog.version import __version__
-
-if TYPE_CHECKING:
-    from vplog.settings import Settings
-    from vplog.stages import Log
-
 
 OWN_LIBRARY = "the drive's own keyframes"
 """`library.from` of a run to which no library was given."""

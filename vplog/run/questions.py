@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import EdgeKind, Verdict
+from vplog.data import Closures, EdgeKind, Floats, Ints, PoseGraph, Verdict
 from vplog.errors import ResultError
 from vplog.graph.build import busier, checked
 from vplog.graph.hypotheses import bounded
 from vplog.graph.questions import questions
 from vplog.loops.false_rate import log_odds_false
-from vplog.results.report.page import Question
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from vplog.data import Closures, Floats, Ints, PoseGraph
+from vplog.results.report.page import ClosureQuestion
 
 
 def ask_ledger(
     graph: PoseGraph, weight: Floats, closures: Closures, answers: Mapping[int, bool] | None = None
-) -> list[Question]:
+) -> list[ClosureQuestion]:
     """All questions about a ledger and the graph of its run, with the weight (E,) of its edges, most telling first.
 
     Asked are closures with a pose, in the solution or not, without a decision in the ledger or in `answers`, by row,
@@ -40,9 +35,9 @@ def ask_ledger(
     odometry = np.zeros(len(weight) - len(rows))
     log_odds = np.concatenate([odometry, log_odds_false(closures)[rows]])
     found = questions(graph, weight, log_odds, np.concatenate([odometry > 0, decided[rows]]))
-    asked = [rows[one.edges - len(odometry)] for one in found]
-    order = [about[np.argsort(-closures.inliers[about], kind="stable")].tolist() for about in asked]
-    return [Question(about, one.p_wrong, one.moved_m) for about, one in zip(order, found, strict=True)]
+    row_sets = [rows[one.edges - len(odometry)] for one in found]
+    order = [about[np.argsort(-closures.inliers[about], kind="stable")].tolist() for about in row_sets]
+    return [ClosureQuestion(about, one.p_wrong, one.moved_m) for about, one in zip(order, found, strict=True)]
 
 
 def _with_candidates(graph: PoseGraph, weight: Floats, closures: Closures) -> tuple[PoseGraph, Ints, Floats]:

@@ -4,29 +4,33 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from vplog.data import USED, Trajectory
+from vplog.data import USED, Ints, Trajectory
 from vplog.errors import GraphError, ResultError
 from vplog.geometry import se3
 from vplog.graph.joint import spaced_apart
 from vplog.results import mcap_read, tables
 from vplog.results.html import mapping
 from vplog.results.previews import thumbnail
-from vplog.results.report.page import Content, Pictures, Tracks, false_closures, page
+from vplog.results.report.page import (
+    Changes,
+    ClosureQuestion,
+    Pictures,
+    ReportContent,
+    Tracks,
+    TruthComparison,
+    false_closures,
+    page,
+)
 from vplog.run.figures.run_figures import earth_of
 from vplog.run.questions import ask_ledger
 from vplog.storage.image_file import decode_image
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vplog.data import Ints
-    from vplog.results.report.page import Changes, Question, TruthComparison
 
 _log = logging.getLogger(__name__)
 
@@ -55,7 +59,7 @@ def write_report(
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RunOutcome:
     """Difference of a run's trajectory from the odometry, and its closures."""
 
     moved_m: float
@@ -66,7 +70,7 @@ class Outcome:
     """Closures that are `join.spacing` keyframes from the next, of queries or of matches: the fewer."""
 
 
-def outcome_of(folder: Path, spacing: int) -> Outcome:
+def outcome_of(folder: Path, spacing: int) -> RunOutcome:
     """Raises ResultError where a table of the run is missing or damaged."""
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
     closures = tables.read_closures(folder / "closures.parquet")
@@ -74,7 +78,7 @@ def outcome_of(folder: Path, spacing: int) -> Outcome:
     moved = (after.world_from_body - first_from_odom @ odometry.odom_from_body)[:, :3, 3]
     used = closures.weight > 0.5  # NaN where the solver never had it
     places = min(spaced_apart(one[used].astype(np.int64), spacing) for one in (closures.query, closures.match))
-    return Outcome(float(np.linalg.norm(moved, axis=1).max()), int(used.sum()), places)
+    return RunOutcome(float(np.linalg.norm(moved, axis=1).max()), int(used.sum()), places)
 
 
 def gather_tracks(folder: Path, record: dict[str, Any]) -> Tracks:
@@ -92,19 +96,19 @@ def gather(
     record: dict[str, Any],
     judged: TruthComparison | None = None,
     pictures: Pictures | None = None,
-) -> Content:
+) -> ReportContent:
     """The content of the page. Raises ResultError where a file of the run is missing or damaged."""
     tracks = gather_tracks(folder, record)
     covariance = tables.read_keyframe_covariance(folder / "keyframes.parquet")
     closures = tables.read_closures(folder / "closures.parquet")
     pictures = pictures or Pictures(tracks.found.views, tracks.found.references)
-    content = Content(record, tracks, covariance, closures, pictures, judged=judged)
+    content = ReportContent(record, tracks, covariance, closures, pictures, judged=judged)
     content = replace(content, questions=_questions(folder, content), references=_references(folder, content))
     thumbnails = pictures.thumbnails or _thumbnails(folder, content)
     return replace(content, pictures=replace(pictures, thumbnails=thumbnails))
 
 
-def _questions(folder: Path, content: Content) -> list[Question]:
+def _questions(folder: Path, content: ReportContent) -> list[ClosureQuestion]:
     """The first questions; none where the poses are not determined, or the graph is not that of the ledger."""
     try:
         graph, weight, _ = tables.read_edges(folder / "edges.parquet", content.tracks.world_from_body)
@@ -114,7 +118,7 @@ def _questions(folder: Path, content: Content) -> list[Question]:
         return []
 
 
-def _references(folder: Path, content: Content) -> Ints | None:
+def _references(folder: Path, content: ReportContent) -> Ints | None:
     """Numbers (N, K) of the references of each keyframe, as descriptors.parquet has them; None of other recognisers."""
     column, _ = tables.read_descriptors(folder / "descriptors.parquet")
     count = mapping(content.record.get("library")).get("references")
@@ -128,12 +132,12 @@ def _references(folder: Path, content: Content) -> Ints | None:
     return np.where(numbers < count, numbers, -1)
 
 
-def _thumbnails(folder: Path, content: Content) -> dict[int, bytes]:
+def _thumbnails(folder: Path, content: ReportContent) -> dict[int, bytes]:
     """Small JPEGs of at most `_MOST_THUMBNAILS` keyframes of closures: those asked about, false ones, those in the
     solution, then the nearest misses, by inliers; empty where result.mcap has no pictures."""
     closures = content.closures
-    asked = np.isin(np.arange(len(closures)), [row for one in content.questions for row in one.rows])
-    nearest = np.lexsort((-closures.inliers, ~closures.of(*USED), ~false_closures(content), ~asked))
+    in_question = np.isin(np.arange(len(closures)), [row for one in content.questions for row in one.rows])
+    nearest = np.lexsort((-closures.inliers, ~closures.of(*USED), ~false_closures(content), ~in_question))
     ends = np.stack([closures.query[nearest], closures.match[nearest]], 1).ravel().tolist()
     wanted = set(list(dict.fromkeys(ends))[:_MOST_THUMBNAILS])
     row_at = {stamp: row for row, stamp in enumerate(content.tracks.keyframes.stamp_ns.tolist()) if row in wanted}

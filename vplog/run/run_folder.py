@@ -105,7 +105,7 @@ def staged_run(
             cached = set(folder.rglob(f"*{ENDING}")) - before if resumable else ()
             interrupted = was_interrupted(error)
             again = bool(cached or resumed) and (interrupted or isinstance(error, OSError | MemoryError | ResultError))
-            if notes := [_kept(out, cached)] * bool(cached) + [f"Go on with: {_resume(out)}"] * again:
+            if notes := [_cached_results(out, cached)] * bool(cached) + [f"Go on with: {_resume(out)}"] * again:
                 error.add_note(" ".join(notes))
             if not again:
                 request.unlink(missing_ok=True)  # resumed, it would fail again
@@ -116,7 +116,7 @@ def staged_run(
             raise
 
 
-def _kept(out: Path, cached: Collection[Path]) -> str:
+def _cached_results(out: Path, cached: Collection[Path]) -> str:
     """Stages and bytes that an unfinished run leaves."""
     stages = ", ".join(sorted({file.name.split("-")[0] for file in cached}))
     return (

@@ -14,6 +14,7 @@ from scipy import sparse
 
 from vplog.cache.codecs import json_codec
 from vplog.cache.steps import step
+from vplog.data import SCALE_WANDER
 from vplog.geometry import se3
 from vplog.loops.candidate import check_queries
 from vplog.loops.landmarks import landmarks_of
@@ -31,8 +32,6 @@ _RANKS = 2
 """Candidates of a keyframe that are looked at: neighbours tell the same."""
 _LEAST = 12
 """Landmarks of both views that give a ratio."""
-_WANDER = 0.01
-"""Standard deviation of the log of the scale after a unit, growing as the root of the way."""
 _ACROSS = 1.0
 """That across a break: a piece begins with a unit by what it sees."""
 _BEST = 0.02
@@ -106,7 +105,7 @@ def in_one_scale(
 def _log_scale(odometry: Odometry, keyframes: Keyframes, ratios: Floats) -> Floats:
     """(N,) of the keyframes by least squares, of a scale that wanders slowly; its median is 0."""
     poses, count = keyframes.odom_from_body, len(keyframes.stamp_ns)
-    sigma = _WANDER * np.sqrt(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) + 1e-6)
+    sigma = SCALE_WANDER * np.sqrt(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) + 1e-6)
     if odometry.breaks is not None:
         edges = np.searchsorted(keyframes.stamp_ns, odometry.stamp_ns[odometry.breaks], "left") - 1
         sigma[np.unique(edges[(edges >= 0) & (edges < count - 1)])] = _ACROSS

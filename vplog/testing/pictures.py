@@ -45,7 +45,7 @@ def reference(seed: int) -> Reference:
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class DecodedFrame:
     """An image that needs no decoding."""
 
     stamp_ns: int
@@ -57,7 +57,7 @@ class Picture:
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class PictureLog:
     """A log of pictures."""
 
     images: list[Bytes]
@@ -76,9 +76,9 @@ class Drive:
     def stamps(self) -> Ints:
         return 10**18 + np.arange(len(self.images), dtype=np.int64)
 
-    def frames(self, stamp_ns: Ints) -> Iterator[Picture]:
+    def frames(self, stamp_ns: Ints) -> Iterator[DecodedFrame]:
         for stamp in stamp_ns.tolist():
-            yield Picture(stamp, self.camera(), self.images[stamp - 10**18])
+            yield DecodedFrame(stamp, self.camera(), self.images[stamp - 10**18])
 
     def file_names(self) -> list[str] | None:
         return None

@@ -25,7 +25,7 @@ from vplog.execution.execution import Execution
 from vplog.places.views import views_of
 from vplog.stages import PlaceState, index_of_part
 from vplog.storage.json_records import with_checksum
-from vplog.testing.pictures import Drive, reference
+from vplog.testing.pictures import PictureLog, reference
 
 COUNT = 12
 """Pictures of a library and of a map."""
@@ -35,8 +35,8 @@ def references() -> list[Reference]:
     return [reference(seed) for seed in range(COUNT)]
 
 
-def drive() -> Drive:
-    return Drive([one.image for one in references()])
+def drive() -> PictureLog:
+    return PictureLog([one.image for one in references()])
 
 
 def describe(state: PlaceState, threads: int = 1) -> list[Any]:

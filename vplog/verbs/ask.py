@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import shlex
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from vplog.data import Verdict
+from vplog.data import Closures, Keyframes, Verdict
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.collage import FramePanel, collage
 from vplog.results.previews import jpeg
+from vplog.results.report.page import ClosureQuestion
 from vplog.run.decisions import decided_lines, write_decisions
 from vplog.run.questions import ask_ledger
 from vplog.storage.image_file import decode_image
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from vplog.data import Closures, Keyframes
-    from vplog.results.report.page import Question
 
 _QUALITY = 80
 """JPEG quality."""
@@ -70,13 +66,13 @@ def _answered(path: Path, keyframes: Keyframes, closures: Closures) -> list[Sequ
     return list(lines.values())
 
 
-def _open(question: Question, closures: Closures) -> list[Sequence[Any]]:
+def _open(question: ClosureQuestion, closures: Closures) -> list[Sequence[Any]]:
     """Lines to answer in: one open, those of the closures that it answers for too as it is."""
     return [(closures.query[row], closures.match[row], "same" if at else "") for at, row in enumerate(question.rows)]
 
 
 def _described(
-    question: Question, pictures: dict[int, Path], keyframes: Keyframes, closures: Closures
+    question: ClosureQuestion, pictures: dict[int, Path], keyframes: Keyframes, closures: Closures
 ) -> dict[str, Any]:
     row = question.rows[0]
     picture = pictures.get(row)
@@ -96,7 +92,7 @@ def _described(
 
 
 def _pictures(
-    chosen: list[Question], folder: Path, output: Path, keyframes: Keyframes, closures: Closures
+    chosen: list[ClosureQuestion], folder: Path, output: Path, keyframes: Keyframes, closures: Closures
 ) -> dict[int, Path]:
     """Files closure-ROW.jpg by row: as the report draws it, else both frames; none where result.mcap has no images."""
     rows = [one.rows[0] for one in chosen]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from vplog.data import USED
+from vplog import logs
+from vplog.data import USED, Floats
 from vplog.errors import ResultError, SettingsError
 from vplog.geometry import se3
 from vplog.results import run_record, tables
@@ -19,12 +21,6 @@ from vplog.verbs import evaluate_run
 from vplog.verbs.evaluate_run import TruthOptions, evaluate, figures_of
 from vplog.verbs.limits import Limit, read_limits
 from vplog.verbs.report import judge
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from vplog import logs
-    from vplog.data import Floats
 
 _OF_RECORD = {
     "candidates": ("counts", "candidates"),

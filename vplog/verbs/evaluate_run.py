@@ -62,7 +62,7 @@ def has_metres(record: dict[str, Any]) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluation:
+class RunEvaluation:
     """A run of one drive against a file of poses."""
 
     record: dict[str, Any]
@@ -124,7 +124,7 @@ def log_truth(record: dict[str, Any], topics: logs.TopicChoice | None, options: 
 
 def evaluate_poses(
     folder: Path, record: dict[str, Any], truth: str, options: TruthOptions, known: Trajectory | None = None
-) -> Evaluation:
+) -> RunEvaluation:
     """A run of one drive against a TUM file, or the poses `known` that were read from it. Raises as `evaluate`."""
     options = options.of(record)
     known = _shifted(read_truth(truth), options) if known is None else known
@@ -166,7 +166,7 @@ def evaluate_poses(
     }
     if record.get("gps") is None:  # with GPS they are relative to earth, where the truth need not be
         found["poses"] = asdict(closures.score_poses(keyframes, world_from_body, covariance, of_body))
-    return Evaluation(found, keyframes, of_body, judged)
+    return RunEvaluation(found, keyframes, of_body, judged)
 
 
 def _stretched(
@@ -216,7 +216,7 @@ def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptio
         raise TruthError(f"{folder} holds several drives; each has its own truth: vplog evaluate {folder}/DRIVE")
     options = options.of(record)
     known = _shifted(read_truth(truth), options)
-    drives: dict[str, Evaluation] = {}
+    drives: dict[str, RunEvaluation] = {}
     uncovered: dict[str, str] = {}
     maps = []
     for found in run_record.recorded(record, folder / "run.json", list, "maps"):
@@ -244,7 +244,7 @@ def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptio
     return {"truth": shown(truth), "maps": maps, "joins": joins, "uncovered": uncovered}
 
 
-def _joins(folder: Path, drives: dict[str, Evaluation], place: closures.PlaceCriterion) -> list[dict[str, Any]]:
+def _joins(folder: Path, drives: dict[str, RunEvaluation], place: closures.PlaceCriterion) -> list[dict[str, Any]]:
     """The closures between each two drives, as those of one are judged."""
     found = []
     for (later, earlier), ledger in tables.read_joins(folder / "joins.parquet").items():

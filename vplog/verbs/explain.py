@@ -4,28 +4,24 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vplog import logs
-from vplog.data import Closures, Keyframes
+from vplog.data import Bytes, Camera, Closures, Features, Keyframes
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
-from vplog.pipeline import recorded_pipeline
+from vplog.pipeline import Pipeline, recorded_pipeline
 from vplog.results import run_record, tables
 from vplog.run.figures.closure_view import SharedBoxes, find_agreement, find_boxes
 from vplog.run.keyframes import row_of
 from vplog.run.provenance import reopened
 from vplog.stages import BoxState, Log
 from vplog.verbs import explain_text
-from vplog.verbs.explain_figure import View, draw
+from vplog.verbs.explain_figure import ClosureFigure, draw
 from vplog.verbs.report import frames_at, recorded_places
-
-if TYPE_CHECKING:
-    from vplog.data import Bytes, Camera, Features
-    from vplog.pipeline import Pipeline
 
 
 def explain(
@@ -107,14 +103,14 @@ class _Opened:
     log: Log
 
 
-def _view(number: int, row: dict[str, Any], explanation: explain_text.Explanation, opened: _Opened) -> View:
+def _view(number: int, row: dict[str, Any], explanation: explain_text.Explanation, opened: _Opened) -> ClosureFigure:
     """Both frames, read again from the log, with their matches and shared boxes."""
     query, match = (_picture(end, row, opened) for end in ("query", "match"))
     pose = se3.from_vectors(np.array([row[name] for name in tables.POSE_COLUMNS], np.float64))
     cameras = query[2], match[2]
     agreement = find_agreement(query[1], match[1], pose, row["inliers"], cameras, opened.pipeline.verify)
     boxes, missing = _boxes(row, (query[1], match[1]), opened)
-    return View(number, row, explanation, query[0], match[0], agreement, boxes, missing)
+    return ClosureFigure(number, row, explanation, query[0], match[0], agreement, boxes, missing)
 
 
 def _picture(end: str, row: dict[str, Any], opened: _Opened) -> tuple[Bytes, Features, Camera]:

@@ -34,7 +34,7 @@ _GAP = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ClosureFigure:
     """All that the picture shows."""
 
     number: int
@@ -49,7 +49,7 @@ class View:
     """Reason that there are no boxes."""
 
 
-def draw(path: Path, view: View) -> None:
+def draw(path: Path, view: ClosureFigure) -> None:
     """Write the picture, a .png or .svg by its name: the same bytes for the same closure."""
     height, width = view.query.shape
     stacked = width > _WIDE * height
@@ -69,13 +69,13 @@ def draw(path: Path, view: View) -> None:
             _reference(figure.add_subplot(grid[1, column]), boxes, view.row, _COLOURS[column])
 
 
-def _title(view: View) -> str:
+def _title(view: ClosureFigure) -> str:
     row = view.row
     outcome = "accepted" if row["verdict"] in ACCEPTED else f"rejected: {row['verdict'].replace('_', ' ')}"
     return f"Closure {view.number}: keyframe {row['query']} as a return to keyframe {row['match']}, {outcome}"
 
 
-def _caption(view: View) -> str:
+def _caption(view: ClosureFigure) -> str:
     a = view.agreement
     count = int(a.agrees.sum())
     sentences = [
@@ -99,7 +99,7 @@ def _caption(view: View) -> str:
     return " ".join(sentences)
 
 
-def _frames(axes: Axes, view: View, stacked: bool) -> None:
+def _frames(axes: Axes, view: ClosureFigure, stacked: bool) -> None:
     """Both frames in one coordinate frame, the query's px, so that lines may cross from one to the other."""
     height, width = view.query.shape
     other_height, other_width = view.match.shape

@@ -5,14 +5,16 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog.errors import ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import tum
 from vplog.results import geo, poses, tables
 from vplog.results.foxglove_layout import foxglove_layout
+from vplog.results.geo import Earth
 from vplog.results.mcap_read import read_topics
+from vplog.results.report.page import Tracks
 from vplog.results.rrd import write_rrd
 from vplog.results.run_record import read_single_run
 from vplog.run.report import gather_tracks
@@ -20,10 +22,6 @@ from vplog.storage.scratch import replacing
 from vplog.verbs.evaluate_run import TruthOptions
 from vplog.verbs.export_images import FOLDERS, export_images
 from vplog.verbs.report import judge
-
-if TYPE_CHECKING:
-    from vplog.results.geo import Earth
-    from vplog.results.report.page import Tracks
 
 FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd", "foxglove-layout")
 """Formats that are one file; two more are a folder."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from vplog import logs
 from vplog.data import Bytes, Camera, Frame, Gps, Ints, LogInfo, Odometry, OdometrySource, Topic
 from vplog.errors import LogError
 from vplog.geometry.masking import masked
+from vplog.logs import TopicChoice
 from vplog.logs.clocks import GAP_NS, GAP_PERIODS
 from vplog.logs.image_folder import PERIOD_NS
 from vplog.logs.odometry_sources import PROPERTIES, evidence_text
@@ -27,13 +28,10 @@ from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.run.lidar_odometry import new_registration
 from vplog.run.odometry import UNIT, about_assumed, gives_visual, is_metric, source_of
 from vplog.run.visual_odometry.visual import visual_odometry
+from vplog.stages import Log
 from vplog.storage.json_records import plain
 from vplog.storage.remote_path import address
 from vplog.storage.scratch import replacing
-
-if TYPE_CHECKING:
-    from vplog.logs import TopicChoice
-    from vplog.stages import Log
 
 _SAMPLES = 8
 """Frames that are decoded: enough to see what the drive looks like and whether its images decode throughout."""

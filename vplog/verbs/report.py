@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from pyarrow import Array
 
 from vplog import logs
 from vplog.data import Bytes, Features, Gps, Ints
@@ -22,15 +23,10 @@ from vplog.results.report.page import Pictures, TruthComparison
 from vplog.run.figures.run_figures import ClosureInputs, choose_views, reference_pictures, view_closures
 from vplog.run.provenance import library_at
 from vplog.run.report import write_report
-from vplog.stages import BoxState
+from vplog.stages import BoxState, Log, PlaceState
 from vplog.storage.remote_path import original
 from vplog.storage.urls import shown
 from vplog.verbs.evaluate_run import TruthOptions, evaluate, evaluate_poses, has_metres, log_truth
-
-if TYPE_CHECKING:
-    from pyarrow import Array
-
-    from vplog.stages import Log, PlaceState
 
 
 def report(
@@ -78,8 +74,8 @@ def judge(
     error_m = np.full(len(keyframes.stamp_ns), np.nan)
     error_m[at.known] = np.linalg.norm(se3.transform(world_from_truth, units * true) - solved, axis=1) / units
     closures = tables.read_closures(folder / "closures.parquet")
-    seen = se3.between(at.world_from_body[closures.match], at.world_from_body[closures.query])
-    apart_m = np.linalg.norm((seen - se3.stretched(closures.match_from_query, 1.0 / units))[:, :3, 3], axis=1)
+    expected = se3.between(at.world_from_body[closures.match], at.world_from_body[closures.query])
+    apart_m = np.linalg.norm((expected - se3.stretched(closures.match_from_query, 1.0 / units))[:, :3, 3], axis=1)
     return TruthComparison(
         Path(shown(truth)).name,
         found.record,

@@ -39,14 +39,14 @@ from vplog.storage import scratch
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.logs.formats.loss_account import Loss
+    from vplog.logs.formats.loss_account import TopicLoss
 
 DRIVE = Drive()
 RECORDED = Counter(m.topic for m in ros_messages(DRIVE, 2))
 """Messages by topic in every ROS drive of these tests."""
 
 
-def opened(path: Path) -> tuple[dict[str, int], list[Loss], str]:
+def opened(path: Path) -> tuple[dict[str, int], list[TopicLoss], str]:
     """Messages by topic that the log says it has, what it says is lost, and its warnings, after all was read."""
     log = logs.open(path)
     assert isinstance(log, RecordedLog)
@@ -59,7 +59,7 @@ def opened(path: Path) -> tuple[dict[str, int], list[Loss], str]:
     return found, log.losses, " ".join(log.warnings)
 
 
-def lost_by_topic(losses: list[Loss], *reasons: str) -> Counter[str]:
+def lost_by_topic(losses: list[TopicLoss], *reasons: str) -> Counter[str]:
     return Counter({loss.topic: loss.messages or 0 for loss in losses if loss.reason in reasons and loss.messages})
 
 

@@ -25,7 +25,7 @@ from vplog.maps.search.exact import Answers, best_places, no_answers
 from vplog.maps.search.index import update_index
 from vplog.maps.search.query import MapQuery, search
 from vplog.maps.search.segment import open_segment
-from vplog.maps.search.sequences import drives_by_credit
+from vplog.maps.search.sequences import LineSearch, drives_by_credit
 from vplog.maps.storage.map_store import Store
 from vplog.places.bobb import NOWHERE, BobbSettings, BobbState, Place
 from vplog.places.sequence import SequenceSettings
@@ -193,9 +193,7 @@ def test_other_recognisers_are_searched_drive_by_drive(made: Map) -> None:
 
     views = made.views(4)
     other = cast("PlaceState", Other())
-    found, warnings = search(
-        made.store, made.store.drives(), other, views, MapQuery(TOP), SequenceSettings(length=1), Execution(2)
-    )
+    found, warnings = search(made.store, made.store.drives(), other, views, MapQuery(TOP), LineSearch(), Execution(2))
     assert not warnings
     assert [told(found, at) for at in range(4)] == [made.expected(view) for view in views]
     assert not made.store.index.exists()
@@ -278,7 +276,7 @@ def test_sequences_in_a_large_map_are_those_of_the_likely_drives(
         large.put(number, 30)
     followed = large.places["drive-000000023"]
     views = [Place(followed.references[row], followed.weights[row], followed.boxes[row]) for row in range(5, 25)]
-    drives, by_five = large.store.drives(), SequenceSettings(length=5)
+    drives, by_five = large.store.drives(), LineSearch(SequenceSettings(length=5))
     every, nothing = search(large.store, drives, state, views, MapQuery(1), by_five)
     monkeypatch.setattr(map_query, "EXACT_PLACES", 100)
     likely, said = search(large.store, drives, state, views, MapQuery(1), by_five)

@@ -18,6 +18,7 @@ from tests.maps.bucket import serving
 from tests.maps.runs import put_rows
 from vplog.execution.execution import Execution
 from vplog.maps.search.query import MapQuery, open_map, search
+from vplog.maps.search.sequences import LineSearch
 from vplog.maps.storage import map_store, objects
 from vplog.maps.storage.download_cache import Cache, cache_in
 from vplog.maps.storage.layout import sha256_of
@@ -83,7 +84,7 @@ def asked(root: Path, finished: Path, cache: Cache | None = None, length: int = 
         drives, _, state = open_map(store, Execution())
         column = tables.read_descriptors(finished / "descriptors.parquet")[0]
         views = state.from_arrow(column.cast(cast("BobbState", state).arrow_type))[::5]
-        answers, told = search(store, drives, state, views, MapQuery(2), SequenceSettings(length=length))
+        answers, told = search(store, drives, state, views, MapQuery(2), LineSearch(SequenceSettings(length=length)))
     assert not told
     return {name: values.tolist() for name, values in vars(answers).items()}
 

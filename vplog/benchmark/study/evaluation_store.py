@@ -36,7 +36,7 @@ LESS_IS_BETTER = frozenset({"anr"})
 
 
 @dataclass(frozen=True, order=True)
-class Library:
+class RandomLibrary:
     """Random frames of a drive as reference images."""
 
     drive: int
@@ -49,7 +49,7 @@ class Evaluation:
     """The frames of one drive looked for in another, by one method with one library. Drives by number."""
 
     method: str
-    library: Library
+    library: RandomLibrary
     query: int
     map: int
 
@@ -103,13 +103,13 @@ class Bench:
         """The grey images of increasing rows of a traversal. Raises LogError where one is gone."""
         return images_at(self.logs[drive], self.traversal(drive).stamp_ns[rows])
 
-    def references(self, library: Library) -> list[Reference]:
+    def references(self, library: RandomLibrary) -> list[Reference]:
         """Frames as `vplog compare` chooses them; those that cannot be decoded are left out after the choice."""
         covered = self.frames[library.drive]
         wanted = LibrarySettings(choose="random", size=library.size, seed=library.seed)
         return references_of(self.traversal(library.drive), covered[choose(covered, wanted)])
 
-    def learn(self, method: str, library: Library) -> PlaceState:
+    def learn(self, method: str, library: RandomLibrary) -> PlaceState:
         """The trained state of a method on a library; the references of the last library are cached for the other
         methods."""
         if self._learned[0] != library:
@@ -131,7 +131,7 @@ class Bench:
         wanted = list(dict.fromkeys(evaluations))
         keys = {evaluation: self._key(evaluation) for evaluation in wanted}
         done = self._stored()
-        groups: dict[tuple[Library, str], list[Evaluation]] = {}
+        groups: dict[tuple[RandomLibrary, str], list[Evaluation]] = {}
         for evaluation in wanted:
             if keys[evaluation] not in done:
                 groups.setdefault((evaluation.library, evaluation.method), []).append(evaluation)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.benchmark.study.charts import explain
 from vplog.benchmark.study.experiments import StudyOptions, box_methods
+from vplog.benchmark.study.score_charts import explain
 from vplog.data import Boxes, Bytes, Floats, Ints
 from vplog.run.figures.canvas import as_text, saved_figure
 

@@ -8,18 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog.benchmark.feature_cache import CacheChoice
 from vplog.benchmark.recogniser_specs import read_method
-from vplog.benchmark.study.evaluation_store import LESS_IS_BETTER, SCORES, Bench, Evaluation, Library
+from vplog.benchmark.study.evaluation_store import LESS_IS_BETTER, SCORES, Bench, Evaluation, RandomLibrary
 from vplog.errors import SettingsError
+from vplog.logs import TopicChoice
 from vplog.places.reference_choice import PAPER_SIZE
 
-if TYPE_CHECKING:
-    from vplog.logs import TopicChoice
-
-    Row = dict[str, Any]
+Row = dict[str, Any]
 
 METHODS = ("bobb", "bobb_paper", "bovf", "fabmap", "vlad", "gist", "thumbnail")
 """Compared where the user names none."""
@@ -100,9 +98,9 @@ class StudyOptions:
     cache: CacheChoice = CacheChoice()
     """Cache of features for further calls."""
 
-    def libraries(self, drive: int, size: int | None = None) -> list[Library]:
+    def libraries(self, drive: int, size: int | None = None) -> list[RandomLibrary]:
         """One for each seed."""
-        return [Library(drive, self.library_size if size is None else size, seed) for seed in range(self.seeds)]
+        return [RandomLibrary(drive, self.library_size if size is None else size, seed) for seed in range(self.seeds)]
 
 
 def box_methods(bench: Bench, options: StudyOptions) -> list[str]:
@@ -211,7 +209,7 @@ NUMBERS: dict[str, Callable[[Bench, StudyOptions], dict[str, Any]]] = {
 """Experiments by name."""
 
 
-def _every(bench: Bench, methods: Iterable[str], libraries: Callable[[int], list[Library]]) -> list[Evaluation]:
+def _every(bench: Bench, methods: Iterable[str], libraries: Callable[[int], list[RandomLibrary]]) -> list[Evaluation]:
     """Each method on each pair of drives, with each of the libraries for its map."""
     return [
         Evaluation(method, library, query, other)

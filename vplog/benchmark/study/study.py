@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, replace
 from glob import escape
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,25 +20,23 @@ from vplog import logs
 from vplog.benchmark.compare import check_truth, every_image, protocol, same_drive
 from vplog.benchmark.feature_cache import FeatureFolder
 from vplog.benchmark.recogniser_specs import read_methods
-from vplog.benchmark.study.charts import CHARTS
 from vplog.benchmark.study.evaluation_store import Bench
 from vplog.benchmark.study.example_figures import PICTURES
 from vplog.benchmark.study.experiments import NUMBERS, StudyOptions
+from vplog.benchmark.study.score_charts import CHARTS
 from vplog.benchmark.traversals import candidate_stops
 from vplog.cache.code_hash import code_of
 from vplog.cache.input_hashes import hash_inputs
 from vplog.errors import ResultError, SettingsError, TruthError, nearest
 from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, open_truth
 from vplog.execution.execution import Execution, logged_warnings
+from vplog.pipeline import Pipeline
 from vplog.results.run_record import is_ours, read_run_json, write_run_json
 from vplog.results.staging import check_contents, staged
 from vplog.storage.folders import check_regular
 from vplog.storage.json_records import key_of, plain
 from vplog.storage.urls import shown
 from vplog.version import __version__
-
-if TYPE_CHECKING:
-    from vplog.pipeline import Pipeline
 
 EXPERIMENTS = (*NUMBERS, *PICTURES)
 """All of them, in the order they are done."""

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import reprlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from vplog.data import Floats
 from vplog.geometry import se3
 from vplog.logs.messages.records import CalibrationMessage
-
-if TYPE_CHECKING:
-    from vplog.data import Floats
 
 _ROUNDED = 1e-3
 """Most that the rows of a rotation may be off from unit length and right angles: files have six digits."""

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Floats
 from vplog.logs.calibrations.camera import BadCalibrationError, CalibratedCamera, numbers_of, pinhole, size_of
 from vplog.logs.messages.records import CalibrationMessage
-
-if TYPE_CHECKING:
-    from vplog.data import Floats
 
 _COLMAP = {
     "SIMPLE_PINHOLE": ("", "ffxy", ""),

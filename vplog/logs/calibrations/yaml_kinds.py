@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 import reprlib
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import yaml
 
+from vplog.data import Floats
 from vplog.geometry import se3
 from vplog.logs.calibrations.camera import (
     BadCalibrationError,
@@ -22,9 +23,6 @@ from vplog.logs.calibrations.camera import (
 )
 from vplog.logs.cameras import lens_of
 from vplog.logs.messages.records import CalibrationMessage
-
-if TYPE_CHECKING:
-    from vplog.data import Floats
 
 _VSLAM_LAB = {"camera_model": "cam_model", "resolution": "image_dimension", "distortion_model": "distortion_type"}
 """VSLAM-LAB's names of what Kalibr has, by Kalibr's."""

@@ -5,21 +5,18 @@ from __future__ import annotations
 import struct
 from collections import Counter, defaultdict
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from vplog.data import Trajectory
+from vplog.data import Floats, Trajectory
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.calibration_file import read_calibrations
 from vplog.logs.datasets.streams import DataSet, calibration_stream, camera_streams
-from vplog.logs.datasets.tables import lines_of
+from vplog.logs.datasets.text_tables import lines_of
 from vplog.logs.image_folder import named_stamps, natural_order
 from vplog.logs.tf_odometry import are_usable
-
-if TYPE_CHECKING:
-    from vplog.data import Floats
 
 _MODELS = (".", "sparse", "sparse/0", "colmap/sparse/0", "dslr_calibration_undistorted")
 """Paths of a model below the folder of a reconstruction: COLMAP's own, its automatic one, NeRF's, ETH3D's."""

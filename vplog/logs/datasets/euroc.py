@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from vplog.logs.calibration_file import read_calibrations
 from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, imu_stream
-from vplog.logs.datasets.tables import listed_images, poses_of
+from vplog.logs.datasets.text_tables import listed_images, poses_of
 from vplog.logs.image_folder import below, image_files, named_stamps
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 _POSES = ("state_groundtruth_estimate0", "gt0", "mocap0", "vicon0")
 """Folders with poses, the best first: of the body, of the IMU in TUM VI, of a marker."""

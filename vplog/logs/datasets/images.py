@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
 from vplog.logs.datasets.streams import DataSet, camera_streams
 from vplog.logs.image_folder import PERIOD_NS, natural_order, select_camera, stamps_of
-from vplog.logs.topic_selection import EVERY_IMAGE
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
-    from pathlib import Path
-
-    from vplog.logs.topic_selection import TopicChoice
+from vplog.logs.topic_selection import EVERY_IMAGE, TopicChoice
 
 
 def read(path: Path, files: list[Path], damaged: Collection[Path], choice: TopicChoice) -> DataSet:

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
-from vplog.data import Trajectory
+from vplog.data import Ints, Trajectory
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.calibration_file import read_calibrations
 from vplog.logs.datasets.streams import DataSet, camera_streams
-from vplog.logs.datasets.tables import numbers_of, rows_of, stamps_ns
+from vplog.logs.datasets.text_tables import numbers_of, rows_of, stamps_ns
 from vplog.logs.image_folder import below, image_files
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vplog.data import Ints
 
 _CAMERAS = ("image_0", "image_1", "image_2", "image_3")
 """Grey left and right, colour left and right."""

@@ -11,7 +11,7 @@ import numpy as np
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.cameras import BODY
-from vplog.logs.datasets.tables import numbers_of, rows_of, stamps_ns
+from vplog.logs.datasets.text_tables import numbers_of, rows_of, stamps_ns
 from vplog.logs.formats.container import BRIEF, Channel, Contents, Message, by_topic
 from vplog.logs.messages.pixels import scaled_depth_m
 from vplog.logs.messages.records import BadMessageError, FixMessage, ImageMessage, ImuMessage, PoseMessage

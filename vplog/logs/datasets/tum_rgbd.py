@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
 from vplog.logs.calibrations.camera import CalibratedCamera, pinhole
 from vplog.logs.datasets.streams import DataSet, camera_streams, depth_stream
-from vplog.logs.datasets.tables import listed_images, poses_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from vplog.logs.datasets.text_tables import listed_images, poses_of
 
 _PER_M = 5000.0
 """Counts of a metre in the depth images (cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats)."""

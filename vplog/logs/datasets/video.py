@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
+from vplog.data import Bytes, Ints
 from vplog.errors import LogError
 from vplog.logs.datasets.streams import DataSet, Stream, raw_image
 from vplog.logs.formats.container import Channel
-from vplog.logs.messages.records import BadMessageError
+from vplog.logs.messages.records import BadMessageError, ImageMessage
 from vplog.logs.messages.video import (
     MAX_PIXELS,
     NAMES,
@@ -24,13 +27,6 @@ from vplog.logs.messages.video import (
     padded,
     pyav,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from vplog.data import Bytes, Ints
-    from vplog.logs.messages.records import ImageMessage
 
 _TURNS = {90: cv2.ROTATE_90_COUNTERCLOCKWISE, 180: cv2.ROTATE_180, -180: cv2.ROTATE_180, -90: cv2.ROTATE_90_CLOCKWISE}
 """By the degrees counterclockwise that PyAV gives of the display matrix (ISO/IEC 14496-12, 8.3.2)."""

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from vplog.errors import LogError
 from vplog.logs.calibration_file import read_calibrations
+from vplog.logs.calibrations.camera import CalibratedCamera
 from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, depth_stream, imu_stream
-from vplog.logs.datasets.tables import lines_of, listed_images, poses_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vplog.logs.calibrations.camera import CalibratedCamera
+from vplog.logs.datasets.text_tables import lines_of, listed_images, poses_of
 
 
 def roots(path: Path) -> list[Path]:

@@ -8,18 +8,13 @@ import threading
 import time
 import weakref
 from collections import OrderedDict, deque
-from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import BinaryIO
 
 from vplog.execution.cores import allowed
 from vplog.logs.formats.compression import BadChunkError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable
-    from concurrent.futures import Future
-    from typing import BinaryIO
-
-    from vplog.logs.formats.container import Octets
+from vplog.logs.formats.container import Octets
 
 MOST_BYTES = 64 * 2**20
 """Bytes of unpacked chunks that a process caches: neighbouring chunks of image and depth are not unpacked twice."""

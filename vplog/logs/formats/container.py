@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
+from vplog.data import Gps, Trajectory
 from vplog.logs.formats.loss_account import LossAccount
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping
-
-    from vplog.data import Gps, Trajectory
 
 Octets = bytes | memoryview
 """Bytes of a message: its own where they are few, else a view of the chunk that holds them."""

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Ints
 from vplog.errors import plural
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
-
-    from vplog.data import Ints
 
 Span = tuple[int, int]
 """First and last ns of something, both included."""
@@ -44,7 +40,7 @@ _NAMED = 4
 
 
 @dataclass(frozen=True)
-class Loss:
+class TopicLoss:
     """Messages of one topic that were lost for one reason."""
 
     reason: str
@@ -178,7 +174,7 @@ class LossAccount:
         return {}
 
     @property
-    def losses(self) -> list[Loss]:
+    def losses(self) -> list[TopicLoss]:
         """By reason in the order of REASONS, then topic; the same for any order of reading."""
         recorded: Counter[str] = Counter()
         for counts in self._recorded.values():
@@ -190,7 +186,7 @@ class LossAccount:
             if lost:
                 messages = None if None in (counts := [one.messages for one in lost]) else sum(n or 0 for n in counts)
                 spans = tuple(merged([span for one in lost for span in self._in_log(reason, one.spans)]))
-                result.append(Loss(reason, topic, messages, recorded.get(topic), spans, lost[0].detail))
+                result.append(TopicLoss(reason, topic, messages, recorded.get(topic), spans, lost[0].detail))
         return result
 
     def _in_log(self, reason: str, spans: list[Span]) -> list[Span]:
@@ -219,7 +215,7 @@ class LossAccount:
         groups = groupby(self.losses, key=lambda loss: loss.reason)
         return [self._sentence(reason, list(group)) for reason, group in groups]
 
-    def _sentence(self, reason: str, group: list[Loss]) -> str:
+    def _sentence(self, reason: str, group: list[TopicLoss]) -> str:
         known = [loss.messages for loss in group if loss.messages is not None]
         total = sum(known)
         what = "an unknown number of messages"
@@ -241,7 +237,7 @@ class LossAccount:
         return f"at t={first} s" if first == last else f"from t={first} to {last} s{where}"
 
 
-def _count(loss: Loss) -> str:
+def _count(loss: TopicLoss) -> str:
     if loss.messages is None:
         return ""
     return f" {loss.messages}" + (f" of {loss.of}" if loss.of is not None else "")

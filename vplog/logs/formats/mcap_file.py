@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import struct
 from collections import Counter
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from mcap import records
 from mcap.data_stream import ReadDataStream
@@ -14,19 +15,12 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
+from vplog.logs.formats.chunk_layout import Chunk, ChunkLosses
 from vplog.logs.formats.compression import BadChunkError, crc32, unpack
-from vplog.logs.formats.container import BRIEF, Channel, Contents, Message, Notes, part_of
-from vplog.logs.formats.layout import ChunkLosses
+from vplog.logs.formats.container import BRIEF, Channel, Contents, Message, Notes, Octets, Place, part_of
 from vplog.logs.formats.loss_account import sampled
 from vplog.logs.formats.mcap_layout import MAGIC, RECORD, read_layout
 from vplog.storage.remote_path import RemotePath
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator
-    from pathlib import Path
-
-    from vplog.logs.formats.container import Octets, Place
-    from vplog.logs.formats.layout import Chunk
 
 __all__ = ["MAGIC", "McapFile"]
 

@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import re
 import struct
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import BinaryIO
 
 from mcap.opcode import Opcode
 
 from vplog.errors import LogError
+from vplog.logs.formats.chunk_layout import MOST_GAPS, Chunk, Layout, ResyncSearch
 from vplog.logs.formats.compression import KINDS, crc32
-from vplog.logs.formats.layout import MOST_GAPS, Chunk, Layout, ResyncSearch
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from typing import BinaryIO
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD = struct.Struct("<BQ")

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Iterator
+from pathlib import Path
 
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
+from vplog.logs.formats.chunk_layout import ChunkLosses
 from vplog.logs.formats.compression import BadChunkError, unpack
-from vplog.logs.formats.container import Channel, Contents, Message, Notes, part_of
-from vplog.logs.formats.layout import ChunkLosses
+from vplog.logs.formats.container import Channel, Contents, Message, Notes, Octets, Place, part_of
 from vplog.logs.formats.loss_account import sampled
 from vplog.logs.formats.ros1_layout import CONNECTION, MAGIC, MESSAGE, fields, number, read_layout, time_ns
 from vplog.storage.remote_path import RemotePath
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
-    from pathlib import Path
-
-    from vplog.logs.formats.container import Octets, Place
 
 _FIELDS = {MESSAGE: {b"conn", b"time"}, CONNECTION: {b"conn", b"topic"}}
 """Header fields of each kind of record in the chunks."""

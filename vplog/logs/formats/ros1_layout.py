@@ -9,14 +9,11 @@ from __future__ import annotations
 import re
 import struct
 from collections import Counter
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import BinaryIO
 
 from vplog.errors import LogError
-from vplog.logs.formats.layout import MOST_GAPS, Chunk, Layout, ResyncSearch
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from typing import BinaryIO
+from vplog.logs.formats.chunk_layout import MOST_GAPS, Chunk, Layout, ResyncSearch
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7

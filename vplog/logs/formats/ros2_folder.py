@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import yaml
 import zstandard
 
 from vplog.logs.formats.compression import BadChunkError, unpack_zstd_message
-from vplog.logs.formats.container import Contents, Notes, by_topic
+from vplog.logs.formats.container import Channel, Container, Contents, Message, Notes, Octets, Place, by_topic
 from vplog.logs.formats.loss_account import LossRuns
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
-    from pathlib import Path
-
-    from vplog.logs.formats.container import Channel, Container, Message, Octets, Place
 
 _MAX_METADATA = 4 * 2**20
 """Bytes of metadata.yaml that are parsed; real ones have some 10 kB."""

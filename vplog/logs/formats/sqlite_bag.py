@@ -6,18 +6,13 @@ import re
 import sqlite3
 import struct
 from collections import Counter
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from vplog.errors import LogError, plural
-from vplog.logs.formats.container import Channel, Contents, Message, Notes, by_topic
-from vplog.logs.formats.layout import ResyncSearch
+from vplog.logs.formats.chunk_layout import ResyncSearch
+from vplog.logs.formats.container import Channel, Contents, Message, Notes, Place, by_topic
 from vplog.logs.formats.loss_account import confirmed_span, main_span
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
-
-    from vplog.logs.formats.container import Place
 
 MAGIC = b"SQLite format 3\x00"
 _DAMAGE = (sqlite3.Error, OverflowError, UnicodeDecodeError)

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from vplog.data import Scan
+from vplog.data import Floats, Scan
 from vplog.geometry import se3
-from vplog.logs.messages.records import BadMessageError
-
-if TYPE_CHECKING:
-    from vplog.data import Floats
-    from vplog.logs.messages.records import CloudMessage
+from vplog.logs.messages.records import BadMessageError, CloudMessage
 
 _TIMES = ("t", "time", "timestamp", "timestamps", "time_stamp", "offset_time")
 """Fields with the time of a point: of Ouster, Velodyne, Hesai and RoboSense, Livox, as kiss-icp takes them."""

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from vplog.logs.messages.records import ENCODINGS, BadMessageError, PoseMessage, nanoseconds, short_type
+from vplog.data import Floats, Ints
+from vplog.logs.formats.container import Channel, Octets
+from vplog.logs.messages.records import ENCODINGS, BadMessageError, PoseMessage, Record, nanoseconds, short_type
 from vplog.logs.messages.ros import decode_ros
-
-if TYPE_CHECKING:
-    from vplog.data import Floats, Ints
-    from vplog.logs.formats.container import Channel, Octets
-    from vplog.logs.messages.records import Record
 
 _STAMPS = {
     ("cdr", True): struct.Struct("<4xiI"),

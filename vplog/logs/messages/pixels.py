@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
-from vplog.logs.messages.records import BadMessageError
+from vplog.data import Bytes, Float32s
+from vplog.logs.formats.container import Octets
+from vplog.logs.messages.records import BadMessageError, ImageMessage
 from vplog.storage.image_file import BadImageError, decode_image, image_size
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from vplog.data import Bytes, Float32s
-    from vplog.logs.formats.container import Octets
-    from vplog.logs.messages.records import ImageMessage
 
 _DEPTH_HEADER = 12
 """Bytes before the PNG of compressedDepth: int32 format, float32 a and b (compressed_depth_image_transport)."""

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from vplog.data import Floats
-    from vplog.logs.formats.container import Channel, Octets
+from vplog.data import Floats
+from vplog.logs.formats.container import Channel, Octets
 
 
 class BadMessageError(Exception):

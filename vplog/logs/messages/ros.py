@@ -9,12 +9,14 @@ from __future__ import annotations
 import math
 import re
 import struct
+from collections.abc import Callable
 from functools import cache, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Floats
 from vplog.geometry import se3
+from vplog.logs.formats.container import Octets
 from vplog.logs.messages.nmea import fix_of
 from vplog.logs.messages.records import (
     BadMessageError,
@@ -25,15 +27,9 @@ from vplog.logs.messages.records import (
     ImuMessage,
     PathMessage,
     PoseMessage,
+    Record,
     nanoseconds,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from vplog.data import Floats
-    from vplog.logs.formats.container import Octets
-    from vplog.logs.messages.records import Record
 
 _UNKNOWN_COVARIANCE = 0
 """NavSatFix.COVARIANCE_TYPE_UNKNOWN."""

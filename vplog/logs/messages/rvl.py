@@ -7,15 +7,12 @@ Every number is a string of nibbles: three bits of value, lowest first, and a co
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
 
+from vplog.data import Bytes, Uint16s
 from vplog.logs.messages.records import BadMessageError
-
-if TYPE_CHECKING:
-    from vplog.data import Bytes, Uint16s
 
 _HEAD = struct.Struct("<II")
 """Columns and rows, before the words (compressed_depth_image_transport, codec.cpp)."""

@@ -13,30 +13,27 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from vplog.data import Bools
 from vplog.errors import SettingsError
 from vplog.execution.execution import Execution
 from vplog.maps.condensation.own_queries import OwnAnswers, OwnPlaces, query_own_places, read_own_places, search_of
-from vplog.maps.condensation.redundancy import remove_cross_validated
+from vplog.maps.condensation.redundancy import RemovalCandidates, remove_cross_validated
 from vplog.maps.condensation.references import remove_references
 from vplog.maps.merge import copy_library, put_library
 from vplog.maps.search.query import open_map
 from vplog.maps.storage import layout, map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
+from vplog.maps.storage.map_store import Store
 from vplog.places.library_files import ReferencesState
 from vplog.results import run_record, tables
 from vplog.run.provenance import library_of
-from vplog.stages import CodedState, FrameState
+from vplog.stages import CodedState, FrameState, PlaceState
 from vplog.storage.folders import regular_files
 from vplog.storage.scratch import copy_folder
-
-if TYPE_CHECKING:
-    from vplog.data import Bools
-    from vplog.maps.storage.map_store import Store
-    from vplog.stages import PlaceState
 
 LOSS = 0.01
 """Loss of recall at rank one of the map's own queries."""
@@ -58,7 +55,7 @@ class Condensed:
     state: PlaceState
     whole: PlaceState
     """The recogniser of the map as it was."""
-    asked: OwnAnswers
+    whole_answers: OwnAnswers
     """Answers of the whole map."""
 
 
@@ -98,19 +95,21 @@ def condense_places(
 ) -> Condensed:  # fmt: skip
     """The references that stay, and then the places. One that no other shows is among them, unless it has faded, and
     one of each drive."""
-    posed, asked, small = places.frame >= 0, answers, state
+    posed, whole_answers, small = places.frame >= 0, answers, state
     most_lost = math.floor(loss * int(posed.sum()) + 1e-9)  # .01 of 300 is 3
     if isinstance(state, CodedState):
         places, answers, small = remove_references(places, answers, state, distance_m, most_lost // 2, execution)
     every = np.arange(len(posed))
     removable, along_m = posed & (np.isin(every, answers.place) | answers.faded), np.cumsum(places.steps_m())
     total = int(removable.sum())
+    most_lost -= len(whole_answers.place) - len(answers.place)
+    candidates = RemovalCandidates(places.drive, along_m, removable, answers.faded)
     removal, lost = remove_cross_validated(
-        answers.queries, answers.place % 2 == 0, places.drive, along_m, removable, answers.faded,
-        most_lost - (len(asked.place) - len(answers.place)), lambda done: execution.progress("remove", done, total),
+        answers.queries, answers.place % 2 == 0, candidates, most_lost,
+        lambda done: execution.progress("remove", done, total),
     )  # fmt: skip
     retained = ~np.isin(every, removal.places)
-    return Condensed(places, answers, distance_m, retained, lost, small, state, asked)
+    return Condensed(places, answers, distance_m, retained, lost, small, state, whole_answers)
 
 
 def _write(store: Store, new: Store, found: Condensed) -> None:
@@ -165,10 +164,10 @@ def _write_drive(store: Store, new: Store, record: Mapping[str, Any], found: Con
 
 def _account(found: Condensed, store: Store, new: Store, warnings: list[str]) -> dict[str, Any]:
     """The places and references removed and what that costs, as plain values."""
-    places, asked, retained, faded = found.places, found.asked, found.retained, found.answers.faded
-    posed, answered = int((places.frame >= 0).sum()), len(asked.place)
-    best = np.array([one.rows[0] for one in asked.queries.best], np.int64)
-    others = int((places.drive[best] != places.drive[asked.place]).sum())
+    places, whole_answers, retained, faded = found.places, found.whole_answers, found.retained, found.answers.faded
+    posed, answered = int((places.frame >= 0).sum()), len(whole_answers.place)
+    best = np.array([one.rows[0] for one in whole_answers.queries.best], np.int64)
+    others = int((places.drive[best] != places.drive[whole_answers.place]).sum())
     ends = ((store, found.whole), (new, found.state))
     drives: list[dict[str, Any]] = []
     for number, drive in enumerate(places.drives):

@@ -43,6 +43,20 @@ class OwnQueries:
 
 
 @dataclass(frozen=True, eq=False)
+class RemovalCandidates:
+    """The N places of drives, in their order, of which some may be removed."""
+
+    drive: Ints
+    """(N,) number of the drive."""
+    along_m: Floats
+    """(N,) position along the drives."""
+    removable: Bools
+    """(N,) places that may go."""
+    faded: Bools
+    """(N,) places that go before all others where they cost no query."""
+
+
+@dataclass(frozen=True, eq=False)
 class Removal:
     """Places in the order in which they are removed."""
 
@@ -156,43 +170,50 @@ class _Gaps:
 
 
 def remove_cross_validated(
-    queries: OwnQueries, fold: Bools, drive: Ints, along_m: Floats, removable: Bools, faded: Bools, most_lost: int,
+    queries: OwnQueries,
+    fold: Bools,
+    places: RemovalCandidates,
+    most_lost: int,
     progress: Callable[[int], None] = lambda _: None,
-) -> tuple[Removal, int]:  # fmt: skip
+) -> tuple[Removal, int]:
     """Remove as many places (N,) as cost at most so many of the queries (Q,), and how many these cost.
 
     Queries that choose what goes lose hardly any of their own answers by it, and a drive that the map has not seen
     does. So how many go is decided by the queries of one fold (Q,) on what those of the other choose, both ways round;
     which ones, by all. Both folds are to be everywhere: where none chooses, more goes.
     """
-    about, losses = (drive, along_m, removable, faded), list[Ints]()
+    losses = list[Ints]()
     for choosing in (fold, ~fold):
         judges = queries.some(~choosing)
-        losses.append(remove_redundant(queries.some(choosing), *about, most_lost, judges=judges).lost)
+        losses.append(remove_redundant(queries.some(choosing), places, most_lost, judges=judges).lost)
     count = min(map(len, losses))
     lost = losses[0][:count] + losses[1][:count]
     most = int(np.argmax([*(lost > most_lost), True]))
-    removal = remove_redundant(queries, *about, len(fold), progress, most=most)
+    removal = remove_redundant(queries, places, len(fold), progress, most=most)
     return removal, int(lost[most - 1]) if most else 0
 
 
 def remove_redundant(
-    queries: OwnQueries, drive: Ints, along_m: Floats, removable: Bools, faded: Bools, most_lost: int,
-    progress: Callable[[int], None] = lambda _: None, judges: OwnQueries | None = None, most: int | None = None,
-) -> Removal:  # fmt: skip
-    """Remove places (N,) of drives, in their order and so far along them, as long as at most so many queries are lost:
-    of `judges`, which have no say in what goes, where these are given. `faded` ones that cost no query go before all
-    others; of each drive one place stays. No more than `most` go."""
+    queries: OwnQueries,
+    places: RemovalCandidates,
+    most_lost: int,
+    progress: Callable[[int], None] = lambda _: None,
+    judges: OwnQueries | None = None,
+    most: int | None = None,
+) -> Removal:
+    """Remove places as long as at most so many queries are lost: of `judges`, which have no say in what goes, where
+    these are given. Of each drive one place stays. No more than `most` go."""
+    drive = places.drive
     remaining = _Remaining(queries, np.ones(len(drive), np.bool_))
     judging = remaining if judges is None else _Remaining(judges, np.ones(len(drive), np.bool_))
-    gaps, left, lost, order, losses = _Gaps.of(drive, along_m), np.bincount(drive), 0, list[int](), list[int]()
+    gaps, left, lost, order, losses = _Gaps.of(drive, places.along_m), np.bincount(drive), 0, list[int](), list[int]()
 
     def key(place: int) -> tuple[float, int, float, int]:
         queries_lost, drop = remaining.cost(place)
-        gap = 0.0 if faded[place] and queries_lost <= 0 else round(gaps.without(place), _MILLIMETRES)
+        gap = 0.0 if places.faded[place] and queries_lost <= 0 else round(gaps.without(place), _MILLIMETRES)
         return gap, queries_lost, drop, place
 
-    heap = [key(place) for place in np.flatnonzero(removable).tolist()]
+    heap = [key(place) for place in np.flatnonzero(places.removable).tolist()]
     heapq.heapify(heap)
     while heap and (most is None or len(order) < most):
         place = heapq.heappop(heap)[-1]

@@ -10,17 +10,14 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Ints
 from vplog.execution.execution import Execution
 from vplog.maps.condensation.own_queries import OwnAnswers, OwnPlaces, query_own_places, search_in_memory
-
-if TYPE_CHECKING:
-    from vplog.data import Ints
-    from vplog.places.code_search import CodeLists
-    from vplog.stages import CodedState
+from vplog.places.code_search import CodeLists
+from vplog.stages import CodedState
 
 _LAST = 0.01
 """References that a place counts as left with when its last one goes, which keeps the logarithm finite."""

@@ -24,13 +24,12 @@ from vplog.maps.joining.members import CameraTrust, member_of, opened_drive, ope
 from vplog.maps.search.exact import NO_SCORE, best_places
 from vplog.maps.search.index import SegmentView, place_keyframes, update_index
 from vplog.maps.search.query import open_map
-from vplog.maps.search.sequences import best_lines
+from vplog.maps.search.sequences import LineSearch, best_lines
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.layout import PICTURES
 from vplog.pipeline import recorded_pipeline
-from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record, tables
 from vplog.results.landmark_table import LandmarkTable
 from vplog.run.landmarks import LANDMARKS, landmark_key, run_drive, write_drive_landmarks
@@ -182,7 +181,7 @@ def _map_search(
             if isinstance(state, CodedState):
                 found = best_places([one.of(there) for one in parts], state, descriptors, top, execution)
             else:
-                found = best_lines(store, there, state, descriptors, top, SequenceSettings(length=1), execution)
+                found = best_lines(store, there, state, descriptors, top, LineSearch(), execution)
             for at in np.unique(found.drive[found.score > NO_SCORE]).tolist():
                 own = (found.drive == at) & (found.score > NO_SCORE)
                 found.keyframe[own] = place_keyframes(store, drives[at].name)[found.keyframe[own]]

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,10 +20,8 @@ from vplog.maps.localization.places import Places, opened
 from vplog.maps.localization.trajectory import join_by_odometry
 from vplog.maps.search.query import select_views
 from vplog.results.tables import TableMetadata, write_localized
+from vplog.stages import Log
 from vplog.storage.scratch import check_file_output
-
-if TYPE_CHECKING:
-    from vplog.stages import Log
 
 _AT_ODDS = "At odds with the other pictures by the log's odometry, so it has no pose."
 

@@ -21,7 +21,7 @@ from vplog.maps.geo_bounds import DriveBounds, box_of_fixes
 from vplog.maps.search.exact import Answers, best_places
 from vplog.maps.search.index import SegmentView, place_keyframes, read_column, update_index
 from vplog.maps.search.probability import answer_probabilities
-from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, best_lines, drives_by_credit
+from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, LineSearch, best_lines, drives_by_credit
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import reading_drive
@@ -97,7 +97,7 @@ def query_map(
             short += _short_drives(store, numbered.values(), settings.length)
             part = replace(query, drives=list(numbered.values()))
             known = None if settings.length == 1 else LookAlikes.of(len(descriptors))
-            answers, more = search(store, drives, state, descriptors, part, settings, execution, known)
+            answers, more = search(store, drives, state, descriptors, part, LineSearch(settings, known), execution)
             p_match = answer_probabilities(store, numbered, state, descriptors, answers, known, execution)
             table = _table(store, list(drives), answers, stamps, p_match)
             named = _named(store, drives, table, log)
@@ -224,8 +224,7 @@ def _descriptors(
 
 def search(
     store: Store, drives: Mapping[str, Mapping[str, Any]], state: PlaceState, descriptors: Sequence[Any],
-    query: MapQuery, settings: SequenceSettings, execution: Execution = Execution(),
-    look_alikes: LookAlikes | None = None,
+    query: MapQuery, lines: LineSearch, execution: Execution = Execution(),
 ) -> tuple[Answers, list[str]]:  # fmt: skip
     """The best places of the map's drives, or of `query.drives` of them, for each of Q views in order, and warnings.
 
@@ -245,16 +244,16 @@ def search(
         if store.mirror is not None:  # workers elsewhere do not see these files
             parts = [replace(part, path=None) for part in parts]
         places = sum(part.places for part in parts)
-        if settings.length == 1:
+        if lines.settings.length == 1:
             return best_places(parts, state, descriptors, min(query.top, places), execution, executor), warnings
         if places > EXACT_PLACES:
             single = best_places(parts, state, descriptors, PLACES_A_VIEW, execution, executor)
-            numbered = {number: numbered[number] for number in drives_by_credit(single, settings.length).tolist()}
+            numbered = {number: numbered[number] for number in drives_by_credit(single, lines.settings.length).tolist()}
             warnings.append(f"Sequences were searched in the {len(numbered)} of {count} drives most like single views.")
         elif executor is not None:
             warnings.append(f"Ray was not used: sequences in maps of up to {EXACT_PLACES} places are searched here.")
     top = min(query.top, places)
-    return best_lines(store, numbered, state, descriptors, top, settings, execution, look_alikes), warnings
+    return best_lines(store, numbered, state, descriptors, top, lines, execution), warnings
 
 
 def _short_drives(store: Store, drives: Iterable[str], length: int) -> list[str]:

@@ -36,18 +36,29 @@ PLACES_A_VIEW = 100
 """Best places of each single view that vote for their drives."""
 _DRIVES_A_STRETCH = 8
 """Drives chosen for each stretch of views as long as a window."""
+_SINGLE_VIEWS = SequenceSettings(length=1)
+
+
+@dataclass(frozen=True, eq=False)
+class LineSearch:
+    """How views are matched along with their neighbours; a window of one view is a search by single views."""
+
+    settings: SequenceSettings = _SINGLE_VIEWS
+    look_alikes: LookAlikes | None = None
+    """Collects look-alikes of the lines, where given."""
 
 
 def best_lines(
     store: Store, drives: Mapping[int, str], state: PlaceState, descriptors: Sequence[Any], top: int,
-    settings: SequenceSettings, execution: Execution, look_alikes: LookAlikes | None = None,
+    search: LineSearch, execution: Execution,
 ) -> Answers:  # fmt: skip
     """The `top` best places of some drives, by their numbers in the map, for each of Q views in order.
 
-    Drives are read one after the other, so memory is that of the largest; of lines, `look_alikes` are taken from the
+    Drives are read one after the other, so memory is that of the largest; of lines, look-alikes are taken from the
     scores of one drive, which are on disk meanwhile. Works for any recogniser, and for a window of one view. Raises
     LibraryError where a drive's descriptors are of another library.
     """
+    settings, look_alikes = search.settings, search.look_alikes
     best = no_answers(len(descriptors), top)
     for number, drive in execution.counted("search", drives.items(), len(drives)):
         index, nearest = drive_index(store, drive, state, settings)

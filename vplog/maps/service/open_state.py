@@ -19,9 +19,9 @@ from vplog.maps.localization.places import opened
 from vplog.maps.search.exact import best_places
 from vplog.maps.search.index import SegmentView, place_keyframes, update_index
 from vplog.maps.search.query import MapQuery, open_map, search
+from vplog.maps.search.sequences import LineSearch
 from vplog.maps.storage import map_store, objects
 from vplog.maps.storage.damage import reading_drive
-from vplog.places.sequence import SequenceSettings
 from vplog.results import tables
 from vplog.stages import CodedState, PlaceState
 from vplog.storage.remote_path import RemotePath
@@ -68,7 +68,7 @@ class OpenState:
             found = best_places(parts, self.state, descriptors, top)
         else:
             only = MapQuery(query.top, drives=[names[number] for number in numbers.tolist()])
-            found, more = search(self.store, self.drives, self.state, descriptors, only, SequenceSettings(length=1))
+            found, more = search(self.store, self.drives, self.state, descriptors, only, LineSearch())
             warnings += more
         answers = []
         for view, count in enumerate(found.count.tolist()):

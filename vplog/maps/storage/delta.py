@@ -92,7 +92,7 @@ def _place(store: Store) -> RemotePath:
         return cast("RemotePath", _Folder(LocalStore(store.root / "delta", mkdir=True)))
 
 
-def is_kept(store: Store) -> bool:
+def is_present(store: Store) -> bool:
     """Whether the map has Delta tables."""
     if store.mirror is None:
         return (store.root / "delta" / _FIRST).is_file()
@@ -143,12 +143,12 @@ def vacuum(store: Store, before: float) -> dict[str, int]:
         versions = [_version(name) for name in old if name.startswith("commits/")]
         commits = _commits(place, store, max(versions, default=0))
         of_then = sum(one["version"] <= max(versions, default=0) for one in commits)
-        kept = {*_files(commits[:of_then]), *(name for one in commits[of_then:] for name in one["added"])}
+        needed = {*_files(commits[:of_then]), *(name for one in commits[of_then:] for name in one["added"])}
         first = commits[0]["version"] if commits else 0
         gone = [
             name for name in old - {_FIRST}
             if (0 <= _version(name) < first if _version(name) >= 0 else name.endswith(".parquet"))
-            and Path(name).stem not in kept
+            and Path(name).stem not in needed
         ]  # fmt: skip
         _remove(place, gone)
     return {"objects": len(gone), "bytes": sum(there[name]["size"] for name in gone)}
@@ -209,15 +209,15 @@ def _missing(
     small = {name for name, file in files.items() if _longest(file) < _FILE_BYTES / 2}
     if compact and len(small - stale) > 1:
         stale |= small
-    kept = {drive for name, file in files.items() if name not in stale for drive in file["drives"]}
-    added, schemas = _write_files(store, place, {drive: wanted[drive] for drive in wanted if drive not in kept})
+    current = {drive for name, file in files.items() if name not in stale for drive in file["drives"]}
+    added, schemas = _write_files(store, place, {drive: wanted[drive] for drive in wanted if drive not in current})
     if not added and not stale and commits:
         return None
     before = commits[-1] if commits else {"version": -1, "id": str(uuid.uuid4()), "schemas": {}}
     if (schemas := schemas or before["schemas"]) == {}:
         raise ResultError(f"{store} has no finished drive yet. Add some: vplog batch LOG... -o {store}")
     known = before["schemas"].get("descriptors", schemas["descriptors"])
-    if kept and schemas["descriptors"] != known:
+    if current and schemas["descriptors"] != known:
         raise ResultError(f"Descriptors in {store} are of several types, for which Delta Lake has no table.")
     removed = {name: files[name] for name in sorted(stale)}
     commit = {

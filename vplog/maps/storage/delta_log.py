@@ -65,7 +65,7 @@ class _Commit(TypedDict):
 
     format: StrictInt
     id: Annotated[str, Field(pattern="^[0-9a-f-]{36}$")]
-    """Of the tables."""
+    """Identity of the tables, the same in all versions."""
     version: StrictInt
     time: StrictInt
     """ms since 1970."""

@@ -108,7 +108,7 @@ def _writing_remote(root: RemotePath) -> Iterator[Store]:
 def follow_with_delta(store: Store, patience_s: float = 0.0, *, begin: bool = False, compact: bool = False) -> Any:
     """Bring the Delta tables of a map that is written to up to its drives, where it has some, or is to `begin`; as
     `delta.update`. Raises ResultError."""
-    if not begin and not delta.is_kept(store):
+    if not begin and not delta.is_present(store):
         return None
     if store.mirror is None:
         return delta.update(store, patience_s, compact=compact)

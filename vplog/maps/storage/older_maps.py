@@ -11,15 +11,12 @@ from __future__ import annotations
 import json
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog.maps.storage import objects
 from vplog.maps.storage.layout import folder_name
 from vplog.storage.json_records import has_checksum
-from vplog.storage.remote_path import names_below, objects_below
-
-if TYPE_CHECKING:
-    from vplog.storage.remote_path import RemotePath
+from vplog.storage.remote_path import RemotePath, names_below, objects_below
 
 NAMES = ("failures.json", "removed.json", "rest.json", "joint.json")
 """Objects that such a map has beside folders."""

@@ -31,7 +31,7 @@ from vplog.storage.scratch import scratch
 _PACK_BYTES = 100_000_000
 """Longest pack. One that holds less than half of it, or of what it held once, is put into a new one."""
 _LEVEL = 9
-"""Of zstd: half a second for 10 MB."""
+"""zstd level: half a second for 10 MB."""
 
 _Member = tuple[str, str, dict[str, Any]]
 """Drive, name of a file, and its entry in the manifest."""

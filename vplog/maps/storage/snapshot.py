@@ -23,7 +23,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from hashlib import sha256
-from typing import TYPE_CHECKING, Annotated, Any, NotRequired, cast
+from pathlib import Path
+from typing import Annotated, Any, NotRequired, cast
 from urllib.parse import unquote
 
 from pydantic import ConfigDict, Field, StrictInt, TypeAdapter, with_config
@@ -38,9 +39,6 @@ from vplog.storage.json_records import has_checksum, with_checksum
 from vplog.storage.parquet_limits import check_version
 from vplog.storage.remote_path import RemotePath, reason
 from vplog.version import __version__
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 STORE_FORMAT, PACKED_FORMAT = FORMAT + 1, FORMAT + 2
 """Versions of this manifest, before and after `map compact`. Before them each drive had its own (older_maps.py)."""

@@ -318,28 +318,28 @@ def vacuum(mirror: Mirror, hours: float) -> dict[str, int]:
     """Remove what was replaced more than `hours` ago, and what no snapshot names and is as old; how many objects and
     bytes. Raises ResultError."""
     snapshot, before = mirror.manifest.now, datetime.now(UTC) - timedelta(hours=hours)
-    kept = {name for name, when in snapshot["replaced"].items() if datetime.fromisoformat(when) > before}
+    needed = {name for name, when in snapshot["replaced"].items() if datetime.fromisoformat(when) > before}
     for drive, entry in snapshot["drives"].items():
         place = f"runs/{folder_name(drive)}/{entry['generation']}"
         if "packed" in entry and datetime.fromisoformat(entry["packed"]) <= before:
-            kept |= {f"{place}/{name}" for name, about in entry["files"].items() if "pack" not in about}
+            needed |= {f"{place}/{name}" for name, about in entry["files"].items() if "pack" not in about}
         else:
-            kept.add(place)
-    kept |= {f"packs/{token}" for token in snapshot.get("packs", {})}
-    kept |= {f"rest/{about['generation']}/{name}" for name, about in snapshot["rest"].items()}
-    kept |= {f"libraries/{digest}" for digest in snapshot["libraries"]}
+            needed.add(place)
+    needed |= {f"packs/{token}" for token in snapshot.get("packs", {})}
+    needed |= {f"rest/{about['generation']}/{name}" for name, about in snapshot["rest"].items()}
+    needed |= {f"libraries/{digest}" for digest in snapshot["libraries"]}
     log = mirror.manifest.log
     recent = [row for row, newer in zip(log[1:], log, strict=False) if datetime.fromisoformat(newer["time"]) > before]
-    kept |= {row["object"] for row in [*log[:1], *recent, *(row for row, _ in mirror.manifest.layers)]}
+    needed |= {row["object"] for row in [*log[:1], *recent, *(row for row, _ in mirror.manifest.layers)]}
     if snapshot.get("by_drive", True):
-        kept |= {f"{name}/{folder_name(drive)}/{name}.parquet" for drive in snapshot["drives"] for name in TABLES}
-    kept |= snapshot["rest"].keys()
+        needed |= {f"{name}/{folder_name(drive)}/{name}.parquet" for drive in snapshot["drives"] for name in TABLES}
+    needed |= snapshot["rest"].keys()
     removed = {"objects": 0, "bytes": 0}
     with store_errors(mirror.remote):
         for name, meta in objects_below(mirror.remote).items():
             parts = name.split("/")
             above = {"/".join(parts[:count]) for count in range(1, len(parts) + 1)}
-            if parts[0] in _OWN and not above & kept and meta["last_modified"] < before:
+            if parts[0] in _OWN and not above & needed and meta["last_modified"] < before:
                 objects.remove(mirror.remote / name)
                 removed = {"objects": removed["objects"] + 1, "bytes": removed["bytes"] + meta["size"]}
 

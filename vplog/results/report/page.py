@@ -101,7 +101,7 @@ class Pictures:
 
 
 @dataclass(frozen=True, eq=False)
-class Question:
+class ClosureQuestion:
     """Neighbouring closures that agree with each other, as one question to a person."""
 
     rows: list[int]
@@ -125,7 +125,7 @@ class Changes:
 
 
 @dataclass(frozen=True, eq=False)
-class Content:
+class ReportContent:
     """A finished run."""
 
     record: dict[str, Any]
@@ -137,12 +137,12 @@ class Content:
     pictures: Pictures
     judged: TruthComparison | None = None
     changes: Changes | None = None
-    questions: list[Question] = field(default_factory=list)
+    questions: list[ClosureQuestion] = field(default_factory=list)
     references: Ints | None = None
     """(N, K) numbers of the references that explain each keyframe, negative for none; None without references."""
 
 
-def page(content: Content) -> str:
+def page(content: ReportContent) -> str:
     """The whole report: the same text for the same run, but for its timings."""
     record, closures, judged = content.record, content.closures, content.judged
     counts = [(verdict, closures.verdict.count(verdict)) for verdict in Verdict]
@@ -175,7 +175,7 @@ def page(content: Content) -> str:
     )
 
 
-def _tiles(content: Content) -> list[tuple[str, str]]:
+def _tiles(content: ReportContent) -> list[tuple[str, str]]:
     """The drive in seven numbers, each with its label."""
     path_m = float(np.linalg.norm(np.diff(content.tracks.after.world_from_body[:, :3, 3], axis=0), axis=1).sum())
     stamps = content.tracks.after.stamp_ns
@@ -206,7 +206,7 @@ def _changes(changes: Changes) -> dict[str, Any]:
     }
 
 
-def _questions(content: Content) -> list[list[Any]]:
+def _questions(content: ReportContent) -> list[list[Any]]:
     """Rows of the table of questions, the ledger row first."""
     closures = content.closures
     return [
@@ -223,7 +223,7 @@ def _questions(content: Content) -> list[list[Any]]:
     ]
 
 
-def _certainty(content: Content) -> list[str]:
+def _certainty(content: ReportContent) -> list[str]:
     """The certificate of global optimality, and the uncertainty of the keyframes' positions."""
     found = [str(reason)] if (reason := mapping(content.record.get("certificate")).get("reason")) else []
     sigma_m = _sigma_m(content.covariance)
@@ -243,7 +243,7 @@ def _sigma_m(covariance: Floats) -> Floats:
     return sigma_m
 
 
-def _over_time(content: Content) -> list[charts.Chart]:
+def _over_time(content: ReportContent) -> list[charts.Chart]:
     """Charts of the drive by its time: height, heading and speed, uncertainty, residuals of closures and error."""
     tracks, closures, judged = content.tracks, content.closures, content.judged
     if len(tracks.after.stamp_ns) < 2:
@@ -284,7 +284,7 @@ def _speed(sample_s: Floats, positions: Floats) -> tuple[Floats, Floats]:
     return times[1:], np.linalg.norm(np.diff(at, axis=0), axis=1) / np.diff(times)
 
 
-def _loss(loss: dict[str, Any], content: Content) -> list[str]:
+def _loss(loss: dict[str, Any], content: ReportContent) -> list[str]:
     """A row of the table of losses: messages, times in s, and the reason."""
     start_ns = int(content.tracks.keyframes.stamp_ns[0]) if len(content.tracks.keyframes.stamp_ns) else 0
     ends = [end for span in _list(loss.get("spans_ns")) for end in span]
@@ -293,7 +293,7 @@ def _loss(loss: dict[str, Any], content: Content) -> list[str]:
     return [loss.get("topic") or "-", figure(loss.get("messages")), figure(loss.get("of")), when, why]
 
 
-def false_closures(content: Content) -> Bools:
+def false_closures(content: ReportContent) -> Bools:
     """(C,) closures in the solution that are false by the truth; none without one."""
     judged = content.judged
     if judged is None or judged.true is None or judged.known is None:
@@ -301,7 +301,7 @@ def false_closures(content: Content) -> Bools:
     return content.closures.of(*USED) & judged.known & ~judged.true
 
 
-def _map(content: Content) -> tuple[list[tuple[str, str]], dict[str, Any]]:
+def _map(content: ReportContent) -> tuple[list[tuple[str, str]], dict[str, Any]]:
     """The legend, and paths and keyframes in m to the right, up and out of the map, which lies along the shortest
     axis."""
     closures, judged, position = content.closures, content.judged, content.tracks.world_from_body[:, :3, 3]
@@ -335,8 +335,8 @@ def _map(content: Content) -> tuple[list[tuple[str, str]], dict[str, Any]]:
         for kind, _, points in paths
     ]
     error = None if judged is None or judged.error_m is None else _rounded(judged.error_m, 3)
-    seen = np.round(position @ view.T, 3).tolist()
-    return legend, {"axes": axes, "paths": flat, "keyframes": seen, "error_m": error}
+    viewed = np.round(position @ view.T, 3).tolist()
+    return legend, {"axes": axes, "paths": flat, "keyframes": viewed, "error_m": error}
 
 
 def _truth(judged: TruthComparison) -> list[list[str]]:
@@ -350,7 +350,7 @@ def _truth(judged: TruthComparison) -> list[list[str]]:
     return [[f"{heading} ({alignment})" if "ATE" in heading else heading, *values] for heading, *values in rows]
 
 
-def _views(content: Content) -> tuple[dict[str, Any], dict[str, str]]:
+def _views(content: ReportContent) -> tuple[dict[str, Any], dict[str, str]]:
     """Views by ledger row, and the references that they show in base64, until the page holds enough bytes of them:
     false closures first, then those of the solution, then those of most inliers."""
     closures, left = content.closures, _MOST_VIEW_BYTES
@@ -369,7 +369,7 @@ def _views(content: Content) -> tuple[dict[str, Any], dict[str, str]]:
     return views, references
 
 
-def _audit(content: Content, drawn: dict[str, Any]) -> dict[str, Any]:
+def _audit(content: ReportContent, drawn: dict[str, Any]) -> dict[str, Any]:
     """Data of the page's script."""
     views, references = _views(content)
     closures, log = content.closures, content.record.get("log")
@@ -411,7 +411,7 @@ def _scales(columns: dict[str, list[Any]], error_m: list[float | None] | None) -
     return found
 
 
-def _columns(content: Content, rows: list[int]) -> dict[str, list[Any]]:
+def _columns(content: ReportContent, rows: list[int]) -> dict[str, list[Any]]:
     """Values of these rows by the name of their column; those of the truth beside the verdict, in view on a phone."""
     closures, judged = content.closures, content.judged
     columns: dict[str, list[Any]] = {"row": rows, "verdict": [closures.verdict[row].value for row in rows]}
@@ -439,7 +439,7 @@ def _rounded(values: Floats | Any, digits: int) -> list[float | None]:
     return [round(value, digits) if np.isfinite(value) else None for value in values.astype(np.float64).tolist()]
 
 
-def _distributions(content: Content) -> list[tuple[str, charts.Chart | None]]:
+def _distributions(content: ReportContent) -> list[tuple[str, charts.Chart | None]]:
     """Distributions of accepted and rejected candidates, with the thresholds of the settings."""
     closures, verify = content.closures, mapping(mapping(content.record.get("settings")).get("verify"))
     metric = mapping(verify.get("metric"))
@@ -458,7 +458,7 @@ def _distributions(content: Content) -> list[tuple[str, charts.Chart | None]]:
     return shown
 
 
-def _references(content: Content) -> dict[str, Any] | None:
+def _references(content: ReportContent) -> dict[str, Any] | None:
     """How often each reference explains a keyframe; None for a recogniser without boxes."""
     library = mapping(content.record.get("library"))
     used = _list(library.get("used"))

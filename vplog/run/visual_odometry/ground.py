@@ -8,15 +8,13 @@ say how such heights hold a monocular scale).
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
+from vplog.data import SCALE_WANDER, Camera, Floats, Ints, Odometry
 from vplog.run.visual_odometry.metres import scaled
-
-if TYPE_CHECKING:
-    from vplog.data import Camera, Floats, Ints, Odometry
 
 _DEPRESSION = np.sin(np.radians(4.0))
 """Sine of the angle below the horizon: what is farther is low by a small error of the pitch alone."""
@@ -34,8 +32,6 @@ _TUNING = 3.0
 _FINEST = 0.01
 """Least relative deviation that is told from zero."""
 _ROUNDS = 40
-_WANDER = 0.01
-"""Standard deviation of the log of the scale after a unit, growing as the root of the way."""
 _ACROSS = 1.0
 """That across a break."""
 _HUBER = 2.0
@@ -98,7 +94,7 @@ def _heights(views: list[Below]) -> tuple[Floats, float]:
 def _smoothed(odometry: Odometry, rows: Ints, measured: Floats, spread: float) -> tuple[Floats, float]:
     """(V,) logs of a scale that wanders slowly, by those measured, and the deviation of these from it."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(odometry.odom_from_body[:, :3, 3], axis=0), axis=1))])
-    sigma = _WANDER * np.sqrt(np.diff(way[rows]) + 1e-6)
+    sigma = SCALE_WANDER * np.sqrt(np.diff(way[rows]) + 1e-6)
     if odometry.breaks is not None:
         pieces = np.searchsorted(odometry.breaks, rows, "right")
         sigma[np.diff(pieces) > 0] = _ACROSS

@@ -7,18 +7,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from vplog.data import Keyframes
+from vplog.data import Camera, Floats, Imu, Keyframes, Odometry
 from vplog.geometry import se3
 from vplog.graph.correct_trajectory import correct_trajectory
 from vplog.graph.inertial import GRAVITY, Solved, States, gyro_bias, preintegrated, solved
 from vplog.run.visual_odometry.metres import scaled
-
-if TYPE_CHECKING:
-    from vplog.data import Camera, Floats, Imu, Odometry
 
 _PERIOD_NS = 190_000_000
 """ns between two states, at least: VINS' keyframes; a double integral over less is noise."""

@@ -4,25 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
-from vplog.data import RECEIVER_SIGMA_M
+from vplog.data import RECEIVER_SIGMA_M, SCALE_WANDER, Camera, Floats, Gps, Ints, Odometry
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
-
-if TYPE_CHECKING:
-    from vplog.data import Camera, Floats, Gps, Ints, Odometry
 
 _APART = 10.0
 """Sigmas of a fix between two that are compared: their distance then is known to a seventh."""
 _REACH = (1, 2, 4, 8)
 """Numbers of such steps over which distances are compared."""
-_WANDER = 0.01
-"""Standard deviation of the log of the scale after a metre, growing as the root of the way: 10 % in 100 m, as a single
-camera's wanders in bends."""
 _TUNING = 2.0
 """Sigmas beyond which a distance counts less (Huber)."""
 _ROUNDS = 15
@@ -117,7 +111,7 @@ def _log_scale(way: _Way, sigma_m: float) -> Floats | None:
     column = np.concatenate([np.arange(a, b) for a, b in pairs.tolist()])
     metres = np.linalg.norm(np.diff(way.enu_m, axis=0), axis=1)
     smooth = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(count - 1, count)).tocsr()
-    smooth = sparse.diags_array(1.0 / (_WANDER * np.sqrt((metres[1:] + metres[:-1]) / 2.0))) @ smooth
+    smooth = sparse.diags_array(1.0 / (SCALE_WANDER * np.sqrt((metres[1:] + metres[:-1]) / 2.0))) @ smooth
     sigma = np.sqrt(2.0) * sigma_m / length
     for _ in range(_ROUNDS):
         moved = np.exp(x)[:, None] * steps
@@ -126,8 +120,8 @@ def _log_scale(way: _Way, sigma_m: float) -> Floats | None:
         reached = np.maximum(np.linalg.norm(chord, axis=1), 1e-9)
         residual = np.log(length / reached) / sigma
         weight = np.sqrt(np.minimum(1.0, _TUNING / np.maximum(np.abs(residual), 1e-9))) / sigma
-        slope = (moved[column] * (chord / reached[:, None])[row]).sum(1) / reached[row]
-        A = sparse.vstack([sparse.csr_array((slope * weight[row], (row, column)), (len(pairs), count)), smooth])
+        gradient = (moved[column] * (chord / reached[:, None])[row]).sum(1) / reached[row]
+        A = sparse.vstack([sparse.csr_array((gradient * weight[row], (row, column)), (len(pairs), count)), smooth])
         b = np.concatenate([residual * sigma * weight, -(smooth @ x)])
         step = sparse.linalg.spsolve((A.T @ A).tocsc(), A.T @ b)
         x = x + np.clip(step, -0.5, 0.5)

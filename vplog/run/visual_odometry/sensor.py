@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
+from vplog.data import Bytes, Camera, Float32s, Floats, Frame
 from vplog.features.sift import depth_at
 from vplog.features.stereo_depth import StereoSettings
 from vplog.loops import undistort
 from vplog.loops.landmarks import LandmarkSettings, for_stereo, inverse_depth
-
-if TYPE_CHECKING:
-    from vplog.data import Bytes, Camera, Float32s, Floats, Frame
 
 _WINDOW = (13, 13)
 """px of the patch that is followed: OpenCV's 21 spans more edges between near and far, and doubles the drift."""

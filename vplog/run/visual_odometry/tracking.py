@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
+from vplog.data import Float32s, Floats, Frame
 from vplog.features.extraction import describe
 from vplog.features.matching import MatchSettings, match_features
 from vplog.features.sift import SiftSettings
@@ -16,11 +16,7 @@ from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.loops.pose_refinement import Matches
 from vplog.loops.verify_metric import MetricSettings, find_pose, log10_false_alarms, refit
-from vplog.run.visual_odometry.sensor import follow
-
-if TYPE_CHECKING:
-    from vplog.data import Float32s, Floats, Frame
-    from vplog.run.visual_odometry.sensor import Points, Sensor
+from vplog.run.visual_odometry.sensor import Points, Sensor, follow
 
 _CORNERS = 300
 """Points of a frame: RTAB-Map's and VINS' 150 to 1000; more cost time, and hardly sharpen a pose."""
@@ -38,7 +34,7 @@ _SINGULAR = 1e12
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class ReferenceFrame:
     """A frame that later ones are followed from."""
 
     frame: Frame
@@ -49,10 +45,10 @@ class Reference:
     free: int
     """The least number that no landmark has."""
 
-    def extended(self, points: Points) -> Reference:
+    def extended(self, points: Points) -> ReferenceFrame:
         """With further points, which are new landmarks."""
         ids = np.concatenate([self.ids, self.free + np.arange(len(points.px))])
-        return Reference(self.frame, ids, self.points.joined(points), self.free + len(points.px))
+        return ReferenceFrame(self.frame, ids, self.points.joined(points), self.free + len(points.px))
 
     @property
     def covariance(self) -> Floats:
@@ -91,7 +87,9 @@ def corners(frame: Frame, taken: Float32s) -> Float32s:
     return np.zeros((0, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2)
 
 
-def track(reference: Reference, frame: Frame, guess: Floats, sensor: Sensor) -> tuple[Reference, Motion] | None:
+def track(
+    reference: ReferenceFrame, frame: Frame, guess: Floats, sensor: Sensor
+) -> tuple[ReferenceFrame, Motion] | None:
     """The motion to a frame: points followed from where `guess`, reference_from_camera, has them, else from where they
     were, else matched as SIFT features, which the reference returned then has, too; None where the frame is lost."""
     for px in (_predicted(reference, guess, sensor), reference.points.px):
@@ -109,7 +107,9 @@ def track(reference: Reference, frame: Frame, guess: Floats, sensor: Sensor) -> 
     return None if motion is None else (extended, motion)
 
 
-def _with_unplaced(motion: Motion, reference: Reference, rows: np.ndarray, observed: Points, sensor: Sensor) -> Motion:
+def _with_unplaced(
+    motion: Motion, reference: ReferenceFrame, rows: np.ndarray, observed: Points, sensor: Sensor
+) -> Motion:
     """The motion with further points: those of the reference without a depth that were followed along the epipolar
     line of the motion."""
     R, t = motion.reference_from_camera[:3, :3], motion.reference_from_camera[:3, 3]
@@ -139,7 +139,7 @@ def rematch(reference: Frame, frame: Frame, sensor: Sensor) -> tuple[Points, Poi
     return first.rows(known), second.rows(known)
 
 
-def solve(reference: Reference, rows: np.ndarray, observed: Points, sensor: Sensor) -> Motion | None:
+def solve(reference: ReferenceFrame, rows: np.ndarray, observed: Points, sensor: Sensor) -> Motion | None:
     """The motion by points `rows` (K,) of the reference, observed in a frame; None where they agree on none."""
     known = np.isfinite(np.column_stack([observed.rays, observed.noise.reshape(-1, 4), reference.points.rho[rows]]))
     valid = np.flatnonzero(known.all(axis=1))
@@ -166,7 +166,7 @@ def solve(reference: Reference, rows: np.ndarray, observed: Points, sensor: Sens
     return Motion(pose, covariance, rows[inlier], observed.rows(inlier), systematic)
 
 
-def _predicted(reference: Reference, guess: Floats, sensor: Sensor) -> Float32s:
+def _predicted(reference: ReferenceFrame, guess: Floats, sensor: Sensor) -> Float32s:
     """(K, 2) px at which the frame shows the landmarks by a guess of its pose; where it does not, as the reference."""
     at = se3.transform(se3.inverse(guess), cloud(_placed(reference.points)))
     px = undistort.project(sensor.camera, at).astype(np.float32)

@@ -108,8 +108,8 @@ def rho_variance(points: Floats, view_centres: Floats, shown: Bools, ray_varianc
     and measure rays of this variance; a million where none adds parallax."""
     ray, rho = points[:, :2] / points[:, 2:], 1.0 / points[:, 2]
     behind = 1.0 - rho * view_centres[:, 2:]
-    slope = (ray * view_centres[:, None, 2:] - view_centres[:, None, :2]) / np.maximum(behind, 0.1)[..., None] ** 2
-    information = (shown * (slope**2).sum(axis=2)).sum(axis=0) / ray_variance
+    jacobian = (ray * view_centres[:, None, 2:] - view_centres[:, None, :2]) / np.maximum(behind, 0.1)[..., None] ** 2
+    information = (shown * (jacobian**2).sum(axis=2)).sum(axis=0) / ray_variance
     return 1.0 / np.maximum(information, 1e-12)
 
 
@@ -121,16 +121,16 @@ def rho_of(rays: Floats, observed: Floats, views: Floats, px: float) -> tuple[Fl
     u (a_z + rho t_z) = a_xy + rho t_xy is linear in rho.
     """
     shown: Bools = np.asarray(np.isfinite(observed).all(axis=2))
-    seen = np.where(shown[..., None], observed, 0.0)
+    known = np.where(shown[..., None], observed, 0.0)
     turned = np.column_stack([rays, np.ones(len(rays))]) @ np.swapaxes(views[:, :3, :3], 1, 2)
     moved = views[:, None, :3, 3]
-    a = np.where(shown[..., None], moved[..., :2] - seen * moved[..., 2:], 0.0)
-    b = np.where(shown[..., None], seen * turned[..., 2:] - turned[..., :2], 0.0)
+    a = np.where(shown[..., None], moved[..., :2] - known * moved[..., 2:], 0.0)
+    b = np.where(shown[..., None], known * turned[..., 2:] - turned[..., :2], 0.0)
     weight = (a**2).sum(axis=(0, 2))
     rho = (a * b).sum(axis=(0, 2)) / np.maximum(weight, 1e-18)
     depth = turned[..., 2:] + rho[:, None] * moved[..., 2:]
     with np.errstate(divide="ignore", invalid="ignore"):
-        missed = np.linalg.norm((turned[..., :2] + rho[:, None] * moved[..., :2]) / depth - seen, axis=2)
+        missed = np.linalg.norm((turned[..., :2] + rho[:, None] * moved[..., :2]) / depth - known, axis=2)
     good = (~shown | ((missed < 3.0 * px) & (depth[..., 0] > 0))).all(axis=0) & shown.any(axis=0)
     variance = px**2 / np.maximum(weight, 1e-18)
     return np.where(good, rho, np.nan), variance

@@ -10,26 +10,18 @@ of the window make its depth sure.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import Odometry
+from vplog.data import Camera, Float32s, Floats, Frame, Odometry
 from vplog.geometry import se3
 from vplog.graph.bundle import Observations, adjust
-from vplog.run.visual_odometry.ground import below, by_height
-from vplog.run.visual_odometry.sensor import Sensor, follow
-from vplog.run.visual_odometry.tracking import Reference, cloud, corners, solve, track
+from vplog.run.visual_odometry.ground import Below, below, by_height
+from vplog.run.visual_odometry.sensor import Points, Sensor, follow
+from vplog.run.visual_odometry.tracking import Motion, ReferenceFrame, cloud, corners, solve, track
 from vplog.run.visual_odometry.two_views import CERTAINTY, rho_of, rho_variance, two_views
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from vplog.data import Camera, Float32s, Floats, Frame
-    from vplog.run.visual_odometry.ground import Below
-    from vplog.run.visual_odometry.sensor import Points
-    from vplog.run.visual_odometry.tracking import Motion
 
 _WINDOW = 8
 """References that are adjusted together: as libviso's and VINS' 5 to 10; what is older hardly shares a landmark."""
@@ -96,7 +88,7 @@ class _Tracker:
 
     sensor: Sensor
     height_m: float | None = None
-    """Of the camera over the ground, where it gives a camera without depth its metres."""
+    """Height of the camera over the ground, where it gives a camera without depth its metres."""
     below: list[Below] = field(default_factory=list)
     """Landmarks below the camera in each view, where its height is known."""
     stamp_ns: list[int] = field(default_factory=list)
@@ -108,7 +100,7 @@ class _Tracker:
     views: list[_View] = field(default_factory=list)
     breaks: list[int] = field(default_factory=list)
     """Rows of frames at which a piece begins, but for the first."""
-    reference: Reference | None = None
+    reference: ReferenceFrame | None = None
     start: _Start | None = None
     window: deque[tuple[int, np.ndarray, Points]] = field(default_factory=lambda: deque(maxlen=_WINDOW))
     """View, landmarks and measurements of the last references of this piece."""
@@ -180,7 +172,7 @@ class _Tracker:
             variance = rho_variance(found.first, centre[None], shown, ray_variance)
             points = replace(first, rays=found.first[:, :2] / found.first[:, 2:], rho=1.0 / found.first[:, 2])
             ids = self._free() + np.arange(len(rows))
-            reference = Reference(start.frame, ids, replace(points, variance=variance), int(ids[-1]) + 1)
+            reference = ReferenceFrame(start.frame, ids, replace(points, variance=variance), int(ids[-1]) + 1)
             motion = solve(reference, np.arange(len(rows)), observed.rows(found.rows), self.sensor)
             if motion is not None:
                 self._begin(start, rows, reference, first)
@@ -189,7 +181,7 @@ class _Tracker:
                 return
         start.passed(frame.stamp_ns, observed)
 
-    def _begin(self, start: _Start, rows: np.ndarray, reference: Reference, measured: Points) -> None:
+    def _begin(self, start: _Start, rows: np.ndarray, reference: ReferenceFrame, measured: Points) -> None:
         """Add the first view, and the frames between it and the second one, by the points `rows` of the start."""
         view = self._first_view(start.frame.stamp_ns)
         at = se3.transform(view.world_from_camera, cloud(reference.points))
@@ -201,7 +193,7 @@ class _Tracker:
             if len(both) and (motion := solve(reference, mine, observed.rows(theirs), self.sensor)) is not None:
                 self._add_frame(stamp_ns, motion)
 
-    def _add_view(self, frame: Frame, reference: Reference, motion: Motion) -> None:
+    def _add_view(self, frame: Frame, reference: ReferenceFrame, motion: Motion) -> None:
         """Make a tracked frame the next reference, and adjust the window."""
         ids, points = reference.ids[motion.rows], motion.points
         new = self._usable(frame, corners(frame, points.px))
@@ -270,7 +262,7 @@ class _Tracker:
             result[row, mine] = points.rays[theirs]
         return result
 
-    def _extend(self, reference: Reference) -> None:
+    def _extend(self, reference: ReferenceFrame) -> None:
         """Give the newest view the points that were matched since."""
         view, ids, points = self.window[-1]
         more = np.flatnonzero(~np.isin(reference.ids, ids))
@@ -304,7 +296,7 @@ class _Tracker:
             self.world.update(zip(landmarks.tolist(), found.points, strict=True))
         self.world = {number: self.world[number] for number in often[placed].tolist()}
 
-    def _reference(self, frame: Frame) -> Reference:
+    def _reference(self, frame: Frame) -> ReferenceFrame:
         """The newest view, its landmarks by all views that show them."""
         view, ids, points = self.window[-1]
         pose = self.views[view].world_from_camera
@@ -318,13 +310,13 @@ class _Tracker:
                 sure = estimated.rho > CERTAINTY * np.sqrt(estimated.variance)
                 found = below(self.views[view].row, cloud(estimated.rows(np.flatnonzero(sure))), self.sensor.camera)
                 self.below.append(found)
-            return Reference(frame, ids, estimated, self._free())
+            return ReferenceFrame(frame, ids, estimated, self._free())
         shown = np.concatenate([other for _, other, _ in self.window])
         times = (np.sort(shown).searchsorted(ids, "right") - np.sort(shown).searchsorted(ids, "left")).clip(1)
         own = np.where(np.isfinite(points.variance), points.variance, np.nanmedian(points.variance))
         rho = 1.0 / at[:, 2]
         estimated = type(points)(points.px, at[:, :2] * rho[:, None], points.noise, rho, own / times)
-        return Reference(frame, ids, estimated, self._free())
+        return ReferenceFrame(frame, ids, estimated, self._free())
 
     def _estimated(self, ids: np.ndarray, points: Points, at: Floats) -> Points:
         """The points with the depths of their landmarks at (K, 3) in the newest view, and the variance by parallax."""
@@ -338,7 +330,7 @@ class _Tracker:
         variance[known] = rho_variance(at[known], centres, shown, ray_variance)
         return replace(points, rays=rays, rho=rho, variance=variance)
 
-    def _is_far(self, reference: Reference, motion: Motion) -> bool:
+    def _is_far(self, reference: ReferenceFrame, motion: Motion) -> bool:
         flow = np.linalg.norm(motion.points.px - reference.points.px[motion.rows], axis=1)
         few = len(motion.rows) < _SHARED * len(reference.ids)
         return few or float(np.median(flow)) > _FLOW * self.sensor.camera.width

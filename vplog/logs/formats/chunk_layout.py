@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import BinaryIO
 
 from vplog.errors import plural
-from vplog.logs.formats.container import Contents, by_topic, topics_of
-from vplog.logs.formats.loss_account import confirmed_span, main_span
-
-if TYPE_CHECKING:
-    import re
-    from collections.abc import Callable, Mapping
-    from typing import BinaryIO
-
-    from vplog.logs.formats.container import Channel, Notes
-    from vplog.logs.formats.loss_account import Span
+from vplog.logs.formats.container import Channel, Contents, Notes, by_topic, topics_of
+from vplog.logs.formats.loss_account import Span, confirmed_span, main_span
 
 MOST_GAPS = 1000
 """Damaged places in one file behind which reading goes on; a file with more is read up to there."""

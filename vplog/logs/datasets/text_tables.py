@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
-from vplog.data import Trajectory
+from vplog.data import Floats, Ints, Trajectory
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.tf_odometry import are_usable
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from vplog.data import Floats, Ints
 
 _LINE_LIMIT = 65536
 """Characters; a line of COLMAP's images.txt has some thousand, and a file without line ends is not read whole."""
