@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -21,8 +21,8 @@ def test_a_drive_whose_references_are_recognised_gets_no_more(monkeypatch: pytes
 
     monkeypatch.setattr(reference_library, "_extracted", extracted)
     monkeypatch.setattr(reference_library, "lacking", lambda *_: {"tower"})
-    first, pipeline = [np.arange(0, 400, 40)] * 2, SimpleNamespace(library=LibrarySettings())
+    first, pipeline = [np.arange(0, 400, 40)] * 2, cast("Any", SimpleNamespace(library=LibrarySettings()))
     references = extracted(opened, first)
-    reference_library._add_until_enough(references, opened, first, pipeline, Execution())  # pyrefly: ignore
+    reference_library._add_until_enough(references, opened, first, pipeline, Execution())
     drives = [one.drive for one in references]
     assert (drives.count("street"), drives.count("tower")) == (10, 90), "an eighth of all frames at most"
