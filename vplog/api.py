@@ -317,8 +317,8 @@ def compare(
     truth: `index` (equal numbers in file names or of frames, within `tolerance`), FILE.csv (`query,match` or
     `image,label`), FILE.npy, `labels` (folders), `utm` (file names), FILE.tum, `poses` or `gps` (within `distance_m`
     and `heading_deg`); None for answers without scores.
-    library: a log or a library of reference images, None for `library_size` images of the map drive: 100 where it is
-    None, too, and more where places look alike.
+    library: a log or a library of reference images, None for `library_size` images of the map drive: where it is None,
+    too, all of them, 1600 at most, and of a drive in its own past 100, and more where places look alike.
     sequence: also match windows of so many frames.
     out: a local folder for compare.json, answers.csv, scores and figures.
     cache, cache_gb: folder and largest size in 10^9 bytes of the cache of features, None for the user's.

@@ -193,6 +193,16 @@ class BoxState(PlaceState, Protocol):
 
 
 @runtime_checkable
+class EvidenceState(PlaceState, Protocol):
+    """A recogniser that weighs several kinds of evidence, and not everywhere alike."""
+
+    def evidence(self, query: Any, match: Any) -> str:
+        """What most of the score of two places is of: `keypoints`, `keypoints and patches`, `patches` or `words`; empty
+        where they have nothing in common."""
+        ...
+
+
+@runtime_checkable
 class CodedState(PlaceState, Protocol):
     """A recogniser whose places are short codes, which a map indexes by inverted lists on disk."""
 

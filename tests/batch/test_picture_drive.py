@@ -47,6 +47,7 @@ def test_pictures_are_put_into_a_map_and_found(pictures: Path, tmp_path: Path, v
     right = sum(match == f"place {at}/view_{at}.png" for at, (_, match) in enumerate(names))
     assert [query for query, _ in names] == [f"view_{number}.png" for number in range(FRAMES)]
     assert right >= FRAMES - 2
+    assert all(one["evidence"].startswith("keypoints") for one in answers["answers"])
     assert "place 3/view_3.png" in verb("map", "query", root, pictures / "dusk").out
     assert verb("map", "info", root, "--check").code == 0
     assert verb("map", "export", root, "-o", tmp_path / "places.parquet").code == 0

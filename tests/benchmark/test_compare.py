@@ -311,6 +311,10 @@ def test_files_are_the_same_every_time(verb: Verb, traversals: tuple[Path, Path]
         "scores-02-paper_partitions=5.npz",
         "similarity.png",
     ]
+    rows = csv.DictReader((outs[0] / "answers.csv").open())
+    assert {row["evidence"] for row in rows if row["method"] == "bobb" and row["match"]} <= {
+        "keypoints", "keypoints and patches",
+    }  # fmt: skip
     for name in set(names) - {"compare.json"}:
         assert (outs[0] / name).read_bytes() == (outs[1] / name).read_bytes()
     records = [read_run_json(out / "compare.json") for out in outs]
@@ -343,6 +347,7 @@ def test_a_row_for_every_query(verb: Verb, traversals: tuple[Path, Path], tmp_pa
     assert np.mean(right) == pytest.approx(found["methods"]["thumbnail"]["r_at_1"])
     assert [row["right"] for row in single if row["true_name"]] == ["true" if one else "false" for one in right]
     assert all((row["rank"] == "1") == (row["right"] == "true") for row in single)
+    assert not any(row["evidence"] for row in rows), "there is one kind"
 
 
 def test_without_a_truth_there_are_answers(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:

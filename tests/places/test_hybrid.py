@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +30,13 @@ SMALL = HybridSettings(bobb=BobbSettings(references=4, features=250), words=4)
 @pytest.fixture(scope="module")
 def hybrid(references: list[Reference]) -> HybridState:
     return SMALL.learn(references, Execution(2))
+
+
+def test_evidence_is_the_larger_part_of_the_score(hybrid: HybridState, references: list[Reference]) -> None:
+    place, other = (hybrid.describe(references[row].features) for row in (0, 1))
+    for share, expected in ((0.0, hybrid.bobb.evidence(place, other)), (1.0, "words")):
+        state = HybridState(hybrid.settings, hybrid.references, hybrid.bobb, hybrid.vlad, share)
+        assert state.evidence(place, replace(other, signs=place.signs)) == expected
 
 
 class NoBoxes:

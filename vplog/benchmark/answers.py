@@ -20,12 +20,14 @@ if TYPE_CHECKING:
 
 COLUMNS = pa.schema({
     "method": pa.string(), "query": pa.int64(), "query_name": pa.string(), "match": pa.int64(),
-    "match_name": pa.string(), "score": pa.float32(), "p_match": pa.float32(), "right": pa.bool_(),
+    "match_name": pa.string(), "score": pa.float32(), "p_match": pa.float32(), "evidence": pa.string(),
+    "right": pa.bool_(),
     "rank": pa.int64(), "true": pa.int64(), "true_name": pa.string(),
 })  # fmt: skip
 """Frame numbers and file names of the query, its best answer and its true match that scores most; `rank` of that match,
-1 the best, means over rows of equal score rounded up. Empty where there is none: no answer, no match in the map, no
-truth, no file names, no probability."""
+1 the best, means over rows of equal score rounded up; `evidence` is what most of the score is of, see
+`stages.EvidenceState`. Empty where there is none: no answer, no match in the map, no truth, no file names, no
+probability, a method with one kind of evidence."""
 
 
 def answers_table(method: str, ranks: Ranks, query: Traversal, other: Traversal) -> pa.Table:
@@ -45,6 +47,7 @@ def answers_table(method: str, ranks: Ranks, query: Traversal, other: Traversal)
         *of_map(ranks.top_row),
         pa.array(ranks.top_score, mask=~answered),
         pa.array(probability.astype(np.float32), mask=np.isnan(probability)),
+        pa.array([one or None for one in ranks.evidence or [""] * len(query)], pa.string()),
         pa.array(ranks.top_true > 0.5, mask=~positive),
         pa.array(rank, mask=~positive),
         *of_map(ranks.true_row),

@@ -33,8 +33,10 @@ from vplog.execution.execution import Execution, logged_warnings
 from vplog.logs import EVERY_IMAGE
 from vplog.pipeline import Pipeline
 from vplog.places.library_files import check_descriptors, load_references, references_hash
+from vplog.places.network_vector import OnnxSettings
+from vplog.places.plugin import PluginSettings
 from vplog.places.reference_choice import FRAMES_A_REFERENCE, PAPER_SIZE, LibrarySettings, choose
-from vplog.places.self_recognition import NO_IMAGE, add_until_enough
+from vplog.places.self_recognition import MOST, NO_IMAGE, add_until_enough
 from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record
 from vplog.results.staging import check_contents, staged
@@ -62,7 +64,8 @@ class CompareOptions:
     library: Path | None = None
     """A drive, or a saved library; None for the map."""
     library_size: int | None = None
-    """None for the paper's 100, and more of a map whose places look alike, see `places.self_recognition`."""
+    """None for all frames of the map, 1600 at most. Of a drive in its own past, the paper's 100, and more where places
+    look alike, see `places.self_recognition`."""
     library_seed: int = 0
     min_gap: int | None = None
     """Frames that a match is older, at least, in a drive compared with itself."""
@@ -102,7 +105,8 @@ def compare(
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=".vplog-", dir=made)))
         drives = _open(query, other, truth, pipeline, options, scratch, execution)
         warnings += check_truth(drives.known, drives.query_log, drives.map_log, options.min_gap)  # before the long part
-        map_traversal, query_traversal, references, notes = drives.extract_all()
+        images = any(isinstance(one, OnnxSettings | PluginSettings) for one in recognisers.values())
+        map_traversal, query_traversal, references, notes = drives.extract_all(images)
         warnings += notes
         check_descriptors(references, map_traversal.store[0])
         stops = candidate_stops(query_traversal.frames, map_traversal.frames, options.min_gap)
@@ -161,8 +165,9 @@ class _Drives:
         made = FeatureFolder.of(folder, path, self.options.topics, self.pipeline.features)
         return extract_traversal(log, self.pipeline.features, made, frames, self.execution)
 
-    def extract_all(self) -> tuple[Traversal, Traversal, list[Reference], list[str]]:
-        """Traversals of the map and the query (one object for a drive against itself), the references, and warnings."""
+    def extract_all(self, images: bool) -> tuple[Traversal, Traversal, list[Reference], list[str]]:
+        """Traversals of the map and the query (one object for a drive against itself), the references, with their
+        images where these count, and warnings."""
         source, known, options = self.source, self.known, self.options
         map_traversal = query_traversal = self.traversal_of(self.other, self.map_log, known.map_frames)
         if self.query_log is not self.map_log:
@@ -170,15 +175,16 @@ class _Drives:
         warnings = list(dict.fromkeys(map_traversal.warnings + query_traversal.warnings))
         if isinstance(source, list):
             return map_traversal, query_traversal, source, warnings
-        size = options.library_size or PAPER_SIZE
+        itself = self.query_log is self.map_log
+        size = options.library_size or (PAPER_SIZE if itself or source is not None else MOST)
         wanted = LibrarySettings(choose="random", size=size, seed=options.library_seed)
         if source is None or self.library is None:
             rows = self._reference_rows(map_traversal, wanted)
-            references = references_of(map_traversal, map_traversal.frames[rows])
+            references = references_of(map_traversal, map_traversal.frames[rows], images)
         else:
             chosen = choose(source.stamps(), wanted)
             traversal = self.traversal_of(self.library, source, chosen)
-            references = references_of(traversal, chosen)
+            references = references_of(traversal, chosen, images)
             warnings += traversal.warnings
         if options.library_size is not None and size > len(references):
             warnings.append(
@@ -187,13 +193,13 @@ class _Drives:
         return map_traversal, query_traversal, references, warnings
 
     def _reference_rows(self, traversal: Traversal, wanted: LibrarySettings) -> Ints:
-        """Rows of the map's frames that become references: all of them at most, of a drive in its own past fewer."""
-        itself = self.query_log is self.map_log
+        """Rows of the map's frames that become references; of a drive in its own past an eighth of them at most, unless
+        their number is given."""
 
         def reference(row: int) -> Reference:
             return Reference(NO_IMAGE, traversal.store[row], traversal.name, int(traversal.stamp_ns[row]))
 
-        stamp_ns, most = traversal.stamp_ns, len(traversal) // (FRAMES_A_REFERENCE if itself else 1)
+        stamp_ns, most = traversal.stamp_ns, len(traversal) // FRAMES_A_REFERENCE
         rows = choose(stamp_ns, wanted)
         if self.options.library_size is None:
             rows = add_until_enough(rows, stamp_ns, wanted, most, reference, self.execution)

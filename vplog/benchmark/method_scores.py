@@ -25,7 +25,7 @@ from vplog.execution.execution import Execution
 from vplog.loops.match_probability import match_probabilities
 from vplog.places.sequence import SequenceSettings, sequence_rows
 from vplog.places.views import views_of
-from vplog.stages import FrameState, PlaceIndex, PlaceState, ProbableIndex, StoredState
+from vplog.stages import EvidenceState, FrameState, PlaceIndex, PlaceState, ProbableIndex, StoredState
 
 if TYPE_CHECKING:
     from vplog.benchmark.traversals import Traversal
@@ -92,6 +92,9 @@ def evaluate_method(
     scores = score_table(len(queries), len(index), inputs.scratch, "scores")
     query_ms = search(index, queries, stops, scores, execution)
     ranks = ranked(scores, truth, stops)
+    if isinstance(state, EvidenceState):
+        found = zip(queries, ranks.top_row.tolist(), strict=True)
+        ranks = replace(ranks, evidence=["" if row < 0 else state.evidence(one, places[row]) for one, row in found])
     traversals = [map_traversal] if query_traversal is map_traversal else [map_traversal, query_traversal]
     of_features = not isinstance(state, FrameState | StoredState)
     feature_ms = of_features * float(np.median(np.concatenate([traversal.feature_ms for traversal in traversals])))

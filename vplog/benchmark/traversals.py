@@ -11,6 +11,7 @@ from vplog.data import Bytes, Floats, Ints, Reference
 from vplog.errors import LogError
 from vplog.execution.execution import Execution
 from vplog.geometry.masking import masked
+from vplog.places.self_recognition import NO_IMAGE
 
 if TYPE_CHECKING:
     from vplog.benchmark.feature_cache import FeatureFolder
@@ -73,11 +74,13 @@ def extract_traversal(
     return Traversal(log, store, numbers, stamp_ns, named, np.array(store.cpu_ms), warnings)
 
 
-def references_of(traversal: Traversal, numbers: Ints) -> list[Reference]:
-    """The frames with these numbers as reference images, without those that cannot be decoded. Raises LogError."""
+def references_of(traversal: Traversal, numbers: Ints, images: bool = True) -> list[Reference]:
+    """The frames with these numbers as references, without those that cannot be decoded; their images are not read
+    again unless they count. Raises LogError."""
     log, rows = traversal.log, np.flatnonzero(np.isin(traversal.frames, numbers))
     stamp_ns = traversal.stamp_ns[rows]
-    found = zip(images_at(log, stamp_ns), rows.tolist(), stamp_ns.tolist(), strict=True)
+    shown = images_at(log, stamp_ns) if images else [NO_IMAGE] * len(rows)
+    found = zip(shown, rows.tolist(), stamp_ns.tolist(), strict=True)
     return [Reference(image, traversal.store[row], log.name, stamp) for image, row, stamp in found]
 
 

@@ -5,6 +5,7 @@ Each figure is its mean over all orders of rows of equal score. Candidates witho
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -46,6 +47,8 @@ class Ranks:
     """(Q,) the true row that scores most, the earliest of several; -1 where the query has none."""
     p_match: Floats | None = None
     """(Q,) probability that the answer is right, NaN without an answer; None where none is stated."""
+    evidence: Sequence[str] | None = None
+    """Of each query, what most of its answer's score is of; empty without an answer. None where there is one kind."""
 
 
 @dataclass(frozen=True, eq=False)

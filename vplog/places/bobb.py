@@ -22,9 +22,17 @@ from vplog.places import expected_votes
 from vplog.places.code_search import BLOCK, CodeIndex, CodeLists, Pairing, Place, build_lists
 from vplog.places.columns import RecordState, from_column, to_column
 from vplog.places.library_files import RelearnedSettings
-from vplog.places.matches import PATCH_WEIGHT, Matcher, Matches, Once, WeighedMatchSettings, index_references
+from vplog.places.matches import (
+    PATCH_WEIGHT,
+    KindWeights,
+    Matcher,
+    Matches,
+    Once,
+    WeighedMatchSettings,
+    index_references,
+)
 from vplog.places.overlap import list_shared
-from vplog.places.self_recognition import patches_mislead
+from vplog.places.self_recognition import misleading_patches
 
 NOBODY = 65_535
 """The number of no reference, where fewer than J share anything."""
@@ -111,38 +119,44 @@ class BobbSettings(WeighedMatchSettings, RelearnedSettings):
     def prepare(self, references: Iterable[Reference], execution: Execution) -> BobbState:
         """`learn` without the index, which the first image to describe makes: comparing places needs none."""
         matcher = index_references(references, self)
+        if isinstance(self.patch_weight, tuple) and len(self.patch_weight) != len(matcher):
+            raise LibraryError(
+                f"places.patch_weight has {len(self.patch_weight)} numbers for {len(matcher)} reference images. "
+                "Give one for each, or a single one."
+            )
         if len(matcher) >= NOBODY:
             raise LibraryError(
                 f"A library may have {NOBODY - 1} reference images, this one {len(matcher)}. Set library.size lower."
             )
 
-        def votes(weights: tuple[float, float]) -> Floats:
+        def votes(weights: KindWeights) -> Floats:
             found = execution.map(lambda one: matcher.match(one.features, weights).votes(), matcher.references)
             return np.array(list(found))
 
         def weights() -> Weights:
             if self.patch_weight is not None:
-                return Weights.of((1.0, self.patch_weight), votes((1.0, self.patch_weight)), self.popularity)
+                given = np.broadcast_to(self.patch_weight, len(matcher))
+                return Weights.of(given, votes((1.0, given)), self.popularity)
             keypoints, patches = votes((1.0, 0.0)), votes((0.0, 1.0))
-            used = 0.0 if patches_mislead(keypoints, patches, matcher.references) else PATCH_WEIGHT
-            return Weights.of((1.0, used), keypoints + used * patches, self.popularity)
+            used = np.where(misleading_patches(keypoints, patches, matcher.references), 0.0, PATCH_WEIGHT)
+            return Weights.of(used, keypoints + used * patches, self.popularity)
 
         return BobbState(self, matcher, Once(weights))
 
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """Weights of the kinds of matches and of the references, by a library's own images."""
+    """Weights of the references, by a library's own images."""
 
-    kinds: tuple[float, float]
-    """Weight of a match of keypoints, and of one of patches."""
+    patches: Floats
+    """(L,) weight of a match of patches on each; one of keypoints weighs 1."""
     rarity: Floats
     """(L,) weight of each reference."""
 
     @classmethod
-    def of(cls, kinds: tuple[float, float], votes: Floats, popularity: float) -> Weights:
+    def of(cls, patches: Floats, votes: Floats, popularity: float) -> Weights:
         """With the votes (L, L) of each reference for the others."""
-        return cls(kinds, _rarity(votes / np.maximum(votes.sum(axis=1, keepdims=True), 1e-9), popularity))
+        return cls(patches, _rarity(votes / np.maximum(votes.sum(axis=1, keepdims=True), 1e-9), popularity))
 
 
 def _rarity(explained: Floats, power: float) -> Floats:
@@ -187,7 +201,7 @@ class BobbState(RecordState):
         references = np.full(s.references, NOBODY, np.uint16)
         weights = np.zeros(s.references, np.uint8)
         boxes = np.full((s.references, s.boxes), NOWHERE, np.uint8)
-        matches = self.matcher.match(features, self.weights().kinds)
+        matches = self.matcher.match(features, (1.0, self.weights().patches))
         for j, (reference, share, here, there, agreed) in enumerate(self._retrieve(matches)):
             references[j], weights[j] = reference, max(round(255 * share**s.share_power), 1)
             boxes[j] = expected_votes.best_boxes(
@@ -246,7 +260,7 @@ class BobbState(RecordState):
 
     def voting_maps(self, features: Features, references: Sequence[int]) -> list[Floats]:
         """(36, 64) expected vote at the middle of every cell, by the closed form of `expected_votes`."""
-        matches = self.matcher.match(features, self.weights().kinds)
+        matches = self.matcher.match(features, (1.0, self.weights().patches))
         return [self._voting_map(matches, reference) for reference in references]
 
     def _voting_map(self, matches: Matches, reference: int) -> Floats:
@@ -281,8 +295,9 @@ class BobbState(RecordState):
         return build_lists(references, weights, boxes, len(self.matcher), BLOCK)
 
     def subset(self, references: Ints, execution: Execution) -> BobbState:
-        """The recogniser with some of the references alone, in their order, and the weight of patches as it is."""
-        settings = self.settings.model_copy(update={"patch_weight": self.weights().kinds[1]})
+        """The recogniser with some of the references alone, in their order, and the weights of patches as they are."""
+        patch_weight = tuple(self.weights().patches[references].tolist())
+        settings = self.settings.model_copy(update={"patch_weight": patch_weight})
         return settings.prepare([self.references[row] for row in references.tolist()], execution)
 
     def on_subset(self, column: pa.Array, references: Ints) -> pa.Array:
@@ -313,6 +328,18 @@ class BobbState(RecordState):
             return overlap, overlap * weights[rows, ranks] * weights[others, other_ranks]
 
         return list_shared(np.where(references == NOBODY, -1, references.astype(np.int64)), query, match, compare)
+
+    def evidence(self, query: Place, match: Place) -> str:
+        """Kinds of features that the references count which most of the score of two places is of."""
+        shared, mine, theirs = np.intersect1d(query.references, match.references, return_indices=True)
+        known = shared != NOBODY
+        worth = query.weights[mine[known]].astype(np.int64) * match.weights[theirs[known]]
+        if not worth.any():
+            return ""
+        if self.settings.features == 0:
+            return "patches"
+        used = self.weights().patches[shared[known]] > 0
+        return "keypoints and patches" if 2 * worth[used].sum() > worth.sum() else "keypoints"
 
     def checked(self, fields: Sequence[Any]) -> list[Any]:
         """Raises LibraryError where there is no such box, too."""

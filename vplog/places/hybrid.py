@@ -229,6 +229,13 @@ class HybridState(ReferencesState):
     def index(self, descriptors: Sequence[HybridPlace]) -> HybridIndex:
         return HybridIndex(self.bobb.index(descriptors), self.signs(descriptors), self.share)
 
+    def evidence(self, query: HybridPlace, match: HybridPlace) -> str:
+        """`words` where their signs are more of the score of two places than the boxes."""
+        boxes, words = self.index([match]).alike(query)
+        if self.share * words[0] > (1 - self.share) * boxes[0]:
+            return "words"
+        return self.bobb.evidence(query, match)
+
     def to_arrow(self, descriptors: Sequence[HybridPlace]) -> pa.Array:
         return to_column(self.arrow_type, iter((*self.bobb.arrays(descriptors), self.signs(descriptors))))
 

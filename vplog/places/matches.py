@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypeVar
 
 import numba
 import numpy as np
@@ -26,6 +26,8 @@ from vplog.settings import Settings
 PATCH_WEIGHT = 2.0
 """Weight of a patch's match where patches are used: 169 of them then weigh about as much as 400 keypoints, on the
 images of a library among themselves."""
+KindWeights = tuple[float, float | Floats]
+"""Weight of a match of keypoints, and of one of patches, of which each of the L references may have its own (L,)."""
 Described = tuple[Float32s, Float32s]
 """Descriptors (M, 128), whole numbers 0..255, and (M, 2) points as shares of the image's sides."""
 
@@ -56,9 +58,10 @@ class WeighedMatchSettings(Settings):
     grain that another camera, resolution or light does not show again."""
     root_sift: bool = True
     """Compare the roots of descriptors (Arandjelovic & Zisserman 2012) instead of the descriptors."""
-    patch_weight: float | None = Field(default=None, ge=0)
-    """A patch's match weighs this many times a keypoint's; 0 uses keypoints alone. None takes 2, or 0 where storeys or
-    aisles of one layout mislead patches, as the library's own images show (see vplog/places/self_recognition.py)."""
+    patch_weight: Annotated[float, Field(ge=0)] | tuple[Annotated[float, Field(ge=0)], ...] | None = None
+    """A patch's match weighs this many times a keypoint's; 0 uses keypoints alone. A number for each reference, or one
+    for all. None takes 2, and 0 on references where storeys or aisles of one layout mislead patches, as the library's
+    own images show (see vplog/places/self_recognition.py)."""
     neighbours: int = Field(default=24, ge=2)
     """Nearest library features looked at for each feature; the last one sets the scale of the others' distances."""
     reach: float = Field(default=0.8, gt=0)
@@ -124,12 +127,12 @@ class Matcher:
         graph = hnsw(np.concatenate(values), s.hnsw_links, s.hnsw_ef_construction, s.neighbours)
         return Indexed(owner, np.concatenate(points), graph)
 
-    def match(self, features: Features, weights: tuple[float, float] = (1.0, PATCH_WEIGHT)) -> Matches:
+    def match(self, features: Features, weights: KindWeights = (1.0, PATCH_WEIGHT)) -> Matches:
         """Matches of an image, those of keypoints and those of patches with these weights; none of a kind with 0."""
         s, L = self.settings, len(self.references)
         found = []
         for kind, described, times in zip(self.indexed(), (keypoints_of, patches_of), weights, strict=True):
-            if kind is not None and times > 0:
+            if kind is not None and np.any(times):
                 values, points = described(features, s)
                 if len(values):
                     found.append((kind, times, points, *kind.graph.search(values, s.neighbours)))
@@ -138,8 +141,10 @@ class Matcher:
         parts = [(np.zeros(0, np.int32), none, none, none[:, 0])]
         for kind, times, points, distance, entry in found:
             feature, library, weight = _weigh(distance, entry, kind.owner, L, itself, s.reach)
-            weight *= np.float32(times)
-            parts.append((kind.owner[library], points[feature], kind.points[library], weight))
+            weight *= np.broadcast_to(np.float32(times), L)[kind.owner[library]]
+            counts = weight > 0
+            feature, library = feature[counts], library[counts]
+            parts.append((kind.owner[library], points[feature], kind.points[library], weight[counts]))
         owner, here, there, weight = map(np.concatenate, zip(*parts, strict=True))
         order = np.argsort(owner, kind="stable")
         start = np.searchsorted(owner[order], np.arange(L + 1)).astype(np.int32)

@@ -25,7 +25,7 @@ class LibrarySettings(Settings):
     """How: `random` frames, as the paper (section IV); `spread`, evenly along the drive; `coverage`, those that
     explain the other frames best (see vplog/places/coverage.py), which looks at the drive first."""
     size: int | None = Field(default=None, ge=1, le=1_000_000)
-    """L: how many. None takes the paper's 100, and more, to 1600, as long as too few of them are recognised by their
+    """L: how many. None takes the paper's 100, and more, to 1600, of drives of which too few are recognised by their
     neighbours (see vplog/places/self_recognition.py), as in storeys that look alike; of a drive by itself every eighth
     keyframe at most: were every other frame a reference, the four that explain a frame would be its neighbours in time,
     which a later visit shares with nobody. With `coverage` None takes as many as explain the drive, 8 to 100, see

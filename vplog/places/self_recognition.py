@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy
 
 from vplog.data import Bools, Floats, Ints, Reference
 from vplog.places.matches import PATCH_WEIGHT, WeighedMatchSettings, index_references
@@ -27,49 +26,73 @@ MOST = 16 * PAPER_SIZE
 """Largest number of references that is taken unasked: their features are 80 MB, and indexed in a minute."""
 _NEAR = 2
 """References before and after one that count as its neighbours: a random choice leaves gaps in between."""
-_SIGNIFICANT = 0.05
-"""Level of the test that patches mislead."""
+_AROUND = 25, 50, 100
+"""References before and after one whose evidence on patches is taken together, as many as tell most: few where a drive
+or storey ends and another begins, many where each tells little."""
+_SAME_PLACE = 0.5
+"""Of the keypoints' votes for the best neighbour: with so many, another reference may show the same place."""
+_SIGNIFICANT = 1.645
+"""Standard deviations that chance exceeds in one of twenty cases."""
 _STRONGEST = 200
 """Keypoints that count for a library's size: half of what describes a place, for half of the time."""
 NO_IMAGE = np.zeros((1, 1), np.uint8)
 """In place of a reference's image, where its features are all that counts."""
 
 
-def neighbours(references: Sequence[Reference]) -> Bools:
-    """(L, L) pairs of one drive that are at most two stamps of references apart, none with itself."""
+def neighbours(references: Sequence[Reference], reach: int = _NEAR) -> Bools:
+    """(L, L) pairs of one drive that are at most `reach` stamps of references apart, none with itself."""
     near = np.zeros((len(references), len(references)), bool)
     names = np.array([one.drive for one in references])
     for name in np.unique(names):
         rows = np.flatnonzero(names == name)
         _, order = np.unique([references[row].stamp_ns for row in rows.tolist()], return_inverse=True)
-        near[np.ix_(rows, rows)] = np.abs(order[:, None] - order) <= _NEAR
+        near[np.ix_(rows, rows)] = np.abs(order[:, None] - order) <= reach
     np.fill_diagonal(near, False)
     return near
 
 
-def recognised(votes: Floats, near: Bools) -> Bools:
-    """(L,) references that most `votes` (L, L) of go to a neighbour; an image's votes for itself do not count."""
+def margin(votes: Floats, near: Bools, place: Bools | None = None) -> Floats:
+    """(L,) by how much the best neighbour explains a reference better than the best stranger does, -1..1 of their sum.
+
+    A reference is recognised where that is positive. An image's votes (L, L) for itself do not count; strangers are
+    those that are not of the same `place`, by default all but the neighbours.
+    """
     others = np.where(np.eye(len(votes), dtype=bool), 0.0, votes)
-    best = np.arange(len(votes)), others.argmax(axis=1)
-    return near[best] & (others[best] > 0)
+    neighbour = np.where(near, others, 0.0).max(axis=1)
+    stranger = np.where(near if place is None else place, 0.0, others).max(axis=1)
+    return (neighbour - stranger) / np.maximum(neighbour + stranger, 1e-9)
 
 
-def patches_mislead(keypoints: Floats, patches: Floats, references: Sequence[Reference]) -> bool:
-    """Whether significantly fewer references are recognised with patches than without, by the (L, L) votes of each
-    kind: McNemar's test in its exact form, on the references that one of the two recognises alone."""
+def misleading_patches(keypoints: Floats, patches: Floats, references: Sequence[Reference]) -> Bools:
+    """(L,) references around which significantly fewer are recognised with patches than without (McNemar's test), and
+    with less margin, by the (L, L) votes of each kind.
+
+    Of several drives in one map each part is decided by itself. A reference that keypoints find may show the same place
+    on the way back, and is no stranger.
+    """
     near = neighbours(references)
-    without, together = recognised(keypoints, near), recognised(keypoints + PATCH_WEIGHT * patches, near)
-    lost, gained = int((without & ~together).sum()), int((together & ~without).sum())
-    return bool(lost > gained and scipy.special.bdtrc(lost - 1, lost + gained, 0.5) < _SIGNIFICANT)
+    neighbour = np.where(near, keypoints, 0.0).max(axis=1, keepdims=True)
+    place = near | ((keypoints > 0) & (keypoints >= _SAME_PLACE * neighbour))
+    without, together = margin(keypoints, near, place), margin(keypoints + PATCH_WEIGHT * patches, near, place)
+    gain, change = together - without, (np.sign(together) - np.sign(without)) / 2.0
+    most, less = np.zeros(len(near)), np.zeros(len(near), bool)
+    for reach in _AROUND:
+        around = neighbours(references, reach) | np.eye(len(near), dtype=bool)
+        mean, lost, changed = (np.where(around, one, 0.0).sum(axis=1) for one in (gain, -change, np.abs(change)))
+        errors = np.sign(lost) * np.maximum(np.abs(lost) - 1.0, 0.0) / np.sqrt(np.maximum(changed, 1.0))
+        most = np.where(np.abs(errors) > np.abs(most), errors, most)
+        less = mean < 0.0 if reach == _AROUND[0] else less
+    return less & (most > _SIGNIFICANT)
 
 
-def recognised_share(references: Sequence[Reference], execution: Execution) -> float:
-    """Share of references that are recognised by their keypoints; 1 where they have none."""
+def recognised_shares(references: Sequence[Reference], execution: Execution) -> dict[str, float]:
+    """Share of each drive's references that are recognised by their keypoints; none where they have none."""
     if not any(len(one.features) for one in references):
-        return 1.0
+        return {}
     matcher = index_references(references, WeighedMatchSettings(features=_STRONGEST, patch_weight=0.0))
     votes = execution.map(lambda one: matcher.match(one.features, (1.0, 0.0)).votes(), matcher.references)
-    return float(recognised(np.array(list(votes)), neighbours(references)).mean())
+    found, drives = margin(np.array(list(votes)), neighbours(references)) > 0, np.array([r.drive for r in references])
+    return {name: float(found[drives == name].mean()) for name in np.unique(drives).tolist()}
 
 
 def add_until_enough(
@@ -79,14 +102,14 @@ def add_until_enough(
     """Rows, increasing, of the frames with these stamps (N,) that become references: those given, and twice as many, as
     long as they recognise each other too seldom, up to `most`."""
     most = min(most, MOST)
-    while len(rows) < most and not suffices([reference(row) for row in rows.tolist()], execution):
+    while len(rows) < most and lacking([reference(row) for row in rows.tolist()], execution):
         rows = np.union1d(rows, further(stamp_ns, rows, settings, min(len(rows), most - len(rows))))
     return rows
 
 
-def suffices(references: Sequence[Reference], execution: Execution) -> bool:
-    """Whether so many references recognise each other that more are not needed."""
-    return recognised_share(references, execution) >= RECOGNISED
+def lacking(references: Sequence[Reference], execution: Execution) -> set[str]:
+    """Drives of which so few references are recognised that more are needed."""
+    return {drive for drive, share in recognised_shares(references, execution).items() if share < RECOGNISED}
 
 
 def further(stamp_ns: Ints, rows: Ints, settings: LibrarySettings, count: int) -> Ints:

@@ -31,7 +31,7 @@ from vplog.places.library import build_library as index_words
 from vplog.places.library_files import check_descriptors, load_references, read_library_record, read_sources
 from vplog.places.plugin import PluginSettings
 from vplog.places.reference_choice import FRAMES_A_REFERENCE, PAPER_SIZE, LibrarySettings, choose, evenly
-from vplog.places.self_recognition import MOST, NO_IMAGE, add_until_enough, further, suffices
+from vplog.places.self_recognition import MOST, NO_IMAGE, add_until_enough, further, lacking
 from vplog.results.staging import check_contents, recover, staged
 from vplog.storage.folders import check_regular
 
@@ -216,16 +216,17 @@ def _add_until_enough(
     references: list[Reference], opened: Sequence[Log], first: Sequence[Ints], pipeline: Describing,
     execution: Execution,
 ) -> None:  # fmt: skip
-    """Add twice as many frames of each log to those with the `first` stamps, as long as the references recognise each
-    other too seldom."""
+    """Add as many frames again to those with the `first` stamps of each log whose references are recognised too seldom,
+    as long as there are such logs."""
     stamps = [log.stamps() for log in opened]
     rows = [np.flatnonzero(np.isin(one, chosen)) for one, chosen in zip(stamps, first, strict=True)]
     most = min(sum(map(len, stamps)) // FRAMES_A_REFERENCE, MOST)
-    while (total := sum(map(len, rows))) < most and references and not suffices(references, execution):
-        share = min(1.0, (most - total) / total)
+    while (total := sum(map(len, rows))) < most and (drives := lacking(references, execution)):
+        old_of = [len(old) if log.name in drives else 0 for log, old in zip(opened, rows, strict=True)]
+        share = min(1.0, (most - total) / max(sum(old_of), 1))
         added = [
-            further(one, old, pipeline.library, min(round(share * len(old)), len(one) - len(old)))
-            for one, old in zip(stamps, rows, strict=True)
+            further(one, old, pipeline.library, min(round(share * count), len(one) - len(old)))
+            for one, old, count in zip(stamps, rows, old_of, strict=True)
         ]
         if not any(map(len, added)):
             break

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
 
 from vplog import logs
 from vplog.data import Floats, Ints, Keyframes
@@ -18,7 +19,7 @@ from vplog.features.extraction import extract_frames
 from vplog.loops.match_probability import LookAlikes
 from vplog.maps.geo_bounds import DriveBounds, box_of_fixes
 from vplog.maps.search.exact import Answers, best_places
-from vplog.maps.search.index import SegmentView, place_keyframes, update_index
+from vplog.maps.search.index import SegmentView, place_keyframes, read_column, update_index
 from vplog.maps.search.probability import answer_probabilities
 from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, LineSearch, best_lines, drives_by_credit
 from vplog.maps.storage import map_store
@@ -31,13 +32,11 @@ from vplog.places.views import views_of
 from vplog.results import tables
 from vplog.results.run_record import read_run_json
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
-from vplog.stages import CodedState, FrameState, Log, PlaceState, StoredState
+from vplog.stages import CodedState, EvidenceState, FrameState, Log, PlaceState, StoredState
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.scratch import check_file_output
 
 if TYPE_CHECKING:
-    import pyarrow as pa
-
     from vplog.maps.geo_bounds import Box
     from vplog.maps.storage.download_cache import Cache
     from vplog.maps.storage.map_store import Store
@@ -101,7 +100,10 @@ def query_map(
             answers, more = search(store, drives, state, descriptors, part, LineSearch(settings, known), execution)
             p_match = answer_probabilities(store, numbered, state, descriptors, answers, known, execution)
             table = _table(store, list(drives), answers, stamps, p_match)
-            return list(drives), answers, short + more, table, _named(store, drives, table, log)
+            named = _named(store, drives, table, log)
+            if isinstance(state, EvidenceState):
+                _add_evidence(named, store, names, answers, state, descriptors)
+            return list(drives), answers, short + more, table, named
 
         drives, answers, more, table, named = skip_damaged(store, attempt)
         warnings += damage_warnings(store)
@@ -284,6 +286,24 @@ def _named(
         if isinstance(names, list) and one["keyframe"] < len(names):
             one["match_name"] = str(names[one["keyframe"]])
     return records
+
+
+def _add_evidence(
+    named: Sequence[dict[str, Any]], store: Store, drives: Sequence[str], answers: Answers, state: EvidenceState,
+    descriptors: Sequence[Any],
+) -> None:  # fmt: skip
+    """Write into the best answer of each view what most of its score is of, as `evidence`."""
+    found: dict[int, str] = {}
+    answered = np.flatnonzero(answers.count > 0)
+    for number in np.unique(answers.drive[answered, 0]).tolist():
+        views = answered[answers.drive[answered, 0] == number]
+        column = read_column(store, drives[number], state)
+        places = state.from_arrow(column.take(pa.array(answers.keyframe[views, 0])))
+        pairs = zip(views.tolist(), places, strict=True)
+        found |= {view: state.evidence(descriptors[view], place) for view, place in pairs}
+    for one in named:
+        if one["rank"] == 0 and found.get(one["query"]):
+            one["evidence"] = found[one["query"]]
 
 
 def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints, p_match: Floats) -> pa.Table:
