@@ -190,14 +190,16 @@ def student_t(factors: Factors, weight: Floats, poses: Floats, multiple: Floats)
         ratio = 1.0 - closures.redundancy * less  # of the variances of a residual's prediction error
         gain[:, column] = -0.5 * (np.log(ratio) + closures.whitened**2 * less / ratio).sum(1)
     most = gain.max(1, keepdims=True)
-    likelihood = np.exp(gain - most)
-    density = np.maximum(likelihood @ _STUDENT.T, 1e-300)
-    total = np.log(density).sum(0) + most.sum()
-    log_gain = float(np.logaddexp.reduce(total))
-    share = (np.exp(total - log_gain) / density) @ _STUDENT * likelihood  # (K, 23) probability of each multiple
+    density = np.log(np.maximum(np.exp(gain - most) @ _STUDENT.T, 1e-300)).sum(0) + most.sum()
+    log_gain = float(np.logaddexp.reduce(density))
+    # of each closure's square by the solution's posterior, in sigmas that they have on average
+    square = multiple[loops] ** 2 * (closures.whitened**2 + 1.0 - closures.redundancy).sum(1)
+    size = closures.whitened.shape[1]
+    fits = -size * np.log(_MULTIPLES) - 0.5 * square[:, None] * _MULTIPLES**-2.0
+    share = np.exp(fits - fits.max(1, keepdims=True)) * (np.exp(density - log_gain) @ _STUDENT)
     expected = np.ones(len(weight))
-    expected[loops] = 1.0 / np.sqrt(share @ _MULTIPLES**-2.0)
-    return StudentT(log_gain - math.log(len(total)), expected)
+    expected[loops] = 1.0 / np.sqrt((share @ _MULTIPLES**-2.0) / share.sum(1))
+    return StudentT(log_gain - math.log(len(density)), expected)
 
 
 def log_room(graph: PoseGraph, places: Floats) -> float:
