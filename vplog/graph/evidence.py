@@ -195,8 +195,9 @@ def student_t(factors: Factors, weight: Floats, poses: Floats, multiple: Floats)
     # of each closure's square by the solution's posterior, in sigmas that they have on average
     square = multiple[loops] ** 2 * (closures.whitened**2 + 1.0 - closures.redundancy).sum(1)
     size = closures.whitened.shape[1]
-    fits = -size * np.log(_MULTIPLES) - 0.5 * square[:, None] * _MULTIPLES**-2.0
-    share = np.exp(fits - fits.max(1, keepdims=True)) * (np.exp(density - log_gain) @ _STUDENT)
+    fits = np.log(np.maximum(np.exp(density - log_gain) @ _STUDENT, 1e-300)) - size * np.log(_MULTIPLES)
+    fits = fits - 0.5 * square[:, None] * _MULTIPLES**-2.0
+    share = np.exp(fits - fits.max(1, keepdims=True))
     expected = np.ones(len(weight))
     expected[loops] = 1.0 / np.sqrt((share @ _MULTIPLES**-2.0) / share.sum(1))
     return StudentT(log_gain - math.log(len(density)), expected)
