@@ -277,7 +277,8 @@ def descend(problem: Problem, start: Floats, tolerance: float = _CONVERGED) -> t
     for _ in range(_STEPS):
         gradient, hessian, gauss_newton = _derivatives(problem, point)
         while damping <= _MOST_DAMPING:
-            step, promised = _step(hessian + sparse.diags_array(damping * hessian.diagonal()), gradient, problem.order)
+            damped = sparse.csr_array(hessian + sparse.diags_array(damping * hessian.diagonal()))
+            step, promised = _step(damped, gradient, problem.order)
             if promised <= 0 and hessian is not gauss_newton:
                 hessian = gauss_newton
                 continue

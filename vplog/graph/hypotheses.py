@@ -148,15 +148,16 @@ def _under_student_t(at: AtSigmas, one: Hypothesis, cost: Cost | None) -> tuple[
 
     Each closure has the noise that is expected of it, by turns with the poses (expectation maximisation).
     """
-    poses, multiple, graph = one.poses, np.ones(len(one.weight)), at.factors.graph
+    poses, multiple, found, graph = one.poses, np.ones(len(one.weight)), -math.inf, at.factors.graph
+    of_loops = ~graph.odometry & (one.weight > 0)
     for _ in range(_ROUNDS):
         information = graph.information / multiple[:, None, None] ** 2
         factors = replace(at.factors, graph=replace(graph, information=information))
         normal = replace(at, factors=factors).hypothesis(one.weight, poses)
         residuals = student_t(factors, one.weight, normal.poses, multiple)
         poses, multiple = normal.poses, residuals.multiple
-    chi2 = (residual_sigma(factors.graph, poses) ** 2)[~graph.odometry & (one.weight > 0)]
-    found = normal.log_evidence - log_tails(chi2, degrees_of_freedom(graph)) + residuals.log_gain
+        chi2 = (residual_sigma(factors.graph, poses) ** 2)[of_loops]
+        found = normal.log_evidence - log_tails(chi2, degrees_of_freedom(graph)) + residuals.log_gain
     return found - (0.0 if cost is None else cost(at.factors, one.weight, poses)), multiple
 
 

@@ -73,6 +73,7 @@ def gauss_newton(
 ) -> tuple[Floats, Floats, float]:
     """The pose T exp(d) where the gradient by d vanishes, and the Hessian (6, 6) and cost before the last step; its
     `equations` are Hessian, gradient (6,) and cost at a pose."""
+    hessian, cost = np.zeros((6, 6)), math.inf
     for _ in range(_STEPS):
         hessian, gradient, cost = equations(pose)
         try:

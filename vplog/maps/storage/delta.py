@@ -105,6 +105,7 @@ def update(store: Store, patience_s: float = 0.0, *, compact: bool = False) -> d
     not younger than `patience_s`; with `compact` small files are put together. Their last version, and the number of
     drives and of files of each table. Raises ResultError."""
     place = _place(store)
+    commits: list[delta_log.Commit] = []
     with store_errors(cast("RemotePath", store)):
         for _ in range(_TRIES):
             commits = _commits(place, store)

@@ -71,7 +71,7 @@ class StoredFile:
                 digest = objects.fetch(place, part, self.bytes)
                 if digest != self.sha256:
                     part.unlink()
-                    raise ResultError(f"{place} is damaged. Remove it: the next join builds it again.")
+                    raise ResultError(f"{place} is damaged. Move it aside: the next join builds it again.")
                 part.replace(target)
         return target
 
