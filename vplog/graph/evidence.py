@@ -170,6 +170,8 @@ class StudentT(NamedTuple):
     """Log of how much likelier they are."""
     multiple: Floats
     """(E,) expected noise of each closure as a multiple of the sigma that they have on average; 1 elsewhere."""
+    log_density: Floats
+    """(E,) of each closure about the prediction of all others; NaN elsewhere."""
 
 
 def student_t(factors: Factors, weight: Floats, poses: Floats, multiple: Floats) -> StudentT:
@@ -190,7 +192,8 @@ def student_t(factors: Factors, weight: Floats, poses: Floats, multiple: Floats)
         ratio = 1.0 - closures.redundancy * less  # of the variances of a residual's prediction error
         gain[:, column] = -0.5 * (np.log(ratio) + closures.whitened**2 * less / ratio).sum(1)
     most = gain.max(1, keepdims=True)
-    density = np.log(np.maximum(np.exp(gain - most) @ _STUDENT.T, 1e-300)).sum(0) + most.sum()
+    each = np.maximum(np.exp(gain - most) @ _STUDENT.T, 1e-300)
+    density = np.log(each).sum(0) + most.sum()
     log_gain = float(np.logaddexp.reduce(density))
     # of each closure's square by the solution's posterior, in sigmas that they have on average
     square = multiple[loops] ** 2 * (closures.whitened**2 + 1.0 - closures.redundancy).sum(1)
@@ -198,9 +201,11 @@ def student_t(factors: Factors, weight: Floats, poses: Floats, multiple: Floats)
     fits = np.log(np.maximum(np.exp(density - log_gain) @ _STUDENT, 1e-300)) - size * np.log(_MULTIPLES)
     fits = fits - 0.5 * square[:, None] * _MULTIPLES**-2.0
     share = np.exp(fits - fits.max(1, keepdims=True))
-    expected = np.ones(len(weight))
+    expected, log_density = np.ones(len(weight)), np.full(len(weight), np.nan)
+    normal = -0.5 * (closures.cost + size * _LOG_2PI) - closures.log_spread
+    log_density[loops] = normal + most[:, 0] + np.log(each @ np.exp(density - log_gain))
     expected[loops] = 1.0 / np.sqrt((share @ _MULTIPLES**-2.0) / share.sum(1))
-    return StudentT(log_gain - math.log(len(density)), expected)
+    return StudentT(log_gain - math.log(len(density)), expected, log_density)
 
 
 def log_room(graph: PoseGraph, places: Floats) -> float:

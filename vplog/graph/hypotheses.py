@@ -16,7 +16,7 @@ import numpy as np
 from vplog.errors import GraphError
 from vplog.graph.build import informed
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, is_loop, residual_sigma
-from vplog.graph.evidence import TAIL, Accidents, agreeing, log_evidence, log_room, log_tails, runs, student_t
+from vplog.graph.evidence import TAIL, Accidents, StudentT, agreeing, log_evidence, log_room, log_tails, runs, student_t
 from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
 from vplog.graph.least_squares import Objective, descend
@@ -115,9 +115,11 @@ def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: 
     unlikely where noise has heavy tails: estimated from those that fit best, noise is too small for the others.
 
     By the odometry that the log claims, which may be far worse than what is estimated, false ones may be within: those
-    that need more than `TAIL` times the noise that is claimed for closures themselves are left out.
+    that need more than `TAIL` times the noise that is claimed for closures themselves are left out. Closures that claim
+    too much noise have false ones within it, too: by the others, those that come back must be likelier true than false
+    together (their pseudo-likelihood; Besag, Statistical analysis of non-lattice data, 1975).
     """
-    rejected = np.flatnonzero(best.weight == 0)
+    loops, rejected = is_loop(claimed.graph), np.flatnonzero(best.weight == 0)
     if not len(rejected) or not isinstance(optimiser, GncSettings):
         return []
     d = degrees_of_freedom(claimed.graph)
@@ -129,12 +131,17 @@ def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: 
     most = TAIL * math.sqrt(quantile / d) / best.sigmas.of_closures
     while len(within):
         weight[within] = 1.0
-        likelihood, multiple = _under_student_t(at, replace(best, weight=weight), cost)
+        true, false = (sum(1 for _ in runs(claimed.graph, np.flatnonzero(loops & (weight == of)))) for of in (1, 0))
+        likelihood, residuals = _under_student_t(at, replace(best, weight=weight), cost)
+        multiple = residuals.multiple
         weight[within] = 0.0
         if (multiple[within] <= most).all():
             break
         within = within[multiple[within] <= most]
     else:
+        return []
+    log_odds = residuals.log_density[within] + at.accidents.room + math.log((true + 1) / (false + 1))
+    if log_odds.sum() < 0.0:
         return []
     weight[within] = 1.0
     more = _refit(claimed, weight, best.poses, best.sigmas)
@@ -142,14 +149,14 @@ def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: 
     return [more] if likeliest > _under_student_t(at, best, cost)[0] - _VERY_STRONG else []
 
 
-def _under_student_t(at: AtSigmas, one: Hypothesis, cost: Cost | None) -> tuple[float, Floats]:
-    """The log evidence of the hypothesis, less the cost, where the noise of closures is Student's t, and by what (E,)
-    the sigma of each is then multiplied.
+def _under_student_t(at: AtSigmas, one: Hypothesis, cost: Cost | None) -> tuple[float, StudentT]:
+    """The log evidence of the hypothesis, less the cost, where the noise of closures is Student's t; and residuals.
 
     Each closure has the noise that is expected of it, by turns with the poses (expectation maximisation).
     """
     poses, multiple, found, graph = one.poses, np.ones(len(one.weight)), -math.inf, at.factors.graph
     of_loops = ~graph.odometry & (one.weight > 0)
+    residuals = StudentT(0.0, multiple, multiple)
     for _ in range(_ROUNDS):
         information = graph.information / multiple[:, None, None] ** 2
         factors = replace(at.factors, graph=replace(graph, information=information))
@@ -158,7 +165,7 @@ def _under_student_t(at: AtSigmas, one: Hypothesis, cost: Cost | None) -> tuple[
         poses, multiple = normal.poses, residuals.multiple
         chi2 = (residual_sigma(factors.graph, poses) ** 2)[of_loops]
         found = normal.log_evidence - log_tails(chi2, degrees_of_freedom(graph)) + residuals.log_gain
-    return found - (0.0 if cost is None else cost(at.factors, one.weight, poses)), multiple
+    return found - (0.0 if cost is None else cost(at.factors, one.weight, poses)), residuals
 
 
 def _recognised(
