@@ -129,24 +129,24 @@ def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: 
     within = rejected[apart <= quantile]
     weight, at = np.array(best.weight), AtSigmas.of(claimed, best.sigmas)
     most = TAIL * math.sqrt(quantile / d) / best.sigmas.of_closures
+    enough = _under_student_t(at, best, cost)[0] - _VERY_STRONG
     while len(within):
         weight[within] = 1.0
         true, false = (sum(1 for _ in runs(claimed.graph, np.flatnonzero(loops & (weight == of)))) for of in (1, 0))
         likelihood, residuals = _under_student_t(at, replace(best, weight=weight), cost)
-        multiple = residuals.multiple
-        weight[within] = 0.0
-        if (multiple[within] <= most).all():
-            break
-        within = within[multiple[within] <= most]
-    else:
-        return []
-    log_odds = residuals.log_density[within] + at.accidents.room + math.log((true + 1) / (false + 1))
-    if log_odds.sum() < 0.0:
-        return []
-    weight[within] = 1.0
-    more = _refit(claimed, weight, best.poses, best.sigmas)
-    likeliest = max(likelihood, _under_student_t(AtSigmas.of(claimed, more.sigmas), more, cost)[0])
-    return [more] if likeliest > _under_student_t(at, best, cost)[0] - _VERY_STRONG else []
+        log_odds = residuals.log_density[within] + at.accidents.room + math.log((true + 1) / (false + 1))
+        unlikely = residuals.multiple[within] > most
+        if not unlikely.any():
+            more = _refit(claimed, weight, best.poses, best.sigmas)
+            likelihood = max(likelihood, _under_student_t(AtSigmas.of(claimed, more.sigmas), more, cost)[0])
+            if log_odds.sum() > 0.0 and likelihood > enough:
+                return [more]
+            unlikely = log_odds <= min(log_odds.min(), 0.0)
+            if log_odds.sum() <= 0.0 or not unlikely.any():
+                break
+        weight = np.array(best.weight)
+        within = within[~unlikely]
+    return []
 
 
 def _under_student_t(at: AtSigmas, one: Hypothesis, cost: Cost | None) -> tuple[float, StudentT]:
