@@ -58,6 +58,19 @@ _STEP = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 _ABOUT = tables.TableMetadata({}, "a" * 64)
 
 
+def write_odometry(run: Path, keyframes: Keyframes, information: Floats, about: tables.TableMetadata) -> None:
+    """The tables of a run whose solution is its odometry, each step with this information (6, 6)."""
+    poses, stamps, count = keyframes.odom_from_body, keyframes.stamp_ns, len(keyframes.stamp_ns) - 1
+    a, step = np.arange(count, dtype=np.int32), se3.between(poses[:-1], poses[1:])
+    graph = PoseGraph(poses, a, a + 1, step, np.tile(information, (count, 1, 1)), [EdgeKind.ODOMETRY] * count)
+    solution = Solution(poses, np.ones(count), 0.0, 0.0, 0, True, "")
+    tables.write_keyframes(run / "keyframes.parquet", keyframes, poses, about)
+    tables.write_edges(run / "edges.parquet", graph, solution, np.zeros(count), about)
+    tables.write_closures(run / "closures.parquet", no_closures(), keyframes, about)
+    odometry = Odometry(stamps, poses, None)
+    tables.write_trajectory(run / "trajectory.parquet", Trajectory(stamps, poses), odometry, about)
+
+
 @dataclass(frozen=True, eq=False)
 class Made:
     """A drive of the city."""
@@ -119,17 +132,8 @@ class City:
         chain = [np.eye(4)]
         for one in step:
             chain.append(chain[-1] @ one)
-        poses, a = np.array(chain), np.arange(EACH - 1, dtype=np.int32)
-        stamps = np.arange(EACH, dtype=np.int64) * 10**9
-        keyframes = Keyframes(name, stamps, poses)
-        information = np.broadcast_to(np.diag(ODOMETRY**-2.0), (EACH - 1, 6, 6)).copy()
-        graph = PoseGraph(poses, a, a + 1, step, information, [EdgeKind.ODOMETRY] * (EACH - 1))
-        solution = Solution(poses, np.ones(EACH - 1), 0.0, 0.0, 0, True, "")
-        tables.write_keyframes(run / "keyframes.parquet", keyframes, poses, _ABOUT)
-        tables.write_edges(run / "edges.parquet", graph, solution, np.zeros(EACH - 1), _ABOUT)
-        tables.write_closures(run / "closures.parquet", no_closures(), keyframes, _ABOUT)
-        odometry = Odometry(stamps, poses, None)
-        tables.write_trajectory(run / "trajectory.parquet", Trajectory(stamps, poses), odometry, _ABOUT)
+        keyframes = Keyframes(name, np.arange(EACH, dtype=np.int64) * 10**9, np.array(chain))
+        write_odometry(run, keyframes, np.diag(ODOMETRY**-2.0), _ABOUT)
         return keyframes
 
     def _write_ledger(self, later: int, earlier: int, query: Ints, match: Ints) -> PairLedger:

@@ -20,13 +20,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tests.benchmarks.city import undecided
+from tests.benchmarks.city import undecided, write_odometry
 from tests.benchmarks.measure import Figure
 from tests.benchmarks.scale import made_up_library
 from tests.benchmarks.search import Places, make_places, seen_again
-from vplog.data import Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Solution, Trajectory, Verdict
+from vplog.data import Closures, Keyframes, Verdict
 from vplog.execution.execution import Execution
-from vplog.loops.verify import no_closures
 from vplog.maps.joining import drive_pairs, join
 from vplog.maps.joining.components import folders_of, groups_of
 from vplog.maps.joining.join_states import JoinState, write_states
@@ -205,16 +204,7 @@ def name_of(number: int) -> str:
 def _write_tables(run: Path, pipeline: Any) -> None:
     run.mkdir(parents=True)
     about = tables.TableMetadata(pipeline.model_dump(mode="json"), "a" * 64)
-    a, step = np.arange(EACH - 1, dtype=np.int32), np.tile(np.eye(4), (EACH - 1, 1, 1))
-    step[:, 0, 3] = 1.0
-    information = np.tile(np.eye(6) * 1e4, (EACH - 1, 1, 1))
-    graph = PoseGraph(_POSES, a, a + 1, step, information, [EdgeKind.ODOMETRY] * (EACH - 1))
-    solution = Solution(_POSES, np.ones(EACH - 1), 0.0, 0.0, 0, True, "")
-    tables.write_keyframes(run / "keyframes.parquet", _KEYFRAMES, _POSES, about)
-    tables.write_edges(run / "edges.parquet", graph, solution, np.zeros(EACH - 1), about)
-    tables.write_closures(run / "closures.parquet", no_closures(), _KEYFRAMES, about)
-    odometry = Odometry(_STAMPS, _POSES, None)
-    tables.write_trajectory(run / "trajectory.parquet", Trajectory(_STAMPS, _POSES), odometry, about)
+    write_odometry(run, _KEYFRAMES, 1e4 * np.eye(6), about)
     run_record.write_run_json(
         run / "run.json", {"finished": True, "topics": {}, "settings": pipeline.model_dump(mode="json")}
     )
