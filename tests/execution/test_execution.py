@@ -65,6 +65,10 @@ def test_a_worker_has_one_thread_of_blas_and_the_caller_as_many_as_before() -> N
         before = blas()
         assert {count for found in Execution(2).map(blas, range(4)) for count in found} <= {1}
         assert blas() == before
+        inner = Execution(2).map(blas, range(4))
+        next(inner)
+        list(Execution(2).map(lambda found: found, inner))  # the one that began first ends first
+        assert blas() == before
 
 
 def test_what_progress_or_work_raises_ends_the_work() -> None:

@@ -6,7 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TypeVar
@@ -53,8 +53,8 @@ class Execution:
         OpenCV, faiss and BLAS start no threads of their own within `work`.
         """
         waiting: deque[Future[Out]] = deque()
-        threads, blas = max(self.threads, 1), _blas().limit(limits=1, user_api="blas")
-        with blas, ThreadPoolExecutor(threads, initializer=_one_thread_each) as pool:
+        threads = max(self.threads, 1)
+        with _one_blas_thread(), ThreadPoolExecutor(threads, initializer=_one_thread_each) as pool:
             try:
                 for item in items:
                     waiting.append(pool.submit(work, item))
@@ -69,10 +69,19 @@ class Execution:
 
 @cache
 def _blas() -> ThreadpoolController:
-    """The BLAS that numpy has loaded, whose idle threads spin: products of a few ms cost ten times their time."""
+    """The BLAS that numpy has loaded."""
     import numpy  # noqa: F401
 
-    return ThreadpoolController()
+    return ThreadpoolController().select(user_api="blas")
+
+
+def _one_blas_thread() -> AbstractContextManager[object]:
+    """BLAS without threads, whose idle ones spin: products of a few ms cost ten times their time.
+
+    Where it has none already, as within another map, nothing is set back: maps end in any order.
+    """
+    alone = all(library["num_threads"] == 1 for library in _blas().info())
+    return nullcontext() if alone else _blas().limit(limits=1)
 
 
 def _one_thread_each() -> None:
