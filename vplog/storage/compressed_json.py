@@ -12,8 +12,9 @@ from vplog.errors import ResultError
 from vplog.storage.parquet_limits import check_file
 from vplog.storage.scratch import replacing
 
-_MOST_BYTES = 1 << 32
-"""Longest text of a compressed record."""
+_MOST_RATIO = 100
+"""Longest text as a multiple of the compressed file: records are mostly hashes, names and numbers, which shrink to a
+tenth."""
 
 
 def write_compressed(path: Path, value: Any) -> None:
@@ -28,7 +29,8 @@ def read_compressed(path: Path) -> Any:
     try:
         check_file(path)
         unpacked = zlib.decompressobj(31)
-        text = unpacked.decompress(path.read_bytes(), _MOST_BYTES)
+        packed = path.read_bytes()
+        text = unpacked.decompress(packed, _MOST_RATIO * len(packed))
         if not unpacked.eof:  # its checksum is behind it
             raise ValueError
         return json.loads(text)
