@@ -117,7 +117,8 @@ def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: 
     By the odometry that the log claims, which may be far worse than what is estimated, false ones may be within: those
     that need more than `TAIL` times the noise that is claimed for closures themselves are left out. Closures that claim
     too much noise have false ones within it, too: by the others, those that come back must be likelier true than false
-    together (their pseudo-likelihood; Besag, Statistical analysis of non-lattice data, 1975).
+    together (their pseudo-likelihood; Besag, Statistical analysis of non-lattice data, 1975). Where all of them are too
+    unlikely, the least likely ones are left out.
     """
     loops, rejected = is_loop(claimed.graph), np.flatnonzero(best.weight == 0)
     if not len(rejected) or not isinstance(optimiser, GncSettings):
@@ -127,6 +128,8 @@ def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: 
     poses = descend(claimed, best.weight, best.poses, _STEPS, _TOLERANCE).world_from_body
     apart, _ = distance(claimed, best.weight, poses, rejected)
     within = rejected[apart <= quantile]
+    if not len(within):
+        return []
     weight, at = np.array(best.weight), AtSigmas.of(claimed, best.sigmas)
     most = TAIL * math.sqrt(quantile / d) / best.sigmas.of_closures
     enough = _under_student_t(at, best, cost)[0] - _VERY_STRONG
@@ -137,12 +140,13 @@ def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: 
         log_odds = residuals.log_density[within] + at.accidents.room + math.log((true + 1) / (false + 1))
         unlikely = residuals.multiple[within] > most
         if not unlikely.any():
+            if log_odds.sum() <= 0.0:
+                break
             more = _refit(claimed, weight, best.poses, best.sigmas)
-            likelihood = max(likelihood, _under_student_t(AtSigmas.of(claimed, more.sigmas), more, cost)[0])
-            if log_odds.sum() > 0.0 and likelihood > enough:
+            if max(likelihood, _under_student_t(AtSigmas.of(claimed, more.sigmas), more, cost)[0]) > enough:
                 return [more]
             unlikely = log_odds <= min(log_odds.min(), 0.0)
-            if log_odds.sum() <= 0.0 or not unlikely.any():
+            if not unlikely.any():
                 break
         weight = np.array(best.weight)
         within = within[~unlikely]

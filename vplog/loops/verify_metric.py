@@ -34,7 +34,7 @@ CHI2_2 = 9.210
 """Mahalanobis^2 of a 2D error that 1 % of right matches exceed: chi-square, 2 degrees of freedom, 99 %."""
 _ROUNDS = 8
 """Most rounds of refitting the pose to its inliers and selecting inliers by the pose."""
-_SINGULAR = 1e12
+SINGULAR = 1e12
 """Condition of the Hessian beyond which its inverse has no digit left that a sensor could have measured."""
 
 
@@ -144,7 +144,7 @@ def solve(
         return Pose(Verdict.IMPLAUSIBLE_POSE, count, spread)
     if np.linalg.norm(moved) > settings.max_distance_m:
         return Pose(Verdict.TOO_FAR, count, spread)
-    if np.linalg.cond(hessian) > _SINGULAR:  # such as landmarks on one line through the camera
+    if np.linalg.cond(hessian) > SINGULAR:  # such as landmarks on one line through the camera
         return Pose(Verdict.DEGENERATE_MOTION, count, spread)
     pose_covariance = np.asarray(np.linalg.inv(hessian), np.float64) * max(1.0, excess)
     shared = settings.systematic_px / focal_px

@@ -20,7 +20,7 @@ from vplog.geometry import se3
 from vplog.loops import pose_refinement, undistort
 from vplog.loops.calibration import body_twists, motion_covariance, stamp_covariance
 from vplog.loops.candidate import Drive, agree
-from vplog.loops.verify_metric import CHI2_2, MODELS, SAMPLE, find_pose, inliers, log10_false_alarms, observe
+from vplog.loops.verify_metric import CHI2_2, MODELS, SAMPLE, SINGULAR, find_pose, inliers, log10_false_alarms, observe
 
 if TYPE_CHECKING:
     from vplog.data import Bools
@@ -81,7 +81,7 @@ class Rig:
     """The cameras of one drive, as its candidates are checked."""
 
     drives: Sequence[Drive]
-    """Of each camera; the first has a picture at every keyframe."""
+    """The pictures of each camera; the first has one at every keyframe."""
     rows: Sequence[Ints]
     """Keyframe of each picture, increasing."""
     share: float
@@ -125,6 +125,8 @@ def _verified(row: Closures, rig: Rig) -> Closures | None:
     if len(used) < 2:
         return None
     information = sum(pairs[at].information(pose, inlier[at], excess, metric.systematic_px) for at in used)
+    if np.linalg.cond(information) > SINGULAR:
+        return None
     covariance = np.asarray(np.linalg.inv(information), np.float64) + motion_covariance(pose, rig.share)
     best = int(np.argmax(counts))
     scale = row.scale[0] if accepted else pairs[best].scale
