@@ -197,8 +197,8 @@ class EvidenceState(PlaceState, Protocol):
     """A recogniser that weighs several kinds of evidence, and not everywhere alike."""
 
     def evidence(self, query: Any, match: Any) -> str:
-        """What most of the score of two places is of: `keypoints`, `keypoints and patches`, `patches` or `words`; empty
-        where they have nothing in common."""
+        """The kind of evidence with most of the score of two places: `keypoints`, `keypoints and patches`, `patches` or
+        `words`; empty where they have nothing in common."""
         ...
 
 

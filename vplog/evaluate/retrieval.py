@@ -48,7 +48,7 @@ class Ranks:
     p_match: Floats | None = None
     """(Q,) probability that the answer is right, NaN without an answer; None where none is stated."""
     evidence: Sequence[str] | None = None
-    """Of each query, what most of its answer's score is of; empty without an answer. None where there is one kind."""
+    """(Q,) what most of an answer's score is of, empty without an answer; None where there is one kind of evidence."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ _AROUND = 25, 50, 100
 """References before and after one whose evidence on patches is taken together, as many as tell most: few where a drive
 or storey ends and another begins, many where each tells little."""
 _SAME_PLACE = 0.5
-"""Of the keypoints' votes for the best neighbour: with so many, another reference may show the same place."""
+"""Share of the keypoints' votes for the best neighbour with which another reference may show the same place."""
 _SIGNIFICANT = 1.645
 """Standard deviations that chance exceeds in one of twenty cases."""
 _STRONGEST = 200

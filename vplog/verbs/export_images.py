@@ -75,7 +75,7 @@ class _PosedCamera:
     log: Log
     camera: Camera
     folder: str
-    """Of its pictures, in that of all; empty where it is alone."""
+    """Name of the folder of its pictures, in that of all; empty where it is the only camera."""
     keyframe: Ints
     """(V,) increasing."""
     stamp_ns: Ints

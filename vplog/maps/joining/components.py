@@ -68,7 +68,7 @@ class Drives:
     member: Callable[[int], Member]
     """A drive as verification needs it, by number. Raises ResultError."""
     others: list[JoinState]
-    """Of those that are excluded."""
+    """States of drives that are excluded."""
 
     @cached_property
     def names(self) -> list[str]:
