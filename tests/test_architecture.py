@@ -138,6 +138,13 @@ def test_run_reads_like_the_algorithm() -> None:
     assert not {part.value for part in parts if isinstance(part, ast.Constant)}.intersection(STAGES)
 
 
+def test_a_run_reads_no_result_back() -> None:
+    """What it writes goes to its report as values; files are read where the run is one of before."""
+    for name in ("pipeline.py", "run/outputs.py", "maps/joining/joint_run.py"):
+        text = (PACKAGE / name).read_text(encoding="utf-8")
+        assert not re.findall(r"mcap_read|tables\.read_|read_bytes|places\.load|gather\(", text), name
+
+
 def test_only_the_graph_knows_gtsam() -> None:
     users = {part_of(file) for file in FILES if any(name.split(".")[0] == "gtsam" for name in imports(file))}
     assert users == {"graph"}

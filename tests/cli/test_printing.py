@@ -21,7 +21,7 @@ from vplog.cli import printing
 from vplog.demo.record import IMAGE
 from vplog.results import tables
 from vplog.results.run_record import read_run_json
-from vplog.run.report import RunOutcome, outcome_of
+from vplog.run.outputs import _outcome
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -165,11 +165,11 @@ def test_a_run_ends_with_what_came_of_it_where_to_look_and_what_next(
 ) -> None:
 
     record = read_run_json(finished / "run.json")
-    outcome = outcome_of(finished, 5)
-    printing.print_run(finished, record, outcome)
+    outcome = record["solution"]
+    printing.print_run(finished, record)
     out = capsys.readouterr().out
     first, last = out.splitlines()[0], out.splitlines()[-1]
-    assert f"the trajectory moved by up to {outcome.moved_m:.2f} m, by {outcome.closures} closures at" in first
+    assert f"the trajectory moved by up to {outcome['moved_m']:.2f} m, by {outcome['closures']} closures at" in first
     assert f"{finished}/report.html" in out
     assert last == f"next      vplog export {finished} --format kitti -o FILE"
     assert f"next      vplog evaluate {finished} --truth FILE.tum" in out
@@ -179,29 +179,30 @@ def test_a_run_ends_with_what_came_of_it_where_to_look_and_what_next(
 
 
 def test_the_outcome_is_that_of_the_tables(finished: Path) -> None:
-    outcome = outcome_of(finished, 5)
+    outcome = read_run_json(finished / "run.json")["solution"]
     after, odometry = tables.read_trajectory(finished / "trajectory.parquet")
     relative = np.linalg.inv(odometry.odom_from_body[0]) @ odometry.odom_from_body
     moved = (after.world_from_body[0] @ relative - after.world_from_body)[:, :3, 3]
-    assert outcome.moved_m == pytest.approx(np.sqrt((moved**2).sum(1)).max())
+    assert outcome["moved_m"] == pytest.approx(np.sqrt((moved**2).sum(1)).max())
     closures = tables.read_closures(finished / "closures.parquet")
-    assert outcome.closures == np.nansum(closures.weight > 0.5)
-    assert 1 <= outcome.places <= outcome.closures
-    assert outcome_of(finished, 10**6).places == 1
+    assert outcome["closures"] == np.nansum(closures.weight > 0.5)
+    assert 1 <= outcome["places"] <= outcome["closures"]
+    assert _outcome(after, odometry, closures, 10**6)["places"] == 1
 
 
 @pytest.mark.parametrize(
     ("outcome", "gps", "said"),
     [
-        (RunOutcome(0.0, 0, 0), None, "the trajectory is the odometry's. No closure passed."),
-        (RunOutcome(1.234, 1, 1), None, "the trajectory moved by up to 1.23 m, by 1 closure at 1 place"),
-        (RunOutcome(5.0, 12, 3), {}, "the trajectory moved by up to 5.00 m, by 12 closures at 3 places"),
-        (RunOutcome(5.0, 2, 2), {"fixes": 3}, "by 2 closures at 2 places and the satellite fixes"),
-        (RunOutcome(5.0, 0, 0), {"fixes": 3}, "moved by up to 5.00 m, by the satellite fixes"),
+        ((0.0, 0, 0), None, "the trajectory is the odometry's. No closure passed."),
+        ((1.234, 1, 1), None, "the trajectory moved by up to 1.23 m, by 1 closure at 1 place"),
+        ((5.0, 12, 3), {}, "the trajectory moved by up to 5.00 m, by 12 closures at 3 places"),
+        ((5.0, 2, 2), {"fixes": 3}, "by 2 closures at 2 places and the satellite fixes"),
+        ((5.0, 0, 0), {"fixes": 3}, "moved by up to 5.00 m, by the satellite fixes"),
     ],
 )
-def test_what_came_of_a_run_is_said_in_metres(outcome: RunOutcome, gps: Any, said: str) -> None:
-    assert printing._outcome_text(outcome, {"gps": gps, "solution": {"reason": "No closure passed."}}).endswith(said)
+def test_what_came_of_a_run_is_said_in_metres(outcome: tuple[float, int, int], gps: Any, said: str) -> None:
+    solution = dict(zip(("moved_m", "closures", "places"), outcome, strict=True), reason="No closure passed.")
+    assert printing._outcome_text({"gps": gps, "solution": solution}).endswith(said)
 
 
 def test_a_joint_run_says_what_next(joint: Path, capsys: pytest.CaptureFixture[str]) -> None:

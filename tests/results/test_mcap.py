@@ -26,7 +26,13 @@ RUN = make_run()
 
 def write(path: Path, run: Run = RUN) -> bytes:
     write_mcap(
-        path, run.keyframes, run.solution.world_from_body, run.graph, run.closures, METADATA, McapExtras(run.camera)
+        path,
+        run.keyframes,
+        run.solution.world_from_body,
+        run.graph,
+        run.closures,
+        METADATA,
+        McapExtras(camera=run.camera),
     )
     return path.read_bytes()
 

@@ -212,6 +212,16 @@ def test_warnings_stages_and_thresholds_are_told(page: str, finished: Path) -> N
         assert verdict.sentence in page
 
 
+def test_the_page_of_a_run_and_of_its_folder_are_the_same(
+    verb: Verb, page: str, finished: Path, tmp_path: Path
+) -> None:
+    """A run writes it from what it holds, the verb from the files."""
+    assert verb("report", finished, "-o", tmp_path / "again.html").code == 0
+    again = (tmp_path / "again.html").read_text(encoding="utf-8")
+    assert ledger(again) == ledger(page)
+    assert drawn(again)["feature matches"] == drawn(page)["feature matches"]
+
+
 def test_same_run_same_bytes(verb: Verb, finished: Path, tmp_path: Path) -> None:
     files = []
     for name in ("one.html", "two.html"):

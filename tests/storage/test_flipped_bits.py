@@ -205,7 +205,7 @@ def test_no_flip_in_what_is_read_of_an_mcap_is_silent(tmp_path: Path) -> None:
     degrees = np.full(len(stamp_ns), 48.0)
     gps = Gps(stamp_ns, degrees, degrees, degrees, np.full((len(stamp_ns), 3, 3), np.nan))
     extras = McapExtras(
-        RUN.camera, image=lambda row: bytes([row]) * 50, image_size=(64, 48), references={3: b"reference" * 9},
+        camera=RUN.camera, image=lambda row: bytes([row]) * 50, image_size=(64, 48), references={3: b"reference" * 9},
         pictures={0: b"closure" * 20}, gps=gps,
     )  # fmt: skip
     write_mcap(path, RUN.keyframes, RUN.solution.world_from_body, RUN.graph, RUN.closures, METADATA, extras)

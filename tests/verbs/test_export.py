@@ -246,7 +246,7 @@ def test_a_run_without_fixes_has_no_place_on_earth(verb: Verb, finished: Path, t
     ledger = tables.read_closures(folder / "closures.parquet")
     camera = Camera("c", None, "none", np.zeros(0), 4, 4, np.eye(4))
     write_mcap(
-        folder / "result.mcap", keyframes, world, graph, ledger, tables.TableMetadata({}, ""), McapExtras(camera)
+        folder / "result.mcap", keyframes, world, graph, ledger, tables.TableMetadata({}, ""), McapExtras(camera=camera)
     )
     for kind in ("geojson", "geoparquet", "kml", "utm"):
         assert (

@@ -210,7 +210,6 @@ def library(arguments: argparse.Namespace) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Turn a recorded drive into an optimised trajectory; several drives into one map where closures join them."""
     from vplog.pipeline import STAGES
-    from vplog.run.report import outcome_of
 
     paths, pipeline, library, topics = _request(arguments)
     remote = "://" in str(arguments.shown)  # and `output` what is sent there
@@ -224,7 +223,7 @@ def run(arguments: argparse.Namespace) -> None:
     elif "maps" in found:
         printing.print_joint(arguments.shown, found)
     else:
-        printing.print_run(arguments.shown, found, outcome_of(arguments.output, pipeline.join.spacing))
+        printing.print_run(arguments.shown, found)
 
 
 def _request(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path | None, TopicChoice]:
@@ -290,7 +289,6 @@ def demo(arguments: argparse.Namespace) -> None:
     """Render a small drive, run on it and evaluate the result."""
     from vplog.demo import DemoSettings, make_drive
     from vplog.pipeline import STAGES
-    from vplog.run.report import outcome_of
     from vplog.verbs.report import report as write_report
 
     pipeline = parser.pipeline_of(arguments)
@@ -304,7 +302,7 @@ def demo(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json({"drive": str(drive.log), "truth": str(drive.truth), "run": done.record, "evaluation": found})
         return
-    printing.print_run(out, done.record, outcome_of(out, pipeline.join.spacing), drive.truth)
+    printing.print_run(out, done.record, drive.truth)
     printing.print_evaluation(found)
 
 

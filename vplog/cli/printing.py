@@ -15,14 +15,10 @@ from contextlib import suppress
 from itertools import zip_longest
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
 from vplog.errors import plural
 from vplog.storage.urls import printable, without_secrets
-
-if TYPE_CHECKING:
-    from vplog.run.report import RunOutcome
-
 
 _UNMOVED_M = 1e-3
 """m: less is what rounding and the solver's last digits come to."""
@@ -146,12 +142,12 @@ def print_info(found: dict[str, Any]) -> None:
         print(f"{'run' if found['ready'] else 'this works':10} {found['command']}")
 
 
-def print_run(out: Path, record: dict[str, Any], outcome: RunOutcome, truth: str | Path = "FILE.tum") -> None:
-    """`outcome` is that of the run folder; `out` is what the user called it; `truth` is the file to compare it with."""
+def print_run(out: Path, record: dict[str, Any], truth: str | Path = "FILE.tum") -> None:
+    """`out` is what the user called it; `truth` is the file to compare it with."""
     from vplog.data import Verdict
 
     counts, totals, named = record["counts"], record["totals"], shlex.quote(str(out))
-    print_line(f"{out}:", _outcome_text(outcome, record))
+    print_line(f"{out}:", _outcome_text(record))
     keyframes, frames, candidates = (plural(counts[f"{one}s"], one) for one in ("keyframe", "frame", "candidate"))
     print_line("", f"{keyframes} of {frames}, {candidates}:")
     for name, count in counts["verdicts"].items():
@@ -160,20 +156,21 @@ def print_run(out: Path, record: dict[str, Any], outcome: RunOutcome, truth: str
     print_line("took", f"{totals['seconds']:.1f} s, {totals['peak_memory_mb']:.0f} MB")
     evaluate = f"vplog evaluate {named} --truth {shlex.quote(str(truth))}"
     commands = [evaluate, f"vplog export {named} --format kitti -o FILE"]
-    if outcome.closures:
+    if record["solution"]["closures"]:
         commands.insert(1, f"vplog explain {named} --worst")
     print_next(f"{out}/report.html in a browser, {out}/result.mcap in Foxglove", *commands)
 
 
-def _outcome_text(outcome: RunOutcome, record: dict[str, Any]) -> str:
-    if outcome.moved_m < _UNMOVED_M:  # the reason is what the user needs, whatever its words
-        return f"the trajectory is the odometry's. {record['solution']['reason'].strip()}"
-    causes = [f"{plural(outcome.closures, 'closure')} at {plural(outcome.places, 'place')}"] if outcome.closures else []
+def _outcome_text(record: dict[str, Any]) -> str:
+    solution = record["solution"]
+    if solution["moved_m"] < _UNMOVED_M:  # the reason is what the user needs, whatever its words
+        return f"the trajectory is the odometry's. {solution['reason'].strip()}"
+    closures, places = (plural(solution[f"{one}s"], one) for one in ("closure", "place"))
+    causes = [f"{closures} at {places}"] if solution["closures"] else []
     causes += ["the satellite fixes"] if record["gps"] else []
     unit = "m" if record.get("scale") != "unknown" else "units (its scale is unknown)"
-    return (
-        f"the trajectory moved by up to {outcome.moved_m:.2f} {unit}{', by ' if causes else ''}{' and '.join(causes)}"
-    )
+    by = f", by {' and '.join(causes)}" if causes else ""
+    return f"the trajectory moved by up to {solution['moved_m']:.2f} {unit}{by}"
 
 
 def print_joint(out: Path, record: dict[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import heapq
 import re
 from collections import Counter
@@ -301,8 +302,9 @@ def _place(poses: Floats, given: np.ndarray, a: Int32s, b: Int32s, a_from_b: Flo
             offer(start)
 
 
-def write_g2o(path: Path, graph: PoseGraph, world_from_body: Floats, ids: Ints | None = None, held: int = 0) -> None:
-    """Vertices at the poses given (N, 4, 4), the edges, and FIX for row `held`; 17 digits, so nothing is lost.
+def write_g2o(path: Path, graph: PoseGraph, world_from_body: Floats, ids: Ints | None = None, held: int = 0) -> str:
+    """Vertices at the poses given (N, 4, 4), the edges, and FIX for row `held`; 17 digits, so nothing is lost. The
+    sha256 of the file.
 
     `ids` (N,) names the poses, their rows where None. The information matrix is that of the rotation vector, as GTSAM
     reads it, not of g2o's half-angle quaternion.
@@ -311,17 +313,24 @@ def write_g2o(path: Path, graph: PoseGraph, world_from_body: Floats, ids: Ints |
     rows, columns = np.triu_indices(len(layout.axes))
     information = graph.information[:, layout.axes][:, :, layout.axes][:, rows, columns]
     names = np.arange(len(world_from_body)) if ids is None else ids
+    digest = hashlib.sha256()
     with replacing(path) as stream:
+
+        def write(line: str) -> None:
+            stream.write(line.encode())
+            digest.update(line.encode())
+
         for name, row in zip(names.tolist(), _rows(world_from_body, graph.dimension), strict=True):
-            stream.write(f"{layout.vertex} {name} {row}\n".encode())
+            write(f"{layout.vertex} {name} {row}\n")
         edges = zip(
             names[graph.a].tolist(), names[graph.b].tolist(), _rows(graph.a_from_b, graph.dimension),
             information.tolist(), strict=True,
         )  # fmt: skip
         for a, b, row, upper in edges:
-            stream.write(f"{layout.edge} {a} {b} {row} {' '.join(map(repr, upper))}\n".encode())
+            write(f"{layout.edge} {a} {b} {row} {' '.join(map(repr, upper))}\n")
         if len(world_from_body):  # last: GTSAM 4.3 reads no planar edge that comes after another element
-            stream.write(f"FIX {names[held]}\n".encode())
+            write(f"FIX {names[held]}\n")
+    return digest.hexdigest()
 
 
 def _rows(poses: Floats, dimension: int) -> list[str]:

@@ -100,7 +100,22 @@ class ReferenceBoxes:
 
 
 @dataclass(frozen=True, eq=False)
-class McapExtras:
+class McapContent:
+    """Pictures and fixes in result.mcap, which no table has; empty where the run was written without."""
+
+    pictures: Mapping[int, bytes] = field(default_factory=dict)
+    """JPEG of a candidate closure by its row in the ledger."""
+    views: Mapping[int, dict[str, Any]] = field(default_factory=dict)
+    """Matches, boxes and votes of a candidate closure by its row, see `closure_views.view`."""
+    references: Mapping[int, bytes] = field(default_factory=dict)
+    """JPEG of a reference of the library by its number."""
+    gps: Gps | None = None
+    thumbnails: Mapping[tuple[int, int], bytes] = field(default_factory=dict)
+    """Small JPEGs of cameras beside the first, by number of the camera and row of the keyframe."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class McapExtras(McapContent):
     """Content of result.mcap beside the tables, all of it optional."""
 
     camera: Camera | None = None
@@ -110,15 +125,6 @@ class McapExtras:
     """Width and height in px of these JPEGs."""
     explained: Callable[[int], ReferenceBoxes | None] | None = None
     """By row of the keyframe."""
-    references: Mapping[int, bytes] = field(default_factory=dict)
-    """JPEG of a reference of the library by its number."""
-    views: Mapping[int, dict[str, Any]] = field(default_factory=dict)
-    """Matches, boxes and votes of a candidate closure by its row, see `closure_views.view`."""
-    thumbnails: Mapping[tuple[int, int], bytes] = field(default_factory=dict)
-    """Small JPEGs of cameras beside the first, by number of the camera and row of the keyframe."""
-    pictures: Mapping[int, bytes] = field(default_factory=dict)
-    """JPEG of a candidate closure by its row in the ledger."""
-    gps: Gps | None = None
     earth: Earth | None = None
     about: Mapping[str, Any] = field(default_factory=dict)
     """Versions, input hashes: metadata of the file beside the settings, as plain values by name."""

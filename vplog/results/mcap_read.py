@@ -8,9 +8,9 @@ import re
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -27,7 +27,7 @@ from vplog.data import Floats, Gps
 from vplog.geometry import se3
 from vplog.results.closure_views import checked
 from vplog.results.foxglove import CAMERA
-from vplog.results.mcap import FIXES, PICTURES, VIEWS
+from vplog.results.mcap import FIXES, PICTURES, VIEWS, McapContent
 from vplog.results.tables import reading
 from vplog.storage.parquet_limits import crc_of
 
@@ -36,21 +36,6 @@ _DATA_END = struct.Struct("<BQI")
 _FOOTER = struct.Struct("<BQQQI8s")
 """Opcode, length, starts of the summary and of its offsets, CRC-32 of the summary and of this so far, or 0, and magic:
 the MCAP specification, Footer."""
-
-
-@dataclass(frozen=True, eq=False)
-class McapContent:
-    """Empty where the run was written without."""
-
-    pictures: dict[int, bytes] = field(default_factory=dict)
-    """JPEG of a candidate closure by its row in the ledger."""
-    views: dict[int, dict[str, Any]] = field(default_factory=dict)
-    """Matches, boxes and votes of a candidate closure by its row, see `closure_views.view`."""
-    references: dict[int, bytes] = field(default_factory=dict)
-    """JPEG of a reference of the library by its number."""
-    gps: Gps | None = None
-    thumbnails: dict[tuple[int, int], bytes] = field(default_factory=dict)
-    """Small JPEGs of cameras beside the first, by number of the camera and row of the keyframe."""
 
 
 @dataclass(frozen=True, eq=False)

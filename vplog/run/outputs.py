@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from vplog.cache.steps import Steps, step
-from vplog.data import Camera, Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Reference, Solution, Verdict
-from vplog.geometry import tum
+from vplog.data import (
+    Camera,
+    Closures,
+    EdgeKind,
+    Keyframes,
+    Odometry,
+    PoseGraph,
+    Reference,
+    Solution,
+    Trajectory,
+    Verdict,
+)
+from vplog.geometry import se3, tum
 from vplog.graph import consistency
+from vplog.graph.joint import spaced_apart
 from vplog.graph.refine import about_odometry
 from vplog.results import g2o, mcap, run_record, tables
+from vplog.results.previews import thumbnail
+from vplog.results.report.page import Pictures, ReportContent
 from vplog.run import provenance
 from vplog.run.back_end import BackEndResult, about_gps, keyframe_covariances
 from vplog.run.figures.run_figures import (
@@ -25,13 +40,18 @@ from vplog.run.figures.run_figures import (
     mcap_extras,
     reference_use,
 )
-from vplog.run.report import write_report
+from vplog.run.report import pictured_keyframes, questions_of, references_of, tracks_of, write_page
+from vplog.storage.image_file import decode_image
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+
     from vplog.cache.feature_shards import Extracted
+    from vplog.data import Floats
     from vplog.execution.execution import Execution
     from vplog.loops.verify import VerifySettings
     from vplog.places.coverage import Coverage
+    from vplog.results.mcap import McapExtras
     from vplog.results.previews import PictureSettings
     from vplog.run.cameras import View
     from vplog.stages import Log, PlaceState
@@ -73,6 +93,20 @@ class Run:
         return self.solved.refined.solution
 
 
+@dataclass(frozen=True, eq=False)
+class Written:
+    """Content of the files of a run that is computed as they are written."""
+
+    extras: McapExtras
+    """Content of result.mcap."""
+    covariance: Floats | None
+    """(N, 6, 6) of the solved keyframes; None where edges and fixes do not determine them."""
+    descriptors: pa.Array
+    """The column of descriptors.parquet."""
+    graph_sha256: str
+    """Of graph.g2o."""
+
+
 @step("write")
 def write(
     folder: Path,
@@ -83,7 +117,7 @@ def write(
     *,
     steps: Steps,
     execution: Execution,
-) -> None:
+) -> Written:
     """Write the tables, the trajectory, the graph and result.mcap of a run into its folder."""
     log, keyframes, trajectory, poses = run.log, run.keyframes, run.solved.trajectory, run.solution.world_from_body
     picture, gps = run.features.picture, log.gps()
@@ -96,29 +130,55 @@ def write(
         earth=earth_of(trajectory, gps, about_gps(run.solved)),
         about={"versions": provenance.versions(), "inputs": steps.cache.hashes()},
     )
-    tables.write_descriptors(folder / "descriptors.parquet", keyframes, run.state.to_arrow(run.places), header)
-    tables.write_keyframes(folder / "keyframes.parquet", keyframes, poses, header, keyframe_covariances(run.solved))
+    descriptors, covariance = run.state.to_arrow(run.places), keyframe_covariances(run.solved)
+    tables.write_descriptors(folder / "descriptors.parquet", keyframes, descriptors, header)
+    tables.write_keyframes(folder / "keyframes.parquet", keyframes, poses, header, covariance)
     tables.write_closures(folder / "closures.parquet", run.closures, keyframes, header)
     residual = consistency.residual_sigma(run.graph, poses)
     tables.write_edges(folder / "edges.parquet", run.graph, run.solution, residual, header)
     tables.write_trajectory(folder / "trajectory.parquet", trajectory, run.odometry, header)
     tum.write_tum(folder / "trajectory.tum", trajectory)
-    g2o.write_g2o(folder / "graph.g2o", run.graph, poses)
+    graph_sha256 = g2o.write_g2o(folder / "graph.g2o", run.graph, poses)
     mcap.write_mcap(folder / "result.mcap", keyframes, poses, run.graph, run.closures, header, extras)
     if run.library is None:
         run.state.save(folder / "library")
     steps.cache.finish(run.features.files)
+    return Written(extras, covariance, descriptors, graph_sha256)
 
 
 @step("report")
-def report(folder: Path, run: Run, head: dict[str, Any], *, steps: Steps) -> dict[str, Any]:
+def report(folder: Path, run: Run, written: Written, head: dict[str, Any], *, steps: Steps) -> dict[str, Any]:
     """Write report.html of the run in `folder`; the record for its run.json, but for the time that this step takes."""
     warnings = run.log.warnings + steps.warnings
-    record = {**head, **_results_record(run), "inputs": steps.cache.hashes(), "warnings": warnings}
+    record = {
+        **head,
+        **_results_record(run, head["settings"]["join"]["spacing"]),
+        "inputs": steps.cache.hashes(),
+        "warnings": warnings,
+    }
     record["pictures"] = _pictures_record(run, head["settings"]["pictures"]["closures"])
-    record["graph_sha256"] = hashlib.sha256((folder / "graph.g2o").read_bytes()).hexdigest()
-    write_report(folder, {**record, **steps.record()})
+    record["graph_sha256"] = written.graph_sha256
+    write_page(_content(run, written, {**record, **steps.record()}), folder / "report.html")
     return record
+
+
+def _content(run: Run, written: Written, record: dict[str, Any]) -> ReportContent:
+    """The content of report.html."""
+    extras, poses, closures = written.extras, run.solution.world_from_body, run.closures
+    covariance = np.full((len(poses), 6, 6), np.nan) if written.covariance is None else written.covariance
+    found = ReportContent(
+        record,
+        tracks_of(run.keyframes, poses, run.odometry, run.solved.trajectory, extras, extras.earth),
+        covariance,
+        closures,
+        Pictures(extras.views, extras.references),
+        questions=questions_of(replace(run.graph, world_from_body=poses), run.solution.weight, closures),
+        references=references_of(written.descriptors, len(run.references), len(poses)),
+    )
+    if extras.image is None:
+        return found
+    thumbnails = {row: thumbnail(decode_image(extras.image(row))) for row in sorted(pictured_keyframes(found))}
+    return replace(found, pictures=replace(found.pictures, thumbnails=thumbnails))
 
 
 def finish(folder: Path, run: Run, record: dict[str, Any], steps: Steps) -> Run:
@@ -137,7 +197,18 @@ def _pictures_record(run: Run, most: int) -> dict[str, int]:
     return {"drawn": len(drawn), "views": len(views), "accepted_left_out": left_out}
 
 
-def _results_record(run: Run) -> dict[str, Any]:
+def _outcome(after: Trajectory, odometry: Odometry, closures: Closures, spacing: int) -> dict[str, float | int]:
+    """The largest distance between a corrected and an odometry position, both from the same first pose, in m; the
+    closures with more than half their weight, and the number of places they are at: how many of their queries, or of
+    their matches, are `spacing` keyframes from the next, the fewer."""
+    first_from_odom = after.world_from_body[0] @ se3.inverse(odometry.odom_from_body[0])
+    moved = (after.world_from_body - first_from_odom @ odometry.odom_from_body)[:, :3, 3]
+    used = closures.weight > 0.5  # NaN where the solver never had it
+    places = min(spaced_apart(one[used].astype(np.int64), spacing) for one in (closures.query, closures.match))
+    return {"moved_m": float(np.linalg.norm(moved, axis=1).max()), "closures": int(used.sum()), "places": places}
+
+
+def _results_record(run: Run, spacing: int) -> dict[str, Any]:
     """Fields of run.json about the results."""
     from vplog.graph.certificate import certify
 
@@ -169,6 +240,7 @@ def _results_record(run: Run) -> dict[str, Any]:
             "iterations": solution.iterations,
             "converged": solution.converged,
             "reason": solution.reason if constrained else "No closure passed verification.",
+            **_outcome(run.solved.trajectory, run.odometry, run.closures, spacing),
         },
         "certificate": certify(run.graph, solution.weight, solution.world_from_body).record(),
         "odometry": about_odometry(refined),

@@ -1,21 +1,22 @@
-"""report.html of a finished run, from the files of its folder."""
+"""report.html of a run, and its content from the files of a folder."""
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from vplog.data import USED, Ints, Trajectory
+from vplog.data import USED, Closures, Floats, Ints, Keyframes, Odometry, PoseGraph, Trajectory
 from vplog.errors import GraphError, ResultError
 from vplog.geometry import se3
-from vplog.graph.joint import spaced_apart
 from vplog.results import mcap_read, tables
+from vplog.results.geo import Earth
 from vplog.results.html import mapping
+from vplog.results.mcap import McapContent
 from vplog.results.previews import thumbnail
 from vplog.results.report.page import (
     Changes,
@@ -52,33 +53,15 @@ def write_report(
     `pictures` are those that result.mcap lacks. Raises ResultError.
     """
     path = path or folder / "report.html"
-    text = page(replace(gather(folder, record, judged, pictures), changes=changes))
-    with replacing(path) as stream:
-        stream.write(text.encode())
+    write_page(replace(gather(folder, record, judged, pictures), changes=changes), path)
     return path
 
 
-@dataclass(frozen=True)
-class RunOutcome:
-    """Difference of a run's trajectory from the odometry, and its closures."""
-
-    moved_m: float
-    """Largest distance between a corrected and an odometry position, both from the same first pose."""
-    closures: int
-    """Loop closures with more than half their weight."""
-    places: int
-    """Closures that are `join.spacing` keyframes from the next, of queries or of matches: the fewer."""
-
-
-def outcome_of(folder: Path, spacing: int) -> RunOutcome:
-    """Raises ResultError where a table of the run is missing or damaged."""
-    after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
-    closures = tables.read_closures(folder / "closures.parquet")
-    first_from_odom = after.world_from_body[0] @ se3.inverse(odometry.odom_from_body[0])
-    moved = (after.world_from_body - first_from_odom @ odometry.odom_from_body)[:, :3, 3]
-    used = closures.weight > 0.5  # NaN where the solver never had it
-    places = min(spaced_apart(one[used].astype(np.int64), spacing) for one in (closures.query, closures.match))
-    return RunOutcome(float(np.linalg.norm(moved, axis=1).max()), int(used.sum()), places)
+def write_page(content: ReportContent, path: Path) -> None:
+    """Write the page of this content."""
+    text = page(content)
+    with replacing(path) as stream:
+        stream.write(text.encode())
 
 
 def gather_tracks(folder: Path, record: dict[str, Any]) -> Tracks:
@@ -86,8 +69,20 @@ def gather_tracks(folder: Path, record: dict[str, Any]) -> Tracks:
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
     found = mcap_read.read_pictures(folder / "result.mcap")
-    before = world_from_body[:1] @ se3.inverse(keyframes.odom_from_body[:1]) @ odometry.odom_from_body
     earth = earth_of(after, found.gps, record.get("gps"))
+    return tracks_of(keyframes, world_from_body, odometry, after, found, earth)
+
+
+def tracks_of(
+    keyframes: Keyframes,
+    world_from_body: Floats,
+    odometry: Odometry,
+    after: Trajectory,
+    found: McapContent,
+    earth: Earth | None,
+) -> Tracks:
+    """The trajectories, with the odometry laid on the first solved keyframe."""
+    before = world_from_body[:1] @ se3.inverse(keyframes.odom_from_body[:1]) @ odometry.odom_from_body
     return Tracks(keyframes, world_from_body, Trajectory(odometry.stamp_ns, before), after, found, earth)
 
 
@@ -102,28 +97,39 @@ def gather(
     covariance = tables.read_keyframe_covariance(folder / "keyframes.parquet")
     closures = tables.read_closures(folder / "closures.parquet")
     pictures = pictures or Pictures(tracks.found.views, tracks.found.references)
-    content = ReportContent(record, tracks, covariance, closures, pictures, judged=judged)
-    content = replace(content, questions=_questions(folder, content), references=_references(folder, content))
+    column, _ = tables.read_descriptors(folder / "descriptors.parquet")
+    count = mapping(record.get("library")).get("references")
+    content = ReportContent(
+        record, tracks, covariance, closures, pictures, judged=judged, questions=_questions(folder, tracks, closures),
+        references=references_of(column, count, len(tracks.keyframes.stamp_ns)),
+    )  # fmt: skip
     thumbnails = pictures.thumbnails or _thumbnails(folder, content)
     return replace(content, pictures=replace(pictures, thumbnails=thumbnails))
 
 
-def _questions(folder: Path, content: ReportContent) -> list[ClosureQuestion]:
+def _questions(folder: Path, tracks: Tracks, closures: Closures) -> list[ClosureQuestion]:
+    """The first questions; none where the graph is damaged, too."""
+    try:
+        graph, weight, _ = tables.read_edges(folder / "edges.parquet", tracks.world_from_body)
+    except ResultError as error:
+        _log.warning("No questions are asked: %s", error)
+        return []
+    return questions_of(graph, weight, closures)
+
+
+def questions_of(graph: PoseGraph, weight: Floats, closures: Closures) -> list[ClosureQuestion]:
     """The first questions; none where the poses are not determined, or the graph is not that of the ledger."""
     try:
-        graph, weight, _ = tables.read_edges(folder / "edges.parquet", content.tracks.world_from_body)
-        return ask_ledger(graph, weight, content.closures)[:_QUESTIONS]
+        return ask_ledger(graph, weight, closures)[:_QUESTIONS]
     except (GraphError, ResultError) as error:
         _log.warning("No questions are asked: %s", error)
         return []
 
 
-def _references(folder: Path, content: ReportContent) -> Ints | None:
-    """Numbers (N, K) of the references of each keyframe, as descriptors.parquet has them; None of other recognisers."""
-    column, _ = tables.read_descriptors(folder / "descriptors.parquet")
-    count = mapping(content.record.get("library")).get("references")
+def references_of(column: pa.Array, count: Any, keyframes: int) -> Ints | None:
+    """Numbers (N, K) of the references of each keyframe, of `count`, by the descriptors; None of other recognisers."""
     at = column.type.get_field_index("references") if pa.types.is_struct(column.type) else -1
-    if at < 0 or not isinstance(count, int) or len(column) != len(content.tracks.keyframes.stamp_ns):
+    if at < 0 or not isinstance(count, int) or len(column) != keyframes:
         return None
     found = column.field(at)
     if found.null_count or not pa.types.is_fixed_size_list(found.type):
@@ -132,14 +138,19 @@ def _references(folder: Path, content: ReportContent) -> Ints | None:
     return np.where(numbers < count, numbers, -1)
 
 
-def _thumbnails(folder: Path, content: ReportContent) -> dict[int, bytes]:
-    """Small JPEGs of at most `_MOST_THUMBNAILS` keyframes of closures: those asked about, false ones, those in the
-    solution, then the nearest misses, by inliers; empty where result.mcap has no pictures."""
+def pictured_keyframes(content: ReportContent) -> set[int]:
+    """Rows of at most `_MOST_THUMBNAILS` keyframes of closures: those asked about, false ones, those in the solution,
+    then the nearest misses, by inliers."""
     closures = content.closures
     in_question = np.isin(np.arange(len(closures)), [row for one in content.questions for row in one.rows])
     nearest = np.lexsort((-closures.inliers, ~closures.of(*USED), ~false_closures(content), ~in_question))
     ends = np.stack([closures.query[nearest], closures.match[nearest]], 1).ravel().tolist()
-    wanted = set(list(dict.fromkeys(ends))[:_MOST_THUMBNAILS])
+    return set(list(dict.fromkeys(ends))[:_MOST_THUMBNAILS])
+
+
+def _thumbnails(folder: Path, content: ReportContent) -> dict[int, bytes]:
+    """Small JPEGs of keyframes of closures by row; empty where result.mcap has no pictures."""
+    wanted = pictured_keyframes(content)
     row_at = {stamp: row for row, stamp in enumerate(content.tracks.keyframes.stamp_ns.tolist()) if row in wanted}
     found = {
         row_at[one.stamp_ns]: thumbnail(decode_image(one.image))

@@ -25,7 +25,7 @@ from vplog.results import g2o, run_record, tables
 from vplog.results.run_record import CACHE
 from vplog.run import provenance
 from vplog.run.odometry import check_metric
-from vplog.run.reference_library import build_library, check_library
+from vplog.run.reference_library import check_library, library_of_logs
 from vplog.run.run_folder import CacheOptions, staged_run
 from vplog.storage.folders import numbered
 
@@ -79,7 +79,7 @@ def run_joint(
         if library is None:
             library = made / "library"
             with watch.stage("library"):
-                build_library(paths, library, pipeline, topics, execution)
+                library_of_logs(opened, library, pipeline, execution)
         drives = []
         for name, path in drives_at.items():
             with watch.stage(name):
@@ -88,7 +88,7 @@ def run_joint(
                 )
                 drives.append(_drive_run(name, done, pipeline))
         with watch.stage("between"):
-            state = pipeline.places.load(library, execution)
+            state = drives[0].run.state
             ledgers = _ledgers(drives, state, pipeline, execution)
         with watch.stage("join"), limited(execution.threads):
             joined, ledgers = solve_drives([drive_run.solved for drive_run in drives], ledgers, pipeline)

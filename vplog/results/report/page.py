@@ -16,9 +16,11 @@ from vplog.results.html import figure, mapping, render
 from vplog.results.report import charts
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from vplog.data import Bools, Closures, Floats, Ints, Keyframes, Trajectory
     from vplog.results.geo import Earth
-    from vplog.results.mcap_read import McapContent
+    from vplog.results.mcap import McapContent
 
 _MOST_ROWS = 100_000
 """Rows of the ledger in the page: 10 MB. Accepted ones first, then by score; the table file has them all."""
@@ -92,9 +94,9 @@ class Tracks:
 class Pictures:
     """Pictures of closures in the page."""
 
-    views: dict[int, dict[str, Any]]
+    views: Mapping[int, dict[str, Any]]
     """Matches, boxes and votes of a candidate closure by its row, see `closure_views.view`."""
-    references: dict[int, bytes] = field(default_factory=dict)
+    references: Mapping[int, bytes] = field(default_factory=dict)
     """JPEG of a reference by its number."""
     thumbnails: dict[int, bytes] = field(default_factory=dict)
     """Small JPEG of a keyframe by its row."""
