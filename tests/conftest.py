@@ -26,7 +26,7 @@ from vplog.pipeline import load_pipeline, run
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 # a check of a change must not fail by the luck of the draw: the same inputs each time, and on
 # `HYPOTHESIS_PROFILE=anew` others each time and twice as many, for those who look for what is not yet known
@@ -194,13 +194,13 @@ def made_once(shared_folder: Path) -> Callable[[str, Callable[[Path], object]], 
 
 
 @pytest.fixture(scope="session")
-def drive(made_once: Callable[..., Path]) -> Drive:
+def drive(made_once: Callable[..., Path]) -> Demo:
     """The small demo drive: about 45 frames, of which the last dozen pass known places."""
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
     from vplog.demo.scene import make_scene
 
     folder = made_once("drive", lambda folder: make_drive(folder, SMALL))
-    return Drive(**vars(make_scene(SMALL)), log=folder / "drive.mcap", truth=folder / "truth.tum")
+    return Demo(**vars(make_scene(SMALL)), log=folder / "drive.mcap", truth=folder / "truth.tum")
 
 
 @pytest.fixture(scope="session")
@@ -216,17 +216,17 @@ def tiny_drives(made_once: Callable[..., Path]) -> list[Path]:
 
 
 @pytest.fixture(scope="session")
-def tiny(tiny_drives: list[Path]) -> Drive:
+def tiny(tiny_drives: list[Path]) -> Demo:
     """The first of the tiny drives, of which the last half dozen frames pass known places."""
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
     from vplog.demo.scene import make_scene
 
     folder = tiny_drives[0]
-    return Drive(**vars(make_scene(TINY)), log=folder / "drive.mcap", truth=folder / "truth.tum")
+    return Demo(**vars(make_scene(TINY)), log=folder / "drive.mcap", truth=folder / "truth.tum")
 
 
 @pytest.fixture(scope="session")
-def finished(drive: Drive, made_once: Callable[..., Path]) -> Path:
+def finished(drive: Demo, made_once: Callable[..., Path]) -> Path:
     """The folder of a default run on the small drive, with two threads. Tests read it and leave it as it is."""
     pipeline, execution = load_pipeline("default"), Execution(2)
     return made_once("finished", lambda folder: run(drive.log, folder / "run", pipeline, execution=execution)) / "run"
@@ -238,7 +238,7 @@ def compiled(finished: Path) -> None:
 
 
 @pytest.fixture(scope="session")
-def joint(drive: Drive, made_once: Callable[..., Path]) -> Path:
+def joint(drive: Demo, made_once: Callable[..., Path]) -> Path:
     """The folder of a joint run of three drives, beside their logs. Tests read it and leave it as it is."""
     from tests.joined import run_together
 
@@ -246,7 +246,7 @@ def joint(drive: Drive, made_once: Callable[..., Path]) -> Path:
 
 
 @pytest.fixture(scope="session")
-def halves(drive: Drive, made_once: Callable[..., Path]) -> Path:
+def halves(drive: Demo, made_once: Callable[..., Path]) -> Path:
     """A map of two halves of the small drive, joined, beside their logs. Tests leave it as it is, but for landmarks."""
     import vplog
     from tests.joined import copied

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from mcap.records import Message
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 QUICK = (
     "features.max_features=400", "features.max_megapixels=0.05", "library.size=12", "places.neighbours=8",
@@ -61,7 +61,7 @@ def cut(log: Path, at_ns: int, folder: Path, mounted: bool = True) -> list[Path]
     ]
 
 
-def run_together(drive: Drive, folder: Path) -> Path:
+def run_together(drive: Demo, folder: Path) -> Path:
     """The folder of the joint run."""
     parts = cut(drive.log, int(drive.stamp_ns[-14]), folder)
     elsewhere = make_drive(folder / "elsewhere", SMALL.model_copy(update={"seed": SMALL.seed + 1})).log

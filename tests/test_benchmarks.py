@@ -26,7 +26,7 @@ from vplog.places.bobb_paper import PaperBobbSettings
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 TINY = Pipeline(features=SiftSettings(max_features=150), places=BobbSettings(references=4, features=100))
 
@@ -108,9 +108,7 @@ def test_the_command_tells_in_json_and_by_its_status(
     assert not any(figure["passed"] for figure in told["figures"])
 
 
-def test_without_real_drives_the_demo_is_measured(
-    drive: Drive, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_without_real_drives_the_demo_is_measured(drive: Demo, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("VPLOG_DATA", str(tmp_path))
     monkeypatch.setattr(pictures_of, "make_drive", lambda _: drive)
     (found,) = pictures_of.drives(3)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 TABLES = ("keyframes", "descriptors", "closures", "edges", "trajectory")
 FILES = (*(f"{name}.parquet" for name in TABLES), "trajectory.tum", "graph.g2o", "result.mcap")
@@ -80,7 +80,7 @@ def test_a_run_says_how_sure_it_is(finished: Path) -> None:
     assert (np.linalg.eigvalsh(covariance[1:]) > 0).all()
 
 
-def test_run_json_says_what_was_run_and_how_it_went(finished: Path, drive: Drive) -> None:
+def test_run_json_says_what_was_run_and_how_it_went(finished: Path, drive: Demo) -> None:
     record = record_of(finished)
     assert record["finished"] is True
     assert record["warnings"] == []
@@ -109,7 +109,7 @@ def test_settings_of_a_run_give_the_run_again(finished: Path, tmp_path: Path) ->
 
 @pytest.mark.usefixtures("computed_anew")
 def test_the_same_bytes_from_any_number_of_threads_and_over_an_old_run(
-    drive: Drive, finished: Path, tiny: Drive, tmp_path: Path
+    drive: Demo, finished: Path, tiny: Demo, tmp_path: Path
 ) -> None:
     """One thread and two on all that a run does, four and three on a smaller one that is run over another."""
     run(drive.log, tmp_path / "one", load_pipeline("default"), execution=Execution(1), cache=CacheOptions(use=False))
@@ -125,7 +125,7 @@ def test_the_same_bytes_from_any_number_of_threads_and_over_an_old_run(
     assert not (out / ".cache").exists()
 
 
-def test_closures_take_out_the_drift(finished: Path, drive: Drive) -> None:
+def test_closures_take_out_the_drift(finished: Path, drive: Demo) -> None:
     found = evaluate(finished, str(drive.truth))
     assert found["ate_before"]["rmse_m"] > 1.5
     assert found["ate_after"]["rmse_m"] < found["ate_before"]["rmse_m"] / 5
@@ -140,7 +140,7 @@ def test_gps_sees_the_drift_go_too(finished: Path) -> None:
 
 
 def test_evo_reads_the_trajectory_and_finds_the_same_error(
-    finished: Path, drive: Drive, verb: Callable[..., Said]
+    finished: Path, drive: Demo, verb: Callable[..., Said]
 ) -> None:
     from evo.core import metrics, sync
     from evo.tools import file_interface
@@ -159,7 +159,7 @@ def test_evo_reads_the_trajectory_and_finds_the_same_error(
         assert said[f"{name}_m"] == pytest.approx(theirs[name], abs=1e-6)
 
 
-def test_evo_ape_says_the_same(finished: Path, drive: Drive, tmp_path: Path) -> None:
+def test_evo_ape_says_the_same(finished: Path, drive: Demo, tmp_path: Path) -> None:
     done = subprocess.run(
         [Path(sys.executable).with_name("evo_ape"), "tum", drive.truth, finished / "trajectory.tum", "--align"],
         capture_output=True, text=True, check=True, env={**os.environ, "HOME": str(tmp_path)},
@@ -256,7 +256,7 @@ def test_accepted_closures_are_whole_and_the_others_are_not_in_the_graph(finishe
     assert np.isnan(ledger.residual_after[~accepted]).all()
 
 
-def test_a_closure_that_the_solver_rejects_has_no_weight(drive: Drive, finished: Path, tmp_path: Path) -> None:
+def test_a_closure_that_the_solver_rejects_has_no_weight(drive: Demo, finished: Path, tmp_path: Path) -> None:
     """A gate this narrow turns away closures that are right."""
     shutil.copytree(finished / ".cache", tmp_path / ".cache")  # all but the solve is as it was
     strict = load_pipeline("default", ["solve.kind=pcm", "solve.gate_probability=0.001"])
@@ -271,7 +271,7 @@ def test_a_closure_that_the_solver_rejects_has_no_weight(drive: Drive, finished:
     assert (edges["weight"][edges["kind"] == "loop"] == 0).sum() == rejected.sum()
 
 
-def test_a_library_of_another_drive_is_used_and_named(tiny: Drive, tmp_path: Path) -> None:
+def test_a_library_of_another_drive_is_used_and_named(tiny: Demo, tmp_path: Path) -> None:
     pipeline = load_pipeline("default", [*QUICK, "library.size=10"])
     state = build_library([tiny.log], tmp_path / "library", pipeline, execution=Execution(4))
     known = json.loads((tmp_path / "library" / "library.json").read_text())

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 
 def test_drives_are_evaluated_each_and_by_tag(
-    halves: Path, drive: Drive, tmp_path: Path, verb: Callable[..., Said]
+    halves: Path, drive: Demo, tmp_path: Path, verb: Callable[..., Said]
 ) -> None:
     root, manifest = Path(shutil.copytree(halves, tmp_path / "map")), tmp_path / "drives.csv"
     tags = {"before": {"light": "day"}, "after": {"light": "night", "vehicle": "v1"}}

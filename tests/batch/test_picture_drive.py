@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 FRAMES = 14
 QUICK = ("--set", "features.max_features=250", "--set", "features.max_megapixels=0.06", "--set", "library.size=8")
 
 
 @pytest.fixture(scope="module")
-def pictures(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def pictures(drive: Demo, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folders `day`, whose images are in folders of their own, and `dusk`, the same views with noise."""
     root = tmp_path_factory.mktemp("pictures")
     for number, (image, dusk) in enumerate(day_and_dusk(drive.log, FRAMES)):
@@ -55,7 +55,7 @@ def test_pictures_are_put_into_a_map_and_found(pictures: Path, tmp_path: Path, v
 
 
 def test_pictures_are_joined_with_no_drive(
-    pictures: Path, drive: Drive, tmp_path: Path, verb: Callable[..., Said]
+    pictures: Path, drive: Demo, tmp_path: Path, verb: Callable[..., Said]
 ) -> None:
     said = verb("batch", pictures / "day", pictures / "dusk", "-o", tmp_path / "map", "--json", *QUICK).json
     assert not said["joined"]["components"]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from conftest import Said
 
     from vplog.batch.plan import DriveInput
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 QUICK = (
     "features.max_features=200", "features.max_megapixels=0.05", "library.size=6", "pictures.closures=0",
@@ -50,7 +50,7 @@ def make_map(root: Path, finished: Path, logs: dict[str, tuple[str, dict[str, An
     return library
 
 
-def test_a_map_in_a_bucket_is_described_anew(finished: Path, drive: Drive, verb: Callable[..., Said]) -> None:
+def test_a_map_in_a_bucket_is_described_anew(finished: Path, drive: Demo, verb: Callable[..., Said]) -> None:
     with serving():
         old, new = located("s3://bucket/old"), located("s3://bucket/new")
         library = make_map(old, finished, {"drive": (str(drive.log), {}), "lost": ("/no/such.mcap", {})})

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
     from vplog.benchmark.traversals import Traversal
     from vplog.data import Ints
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
     from vplog.evaluate.pairs import Pairs
 
     Verb = Callable[..., Said]
@@ -63,7 +63,7 @@ TIMES = {"encode_ms", "feature_ms", "mining_ms", "query_ms", "learn_s"}
 
 
 @pytest.fixture(scope="module")
-def traversals(compiled: None, drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def traversals(compiled: None, drive: Demo, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folders = tmp_path_factory.mktemp("traversals") / "day", tmp_path_factory.mktemp("traversals") / "dusk"
     for folder in folders:
         folder.mkdir()
@@ -261,7 +261,7 @@ def test_the_same_frames_at_dusk(traversals: tuple[Path, Path]) -> None:
     assert done.record["methods"]["bobb"]["settings"]["windows_along"] == 3
 
 
-def test_a_drive_against_itself(verb: Verb, drive: Drive) -> None:
+def test_a_drive_against_itself(verb: Verb, drive: Demo) -> None:
     """The positives are those that the truth has, counted pair by pair."""
     found = verb(
         "compare", drive.log, "--min-gap", 20, "--truth", drive.truth, "--methods", "bobb", "--json", *QUICK
@@ -278,7 +278,7 @@ def test_a_drive_against_itself(verb: Verb, drive: Drive) -> None:
     }
 
 
-def test_the_log_tells_its_own_truth(verb: Verb, drive: Drive) -> None:
+def test_the_log_tells_its_own_truth(verb: Verb, drive: Demo) -> None:
     """By GPS and by odometry, with the drive given twice."""
     for source in ("gps", "poses"):
         arguments = ("compare", drive.log, drive.log, "--min-gap", 20, "--truth", source, "--methods", "thumbnail")
@@ -511,7 +511,7 @@ def test_libraries_of_every_origin(
     assert str(saved) in verb(*arguments, "--library", saved).error
 
 
-def test_frames_without_truth_are_left_out(verb: Verb, drive: Drive, tmp_path: Path) -> None:
+def test_frames_without_truth_are_left_out(verb: Verb, drive: Demo, tmp_path: Path) -> None:
     part = tmp_path / "part.tum"
     lines = drive.truth.read_text().splitlines()
     kept = [line for line in lines if not line.startswith("#") and float(line.split()[0]) * 1e9 >= drive.stamp_ns[3]]
@@ -569,7 +569,7 @@ def test_another_programs_comparison_is_not_replaced(verb: Verb, traversals: tup
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == own
 
 
-def test_truth_of_another_drive(verb: Verb, traversals: tuple[Path, Path], drive: Drive) -> None:
+def test_truth_of_another_drive(verb: Verb, traversals: tuple[Path, Path], drive: Demo) -> None:
     said = verb("compare", traversals[1], traversals[0], "--truth", drive.truth, "--methods", "bobb", *QUICK).error
     assert "covers none of the 16 frames of the query dusk" in said
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     import pytest
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 EXTRACTION = ("vplog.run.feature_extraction", "vplog.features.sift")
 COUNTS = ("logs/messages/h264.py", "features/sift.py", "features/stereo_depth.py", "features/__init__.py")
@@ -40,7 +40,7 @@ def test_code_counts_where_it_is_imported(tmp_path: Path, monkeypatch: pytest.Mo
     assert len({before, *found}) == len(COUNTS) + 1
 
 
-def test_all_code_that_a_part_runs_counts(tiny: Drive) -> None:
+def test_all_code_that_a_part_runs_counts(tiny: Demo) -> None:
     """What of the package a process has loaded after computing a part is among the files that its key is made of."""
     code = f"""
 import sys

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from conftest import Said
     from mcap.records import Message
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
     Verb = Callable[..., Said]
     Change = Callable[[str, int, bytes], bytes | None]
@@ -261,13 +261,13 @@ def test_help_is_a_verb_too(verb: Verb) -> None:
     assert verb("-V").out == verb("--version").out
 
 
-def test_a_mistyped_topic_finds_the_one_meant(verb: Verb, drive: Drive) -> None:
+def test_a_mistyped_topic_finds_the_one_meant(verb: Verb, drive: Demo) -> None:
     for typed in (IMAGE.strip("/"), IMAGE.upper(), IMAGE[:-2]):
         error = verb("info", drive.log, "--image-topic", typed).error
         assert f"Did you mean {IMAGE}?" in error
 
 
-def test_json_of_info(verb: Verb, drive: Drive) -> None:
+def test_json_of_info(verb: Verb, drive: Demo) -> None:
     said = verb("info", drive.log, "--json")
     assert said.err == ""
     assert said.json["kind"] == "mcap"
@@ -276,7 +276,7 @@ def test_json_of_info(verb: Verb, drive: Drive) -> None:
     np.testing.assert_allclose(said.json["camera"]["matrix"], drive.camera.matrix)
 
 
-def test_info_in_words_names_topics_and_the_command_to_run(verb: Verb, drive: Drive) -> None:
+def test_info_in_words_names_topics_and_the_command_to_run(verb: Verb, drive: Demo) -> None:
     said = verb("info", drive.log)
     assert said.code == 0
     assert IMAGE in said.out
@@ -284,7 +284,7 @@ def test_info_in_words_names_topics_and_the_command_to_run(verb: Verb, drive: Dr
     assert f"vplog run {drive.log} -o OUT" in said.out
 
 
-def test_json_of_library_and_run(compiled: None, verb: Verb, tiny: Drive, tmp_path: Path) -> None:
+def test_json_of_library_and_run(compiled: None, verb: Verb, tiny: Demo, tmp_path: Path) -> None:
     made = verb("library", tiny.log, "-o", tmp_path / "library", *QUICK, "--json")
     assert made.err == ""
     assert made.json["references"] == 4
@@ -295,7 +295,7 @@ def test_json_of_library_and_run(compiled: None, verb: Verb, tiny: Drive, tmp_pa
     assert {**record_of(tmp_path / "run"), "run": str(tmp_path / "run")} == ran.json
 
 
-def test_json_of_evaluate_config_and_schemas(verb: Verb, drive: Drive, finished: Path, tmp_path: Path) -> None:
+def test_json_of_evaluate_config_and_schemas(verb: Verb, drive: Demo, finished: Path, tmp_path: Path) -> None:
     for truth in (str(drive.truth), "gps"):
         said = verb("evaluate", finished, "--truth", truth, "--json")
         assert said.err == ""
@@ -304,7 +304,7 @@ def test_json_of_evaluate_config_and_schemas(verb: Verb, drive: Drive, finished:
     assert verb("schemas", "-o", tmp_path / "schemas", "--json").json["written"]
 
 
-def test_evaluate_says_by_which_criteria(verb: Verb, drive: Drive, finished: Path, tmp_path: Path) -> None:
+def test_evaluate_says_by_which_criteria(verb: Verb, drive: Demo, finished: Path, tmp_path: Path) -> None:
     found = verb("evaluate", finished, "--truth", drive.truth, "--json").json
     closures = found["closures"]
     assert closures["accepted_true"] + closures["accepted_false"] + closures["not_judged"] == closures["accepted"] > 0
@@ -325,7 +325,7 @@ def test_evaluate_says_by_which_criteria(verb: Verb, drive: Drive, finished: Pat
 
 
 def test_evaluate_with_a_clock_that_is_said_to_be_off_and_a_truth_of_the_camera(
-    verb: Verb, drive: Drive, finished: Path, tmp_path: Path
+    verb: Verb, drive: Demo, finished: Path, tmp_path: Path
 ) -> None:
     from vplog.data import Trajectory
     from vplog.evaluate.truth import read_truth
@@ -349,7 +349,7 @@ def test_evaluate_with_a_clock_that_is_said_to_be_off_and_a_truth_of_the_camera(
     assert not np.array_equal(se3.inverse(camera), camera)
 
 
-def test_evaluate_and_config_in_words(verb: Verb, drive: Drive, finished: Path, tmp_path: Path) -> None:
+def test_evaluate_and_config_in_words(verb: Verb, drive: Demo, finished: Path, tmp_path: Path) -> None:
     assert "ATE rmse" in verb("evaluate", finished, "--truth", drive.truth).out
     assert "ATE rmse" in verb("evaluate", finished, "--truth", "gps").out
     file = tmp_path / "mine.yaml"
@@ -365,7 +365,7 @@ def test_set_changes_one_setting_and_keeps_the_method(verb: Verb) -> None:
         assert changed == {**default, stage: {**default[stage], setting: value}}
 
 
-def test_the_command_runs_in_a_process_of_its_own(drive: Drive) -> None:
+def test_the_command_runs_in_a_process_of_its_own(drive: Demo) -> None:
     command = [sys.executable, "-m", "vplog", "info", drive.log, "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
@@ -450,7 +450,7 @@ def image_folder(folder: Path, _: Path) -> Path:
     ids=lambda value: value.__name__ if callable(value) else "",
 )
 def test_a_log_that_cannot_be_run_is_one_line(
-    verb: Verb, tiny: Drive, tmp_path: Path, make: Callable[[Path, Path], Path], why: str
+    verb: Verb, tiny: Demo, tmp_path: Path, make: Callable[[Path, Path], Path], why: str
 ) -> None:
     log = make(tmp_path, tiny.log)
     error = verb("run", log, "-o", tmp_path / "run", *QUICK).error
@@ -460,7 +460,7 @@ def test_a_log_that_cannot_be_run_is_one_line(
 
 @pytest.mark.parametrize("make", [no_odometry, only_nan_odometry])
 def test_a_log_without_odometry_is_run_by_its_images_unless_it_may_not(
-    verb: Verb, tiny: Drive, tmp_path: Path, make: Callable[[Path, Path], Path]
+    verb: Verb, tiny: Demo, tmp_path: Path, make: Callable[[Path, Path], Path]
 ) -> None:
     log = make(tmp_path, tiny.log)
     assert "has no odometry" in verb("run", log, "-o", tmp_path / "run", "--odometry", "", *QUICK).error
@@ -470,7 +470,7 @@ def test_a_log_without_odometry_is_run_by_its_images_unless_it_may_not(
     assert any("visual odometry of its images is used" in line for line in found["warnings"])
 
 
-def test_topics_that_are_not_there_are_named_with_the_choices(verb: Verb, drive: Drive, tmp_path: Path) -> None:
+def test_topics_that_are_not_there_are_named_with_the_choices(verb: Verb, drive: Demo, tmp_path: Path) -> None:
     error = verb("run", drive.log, "-o", tmp_path / "run", "--image-topic", "/nowhere").error
     assert "/nowhere" in error
     assert IMAGE in error
@@ -503,7 +503,7 @@ def test_topics_that_are_not_there_are_named_with_the_choices(verb: Verb, drive:
     ids=lambda value: value[1] if isinstance(value, tuple) else "",
 )
 def test_settings_that_do_not_fit_are_one_line(
-    verb: Verb, drive: Drive, tmp_path: Path, options: tuple[str, ...], why: str
+    verb: Verb, drive: Demo, tmp_path: Path, options: tuple[str, ...], why: str
 ) -> None:
     assert why in verb("run", drive.log, "-o", tmp_path / "run", *options).error
     assert why in verb("config", *options).error
@@ -517,7 +517,7 @@ def test_pipeline_files_that_are_none(verb: Verb, tmp_path: Path, text: str) -> 
     assert str(file) in verb("config", "--pipeline", file).error
 
 
-def test_output_that_cannot_be_a_run_folder(verb: Verb, drive: Drive, tmp_path: Path) -> None:
+def test_output_that_cannot_be_a_run_folder(verb: Verb, drive: Demo, tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "holiday.jpg").touch()
     (tmp_path / "file").write_text("mine")
@@ -527,7 +527,7 @@ def test_output_that_cannot_be_a_run_folder(verb: Verb, drive: Drive, tmp_path: 
     assert [path.name for path in (tmp_path / "photos").iterdir()] == ["holiday.jpg"]
 
 
-def test_output_of_the_other_verbs_that_cannot_be_written(verb: Verb, drive: Drive, tmp_path: Path) -> None:
+def test_output_of_the_other_verbs_that_cannot_be_written(verb: Verb, drive: Demo, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     for out in ("file", "file/below"):
         assert "file" in verb("schemas", "-o", tmp_path / out).error
@@ -538,7 +538,7 @@ def test_output_of_the_other_verbs_that_cannot_be_written(verb: Verb, drive: Dri
 
 @pytest.mark.parametrize("damage", ["missing", "no record", "cut record", "cut table", "empty table", "other settings"])
 def test_a_library_that_cannot_be_used_is_one_line(
-    verb: Verb, drive: Drive, finished: Path, tmp_path: Path, damage: str
+    verb: Verb, drive: Demo, finished: Path, tmp_path: Path, damage: str
 ) -> None:
     library = tmp_path / "library"
     if damage != "missing":
@@ -559,7 +559,7 @@ def test_a_library_that_cannot_be_used_is_one_line(
         assert not (tmp_path / "run").exists(), "told before the run began"
 
 
-def test_a_truth_that_does_not_fit_is_one_line(verb: Verb, drive: Drive, finished: Path, tmp_path: Path) -> None:
+def test_a_truth_that_does_not_fit_is_one_line(verb: Verb, drive: Demo, finished: Path, tmp_path: Path) -> None:
     assert "missing.tum" in verb("evaluate", finished, "--truth", tmp_path / "missing.tum").error
     assert "Cannot read" in verb("evaluate", finished, "--truth", tmp_path).error
     for name, data in (
@@ -575,7 +575,7 @@ def test_a_truth_that_does_not_fit_is_one_line(verb: Verb, drive: Drive, finishe
     assert "clock" in verb("evaluate", finished, "--truth", tmp_path / "other.tum").error
 
 
-def test_what_is_no_finished_run_cannot_be_evaluated(verb: Verb, drive: Drive, finished: Path, tmp_path: Path) -> None:
+def test_what_is_no_finished_run_cannot_be_evaluated(verb: Verb, drive: Demo, finished: Path, tmp_path: Path) -> None:
     assert "run.json" in verb("evaluate", tmp_path / "nowhere", "--truth", drive.truth).error
     assert "run.json" in verb("evaluate", drive.log.parent, "--truth", drive.truth).error
     run = tmp_path / "run"
@@ -600,7 +600,7 @@ def test_what_is_no_finished_run_cannot_be_evaluated(verb: Verb, drive: Drive, f
     assert "trajectory.parquet" in verb("evaluate", run, "--truth", drive.truth).error
 
 
-def test_a_log_without_gps_has_no_gps_truth(verb: Verb, drive: Drive, finished: Path, tmp_path: Path) -> None:
+def test_a_log_without_gps_has_no_gps_truth(verb: Verb, drive: Demo, finished: Path, tmp_path: Path) -> None:
     log = changed(drive.log, tmp_path / "indoors.mcap", without(GPS))
     shutil.copytree(finished, tmp_path / "run")
     (tmp_path / "run" / "run.json").write_text(json.dumps({**record_of(finished), "log": str(log)}))
@@ -623,7 +623,7 @@ def assert_all_finite(run: Path) -> None:
     assert np.isfinite(keyframes).all()
 
 
-def test_a_log_cut_in_the_middle_is_run_as_far_as_it_goes(verb: Verb, tiny: Drive, tmp_path: Path) -> None:
+def test_a_log_cut_in_the_middle_is_run_as_far_as_it_goes(verb: Verb, tiny: Demo, tmp_path: Path) -> None:
     data = tiny.log.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 6 // 10])
     record = run_quick(verb, tmp_path / "cut.mcap", tmp_path / "run")
@@ -632,7 +632,7 @@ def test_a_log_cut_in_the_middle_is_run_as_far_as_it_goes(verb: Verb, tiny: Driv
     assert_all_finite(tmp_path / "run")
 
 
-def test_undecodable_images_are_left_out_and_counted(verb: Verb, tiny: Drive, tmp_path: Path) -> None:
+def test_undecodable_images_are_left_out_and_counted(verb: Verb, tiny: Demo, tmp_path: Path) -> None:
     def spoil(topic: str, number: int, data: bytes) -> bytes:
         return data[:120] + bytes(len(data) - 120) if topic == IMAGE and number % 8 == 3 else data
 
@@ -645,7 +645,7 @@ def test_undecodable_images_are_left_out_and_counted(verb: Verb, tiny: Drive, tm
     assert_all_finite(tmp_path / "run")
 
 
-def test_odometry_that_is_not_finite_is_left_out_and_counted(verb: Verb, tiny: Drive, tmp_path: Path) -> None:
+def test_odometry_that_is_not_finite_is_left_out_and_counted(verb: Verb, tiny: Demo, tmp_path: Path) -> None:
     values = [np.nan, np.inf, -np.inf, 1e300]
 
     def spoil(number: int, x: float) -> float:
@@ -657,7 +657,7 @@ def test_odometry_that_is_not_finite_is_left_out_and_counted(verb: Verb, tiny: D
     assert_all_finite(tmp_path / "run")
 
 
-def test_frames_without_odometry_are_left_out_with_a_warning(verb: Verb, tiny: Drive, tmp_path: Path) -> None:
+def test_frames_without_odometry_are_left_out_with_a_warning(verb: Verb, tiny: Demo, tmp_path: Path) -> None:
     log = changed(
         tiny.log, tmp_path / "half.mcap", lambda topic, n, data: None if topic == ODOMETRY and n > 160 else data
     )
@@ -667,7 +667,7 @@ def test_frames_without_odometry_are_left_out_with_a_warning(verb: Verb, tiny: D
     assert_all_finite(tmp_path / "run")
 
 
-def test_standing_still_all_the_time_is_said(verb: Verb, tiny: Drive, tmp_path: Path) -> None:
+def test_standing_still_all_the_time_is_said(verb: Verb, tiny: Demo, tmp_path: Path) -> None:
     """The odometry says that nothing moves, whatever the camera sees."""
     first: list[Any] = []
 
@@ -688,7 +688,7 @@ def test_standing_still_all_the_time_is_said(verb: Verb, tiny: Drive, tmp_path: 
 # Runs that are cut short
 
 
-def begun(tiny: Drive, out: Path) -> Forked:
+def begun(tiny: Demo, out: Path) -> Forked:
     """A run that has begun to keep what it comes to."""
     code = f"""
 from vplog.run import feature_extraction as parts
@@ -703,7 +703,7 @@ parts.PART_KEYFRAMES = 4  # the first is soon there
 
 
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_interrupted_in_the_middle(tiny: Drive, tmp_path: Path, sent: signal.Signals, code: int) -> None:
+def test_interrupted_in_the_middle(tiny: Demo, tmp_path: Path, sent: signal.Signals, code: int) -> None:
     process = begun(tiny, tmp_path / "run")
     process.send(sent)
     status, out, err = process.ended()
@@ -717,7 +717,7 @@ def test_interrupted_in_the_middle(tiny: Drive, tmp_path: Path, sent: signal.Sig
     assert not list((tmp_path / "run").rglob("*.part"))
 
 
-def test_killed_in_the_middle_and_run_again(verb: Verb, tiny: Drive, tmp_path: Path) -> None:
+def test_killed_in_the_middle_and_run_again(verb: Verb, tiny: Demo, tmp_path: Path) -> None:
     process = begun(tiny, tmp_path / "run")
     process.send(signal.SIGKILL)
     assert process.ended()[0] == -signal.SIGKILL
@@ -728,7 +728,7 @@ def test_killed_in_the_middle_and_run_again(verb: Verb, tiny: Drive, tmp_path: P
 
 
 @pytest.mark.parametrize("limit", [2_000, 100_000])
-def test_a_full_disk_is_one_line(tiny: Drive, tmp_path: Path, limit: int) -> None:
+def test_a_full_disk_is_one_line(tiny: Demo, tmp_path: Path, limit: int) -> None:
     """A limit on the size of a file stands in for the disk: too small for run.json, or for the features."""
     code = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit})); {VPLOG}"
     status, out, err = Forked(code, "run", tiny.log, "-o", tmp_path / "run", *QUICK).ended()

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
     Verb = Callable[..., Said]
 
@@ -148,7 +148,7 @@ def test_lines_on_stderr_wrap_too_and_by_its_own_width(
 
 @pytest.mark.parametrize("columns", [50, None])
 def test_an_evaluation_wraps_between_words(
-    columns: int | None, finished: Path, drive: Drive, verb: Verb, monkeypatch: pytest.MonkeyPatch
+    columns: int | None, finished: Path, drive: Demo, verb: Verb, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = verb("evaluate", finished, "--truth", drive.truth).out.split()
     monkeypatch.setattr(printing, "terminal_width", lambda _: columns)
@@ -214,7 +214,7 @@ def test_a_joint_run_says_what_next(joint: Path, capsys: pytest.CaptureFixture[s
     assert "sigma" not in out
 
 
-def test_a_command_of_an_odd_name_can_be_copied(drive: Drive, verb: Verb, tmp_path: Path) -> None:
+def test_a_command_of_an_odd_name_can_be_copied(drive: Demo, verb: Verb, tmp_path: Path) -> None:
     import shlex
 
     log = changed(drive.log, tmp_path / "my drive's.mcap", without("/none"))

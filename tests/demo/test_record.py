@@ -20,7 +20,7 @@ from vplog.demo.record import (
     ODOMETRY,
     TF_STATIC,
     TYPES,
-    Drive,
+    Demo,
 )
 from vplog.demo.scene import make_scene, take_picture
 from vplog.errors import ResultError
@@ -34,12 +34,12 @@ SETTINGS = SMALL.model_copy(update={"width": 320, "height": 180, "laps": 0.3, "d
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Demo:
     return make_drive(tmp_path_factory.mktemp("demo"), SETTINGS, Execution(2))
 
 
 @pytest.fixture(scope="module")
-def messages(drive: Drive) -> dict[str, list[tuple[int, Any]]]:
+def messages(drive: Demo) -> dict[str, list[tuple[int, Any]]]:
     """Log time and message by topic, as rosbags reads them."""
     result: dict[str, list[tuple[int, Any]]] = {}
     with AnyReader([drive.log]) as reader:
@@ -54,7 +54,7 @@ def stamp_ns(message: Any) -> int:
     return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
 
-def test_all_topics_are_there_with_a_message_for_every_stamp(drive: Drive, messages: dict) -> None:
+def test_all_topics_are_there_with_a_message_for_every_stamp(drive: Demo, messages: dict) -> None:
     assert set(messages) == {IMAGE, CAMERA_INFO, DEPTH, DEPTH_INFO, GPS, ODOMETRY, TF_STATIC}
     for topic in (IMAGE, CAMERA_INFO, DEPTH, DEPTH_INFO):
         assert [stamp_ns(m) for _, m in messages[topic]] == drive.stamp_ns.tolist()
@@ -62,7 +62,7 @@ def test_all_topics_are_there_with_a_message_for_every_stamp(drive: Drive, messa
     assert len(messages[TF_STATIC]) == 1
 
 
-def test_messages_are_logged_2_to_30_ms_late_and_in_order(drive: Drive, messages: dict) -> None:
+def test_messages_are_logged_2_to_30_ms_late_and_in_order(drive: Demo, messages: dict) -> None:
     for topic in set(messages) - {TF_STATIC}:
         for log_ns, message in messages[topic]:
             assert 2_000_000 <= log_ns - stamp_ns(message) <= 30_000_000
@@ -78,7 +78,7 @@ def test_messages_are_logged_2_to_30_ms_late_and_in_order(drive: Drive, messages
     assert {c.compression for c in summary.chunk_indexes} == {"zstd"}
 
 
-def test_images_are_the_rendered_ones(drive: Drive, messages: dict) -> None:
+def test_images_are_the_rendered_ones(drive: Demo, messages: dict) -> None:
     scene = make_scene(SETTINGS)
     for frame in (0, 3):
         rendered, depth = take_picture(scene, frame)
@@ -95,7 +95,7 @@ def test_images_are_the_rendered_ones(drive: Drive, messages: dict) -> None:
         np.testing.assert_allclose(mm[known] / 1000, depth[known], atol=0.00051)
 
 
-def test_calibration_and_mounting_are_the_drives(drive: Drive, messages: dict) -> None:
+def test_calibration_and_mounting_are_the_drives(drive: Demo, messages: dict) -> None:
     info = messages[CAMERA_INFO][0][1]
     assert drive.camera.matrix is not None
     np.testing.assert_array_equal(info.k.reshape(3, 3), drive.camera.matrix)
@@ -117,7 +117,7 @@ def test_odometry_has_a_usable_covariance_and_starts_at_its_origin(messages: dic
     assert (np.linalg.eigvalsh(covariance) > 0).all()
 
 
-def test_truth_covers_every_frame_and_sample(drive: Drive) -> None:
+def test_truth_covers_every_frame_and_sample(drive: Demo) -> None:
     lines = [line.split() for line in drive.truth.read_text().splitlines()[1:]]
     truth = {int(line[0].replace(".", "")): np.array(line[1:], float) for line in lines}
     assert list(truth) == sorted(truth)
@@ -127,7 +127,7 @@ def test_truth_covers_every_frame_and_sample(drive: Drive) -> None:
         np.testing.assert_allclose(rotation(truth[stamp][3:]), pose[:3, :3], atol=1e-8)
 
 
-def test_the_number_of_threads_does_not_change_a_byte(drive: Drive, tmp_path: Path) -> None:
+def test_the_number_of_threads_does_not_change_a_byte(drive: Demo, tmp_path: Path) -> None:
     again = make_drive(tmp_path, SETTINGS, Execution())
     assert again.log.read_bytes() == drive.log.read_bytes()
     assert again.truth.read_bytes() == drive.truth.read_bytes()

@@ -25,7 +25,7 @@ from vplog.run.reference_library import build_library
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def test_stores_keep_descriptors_of_any_length(references: list[Reference], tmp_
                 np.testing.assert_array_equal(getattr(store[row], name), getattr(reference.features, name))
 
 
-def test_a_drive_with_features_of_a_network(drive: Drive, network: Path, tmp_path: Path) -> None:
+def test_a_drive_with_features_of_a_network(drive: Demo, network: Path, tmp_path: Path) -> None:
     """Boxes are mined over them, and geometry verifies closures by them."""
     tree = {"features": {"kind": "onnx", "model": str(network)}, "places": {"references": 4}, "library": {"size": 8}}
     pipeline = pipeline_from(tree, "mine.yaml")

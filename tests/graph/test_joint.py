@@ -11,7 +11,7 @@ from tests.graph import drive as drives
 from vplog.data import EdgeKind, Trajectory
 from vplog.evaluate.trajectory import ate
 from vplog.geometry import se3
-from vplog.graph.joint import Between, Drive, JoinSettings, join
+from vplog.graph.joint import Between, JoinSettings, SessionGraph, join
 from vplog.graph.refine import RefineSettings
 from vplog.graph.solve import GncSettings
 
@@ -19,13 +19,13 @@ SHIFT = se3.exp(np.array([0.1, -0.2, 2.0, 30.0, 10.0, -3.0]))
 CLOSURE = np.diag(1.0 / drives.CLOSURE_SIGMA**2)
 
 
-def lap(seed: int) -> tuple[Drive, np.ndarray]:
+def lap(seed: int) -> tuple[SessionGraph, np.ndarray]:
     ring = drives.ring(80, loops=10, seed=seed)
     graph = ring.graph
-    return Drive(graph, np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind])), ring.true
+    return SessionGraph(graph, np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind])), ring.true
 
 
-def moved(drive: Drive, by: np.ndarray) -> Drive:
+def moved(drive: SessionGraph, by: np.ndarray) -> SessionGraph:
     return replace(drive, graph=replace(drive.graph, world_from_body=by @ drive.graph.world_from_body))
 
 
@@ -95,7 +95,7 @@ def test_no_ties_no_maps() -> None:
     assert found.solved == {}
 
 
-def mistold(seed: int, factor: float) -> tuple[Drive, np.ndarray]:
+def mistold(seed: int, factor: float) -> tuple[SessionGraph, np.ndarray]:
     """A lap whose odometry is worse than it says."""
     (first, true), random = lap(seed), np.random.default_rng(seed)
     graph, odometry = first.graph, first.of_odometry

@@ -7,7 +7,7 @@ import pytest
 
 from vplog.geometry import se3
 from vplog.loops import pose_refinement
-from vplog.loops.pose_refinement import Matches
+from vplog.loops.pose_refinement import LandmarkMatches
 
 
 def landmarks(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -18,10 +18,10 @@ def of_rays(sigma: float, count: int) -> np.ndarray:
     return np.tile(sigma**2 * np.eye(2), (count, 1, 1))
 
 
-def image_only(points: np.ndarray, covariance: np.ndarray, seen: np.ndarray) -> Matches:
+def image_only(points: np.ndarray, covariance: np.ndarray, seen: np.ndarray) -> LandmarkMatches:
     """Landmarks whose depth the query did not measure, each ray with a standard deviation of 1e-3."""
     unknown = np.full(len(points), np.nan)
-    return Matches(points, covariance, seen, of_rays(1e-3, len(points)), unknown, unknown)
+    return LandmarkMatches(points, covariance, seen, of_rays(1e-3, len(points)), unknown, unknown)
 
 
 def predict(match_from_query: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -58,9 +58,10 @@ def test_the_pose_is_found_and_its_covariance_is_that_of_its_errors(deep: bool) 
         seen = exact[:, :2] + rng.normal(0, sigma, (40, 2))
         rho = exact[:, 2] + rng.normal(0, rho_sigma, 40) if deep else np.full(40, np.nan)
         start = true @ se3.exp(rng.normal(0, 0.02, 6))
-        found, hessian, excess = pose_refinement.fit(
-            start, Matches(points, np.zeros((40, 3, 3)), seen, of_rays(sigma, 40), rho, np.full(40, rho_sigma**2))
+        matches = LandmarkMatches(
+            points, np.zeros((40, 3, 3)), seen, of_rays(sigma, 40), rho, np.full(40, rho_sigma**2)
         )
+        found, hessian, excess = pose_refinement.fit(start, matches)
         error = se3.log(se3.between(true, found))
         errors.append(error @ hessian @ error / 6)
         assert 0.4 < excess < 1.6

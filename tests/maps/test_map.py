@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
     from vplog.stages import PlaceState
 
     Verb = Callable[..., Said]
@@ -94,7 +94,7 @@ def test_the_best_of_the_drives_are_those_of_one_index(root: Path, library: str)
         assert answers.keyframe[at, :count].tolist() == [rows[row] for row in ranking.rows]
 
 
-def test_a_drive_is_found_where_it_is(root: Path, drive: Drive, verb: Verb, tmp_path: Path) -> None:
+def test_a_drive_is_found_where_it_is(root: Path, drive: Demo, verb: Verb, tmp_path: Path) -> None:
     out, query = tmp_path / "placed.parquet", ("map", "query", root, drive.log, "--top", 3, "--sequence", 5)
     told = verb(*query, "-o", out, "--json", "--threads", 2).json
     table, digest = pq.read_table(out), hashlib.sha256(out.read_bytes()).hexdigest()
@@ -107,7 +107,7 @@ def test_a_drive_is_found_where_it_is(root: Path, drive: Drive, verb: Verb, tmp_
     assert hashlib.sha256(out.read_bytes()).hexdigest() == digest
 
 
-def test_places_of_another_library_are_refused(root: Path, finished: Path, drive: Drive, verb: Verb) -> None:
+def test_places_of_another_library_are_refused(root: Path, finished: Path, drive: Demo, verb: Verb) -> None:
     with map_store.writing(root) as store:
         put_rows(store, "stranger", finished, "f" * 64)
     assert "places do not compare" in verb("map", "query", root, drive.log).error
@@ -120,7 +120,7 @@ def test_places_of_another_library_are_refused(root: Path, finished: Path, drive
     assert "all is damaged and left out" in verb("map", "query", root, drive.log).err
 
 
-def test_what_is_no_map_is_one_line(root: Path, drive: Drive, verb: Verb, tmp_path: Path) -> None:
+def test_what_is_no_map_is_one_line(root: Path, drive: Demo, verb: Verb, tmp_path: Path) -> None:
     assert "is not a map" in verb("map", "info", tmp_path).error
     assert "is not a map" in verb("map", "query", tmp_path / "gone", drive.log).error
     record = run_record.read_run_json(root / "map.json")

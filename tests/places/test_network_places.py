@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tests.conftest import Said
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
     from vplog.stages import PlaceState
 
 FRAMES = 12
@@ -356,7 +356,7 @@ def test_methods_and_pipelines_name_a_file(network: Path, pair: Path) -> None:
 # Runs and maps
 
 
-def test_runs_and_maps_by_a_network_and_by_its_vectors(drive: Drive, verb: Callable[..., Said], tmp_path: Path) -> None:
+def test_runs_and_maps_by_a_network_and_by_its_vectors(drive: Demo, verb: Callable[..., Said], tmp_path: Path) -> None:
     """The same places, and the same answers of a map, from either."""
     net, log = block_means(tmp_path), logs.open(drive.log)
     state = OnnxSettings(model=str(net)).learn([reference(0)], Execution())

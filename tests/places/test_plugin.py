@@ -24,7 +24,7 @@ from vplog.testing.recogniser_contract import RecogniserContract
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 NAME = "mean_colours"
 SMALL = {"features": {"max_features": 100, "max_megapixels": 0.02}, "library": {"size": 4}}
@@ -77,7 +77,7 @@ def test_a_plugin_is_imported_when_it_is_named_and_not_before() -> None:
 
 
 @pytest.mark.usefixtures("installed")
-def test_compare_names_it_as_its_own(tiny: Drive, tmp_path: Path) -> None:
+def test_compare_names_it_as_its_own(tiny: Demo, tmp_path: Path) -> None:
     options = CompareOptions(library_size=3, min_gap=5, out=tmp_path / "out")
     pipeline = Pipeline(features=SiftSettings(max_features=60, max_megapixels=0.01))
     done = compare(tiny.log, None, [NAME, f"{NAME}:blocks=2"], TruthChoice("poses"), pipeline, options)
@@ -87,7 +87,7 @@ def test_compare_names_it_as_its_own(tiny: Drive, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("installed")
-def test_a_run_with_a_library_of_a_plugin(tiny: Drive, tmp_path: Path) -> None:
+def test_a_run_with_a_library_of_a_plugin(tiny: Demo, tmp_path: Path) -> None:
     pipeline = pipeline_from({**SMALL, "places": {"kind": NAME, "blocks": 2}}, "mine.yaml")
     build_library([tiny.log], tmp_path / "library", pipeline)
     again = Pipeline.read(pipeline.model_dump(mode="json"), "run.json")
@@ -141,7 +141,7 @@ def test_two_packages_of_one_name_are_told(tmp_path: Path, monkeypatch: pytest.M
         read_method("same", Pipeline())
 
 
-def test_logs_keep_colour_for_it(tiny: Drive, tmp_path: Path) -> None:
+def test_logs_keep_colour_for_it(tiny: Demo, tmp_path: Path) -> None:
     log = logs.open(tiny.log)
     frame = next(iter(log.frames(log.stamps()[:1])))
     assert frame.decode().colour is None

@@ -20,7 +20,7 @@ from vplog.run.reference_library import build_library
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 COUNTS = st.integers(1, 3000)
 SIZES = st.one_of(st.none(), st.integers(1, 400))
@@ -72,7 +72,7 @@ def test_an_unknown_way_is_refused_with_the_choices() -> None:
         LibrarySettings.read({"choose": "best"}, "test")
 
 
-def test_a_run_keeps_the_images_that_its_features_chose(drive: Drive, tmp_path: Path) -> None:
+def test_a_run_keeps_the_images_that_its_features_chose(drive: Demo, tmp_path: Path) -> None:
     """The images are read from the log a second time: each must be the one at its reference's stamp."""
     done = run(
         drive.log,
@@ -89,7 +89,7 @@ def test_a_run_keeps_the_images_that_its_features_chose(drive: Drive, tmp_path: 
         assert np.array_equal(encoded.decode().image, reference.image)
 
 
-def test_what_one_drive_explains_the_other_need_not(drive: Drive, tmp_path: Path) -> None:
+def test_what_one_drive_explains_the_other_need_not(drive: Demo, tmp_path: Path) -> None:
     pipeline = load_pipeline("default", [*QUICK, "library.size=12"])
     build_library([drive.log, drive.log], tmp_path / "twice", pipeline, execution=Execution(2))
     stamps = [reference.stamp_ns for reference in load_references(tmp_path / "twice")]
@@ -97,7 +97,7 @@ def test_what_one_drive_explains_the_other_need_not(drive: Drive, tmp_path: Path
     assert len(set(stamps)) == 12, "two equal drives, and no view of them twice"
 
 
-def test_a_library_without_keypoints_serves_other_drives(drive: Drive, tmp_path: Path) -> None:
+def test_a_library_without_keypoints_serves_other_drives(drive: Demo, tmp_path: Path) -> None:
     """Places described by patches alone, as `quick` has them."""
     pipeline = load_pipeline("quick", ["pictures.megapixels=0", "library.size=12"])
     build_library([drive.log], tmp_path / "library", pipeline)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
     from vplog.run.back_end import BackEndResult
 
 HEADER = "query,match,decision,who,when,reason\n"
@@ -100,7 +100,7 @@ def test_a_true_closure_is_accepted_without_a_warning_and_rejected_with_one() ->
 
 
 def test_a_run_follows_decisions_and_computes_no_image_again(
-    finished: Path, drive: Drive, verb: Callable[..., Said], tmp_path: Path
+    finished: Path, drive: Demo, verb: Callable[..., Said], tmp_path: Path
 ) -> None:
     out, path = tmp_path / "run", tmp_path / "decisions.csv"
     shutil.copytree(finished, out)
@@ -129,7 +129,7 @@ def test_a_run_follows_decisions_and_computes_no_image_again(
     assert "Accepted: A known inlier" in verb("explain", out, "--closure", row, "--no-picture").out
 
 
-def test_decisions_are_for_one_drive(drive: Drive, verb: Callable[..., Said], tmp_path: Path) -> None:
+def test_decisions_are_for_one_drive(drive: Demo, verb: Callable[..., Said], tmp_path: Path) -> None:
     (tmp_path / "decisions.csv").write_text(HEADER)
     given = "-o", tmp_path / "out", "--decisions", tmp_path / "decisions.csv"
     assert "one drive at a time" in verb("run", drive.log, drive.log, *given).error

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mcap.records import Message
 
     from tests.conftest import Said
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 QUICK = (
     "--set", "pictures.closures=0", "--set", "pictures.megapixels=0", "--set", "features.max_features=600",
@@ -34,7 +34,7 @@ HORIZON = 0.6
 
 
 @pytest.fixture(scope="module")
-def bonnet(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bonnet(drive: Demo, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The drive with the same texture in the lower part of each image, and its mask."""
     folder = tmp_path_factory.mktemp("bonnet")
     size = (SMALL.height, SMALL.width)
@@ -72,7 +72,7 @@ def test_a_masked_bonnet_neither_hides_closures_nor_makes_them(
 
 
 def test_a_mask_counts_by_its_content_and_not_by_its_name(
-    tiny: Drive, verb: Callable[..., Said], tmp_path: Path
+    tiny: Demo, verb: Callable[..., Said], tmp_path: Path
 ) -> None:
     mask, out = tmp_path / "mask.png", tmp_path / "run"
     used = np.full((tiny.camera.height, tiny.camera.width), 255, np.uint8)

@@ -29,7 +29,7 @@ from vplog.verbs.evaluate_run import TruthOptions, evaluate
 
 if TYPE_CHECKING:
     from vplog.data import Floats
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
     from vplog.run.visual_odometry.sensor import Points
 
 SENSOR = Sensor(Camera("camera", np.array([[500, 0, 320], [0, 500, 240], [0, 0, 1.0]]), "none", np.zeros(0), 640, 480,
@@ -215,7 +215,7 @@ def test_the_ratios_of_closures_give_one_scale() -> None:
     np.testing.assert_allclose(keyframes.odom_from_body, found.odom_from_body, atol=1e-9)
 
 
-def test_a_run_without_metres_is_evaluated_with_a_scale(finished: Path, drive: Drive, tmp_path: Path) -> None:
+def test_a_run_without_metres_is_evaluated_with_a_scale(finished: Path, drive: Demo, tmp_path: Path) -> None:
     """The finished run, said to have a unit of its own."""
     folder = Path(shutil.copytree(finished, tmp_path / "run"))
     record = run_record.read_finished_run(folder)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Camera
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 QUICK = (
     "features.max_features=200", "features.max_megapixels=0.03", "features.min_features=0", "library.size=6",
@@ -35,7 +35,7 @@ VISUAL = logs.TopicChoice(odometry="visual")
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Demo:
     settings = SMALL.model_copy(update={"depth": True, "frame_rate_hz": 4.0, "laps": 1.2, "width": 320, "height": 180})
     return make_drive(tmp_path_factory.mktemp("visual"), settings)
 
@@ -53,7 +53,7 @@ class Calibrated(pictures.PictureLog):
         return self.depth
 
 
-def test_a_run_by_its_images(drive: Drive, tmp_path: Path) -> None:
+def test_a_run_by_its_images(drive: Demo, tmp_path: Path) -> None:
     done = run(drive.log, tmp_path / "run", load_pipeline("default", QUICK), topics=VISUAL, execution=Execution(2))
     assert done.odometry.stamp_ns.tolist() == done.log.stamps().tolist()  # not those of /odom
     assert done.record["stages"]["odometry"]["result"] == "computed"
@@ -66,7 +66,7 @@ def test_a_run_by_its_images(drive: Drive, tmp_path: Path) -> None:
     assert again.odometry.odom_from_body.tobytes() == done.odometry.odom_from_body.tobytes()
 
 
-def test_info_names_it(drive: Drive) -> None:
+def test_info_names_it(drive: Demo) -> None:
     by_log, by_images = (preflight(drive.log, topics).record for topics in (None, VISUAL))
     assert by_log["visual_odometry"] == "possible"
     assert any("--odometry visual" in text for _, text in preflight_lines(by_log))

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
     Verb = Callable[..., Said]
 
@@ -230,7 +230,7 @@ def test_same_run_same_bytes(verb: Verb, finished: Path, tmp_path: Path) -> None
     assert files[0] == files[1]
 
 
-def test_against_the_truth(verb: Verb, finished: Path, drive: Drive, tmp_path: Path) -> None:
+def test_against_the_truth(verb: Verb, finished: Path, drive: Demo, tmp_path: Path) -> None:
     found = verb("report", finished, "--truth", drive.truth, "-o", tmp_path / "r.html", "--json").json
     text = (tmp_path / "r.html").read_text()
     assert found["bytes"] == (tmp_path / "r.html").stat().st_size
@@ -268,7 +268,7 @@ def test_accepted_closures_that_are_false_stand_out(finished: Path, wrong: int) 
     assert [columns["true"][row] for row in accepted] == ["no"] * wrong + ["yes"] * (len(accepted) - 1 - wrong) + [None]
 
 
-def test_the_curves_enclose_the_average_precision(finished: Path, drive: Drive) -> None:
+def test_the_curves_enclose_the_average_precision(finished: Path, drive: Demo) -> None:
     keyframes, _ = tables.read_keyframes(finished / "keyframes.parquet")
     closures, truth = tables.read_closures(finished / "closures.parquet"), read_truth(drive.truth)
     stop = candidate_stops(keyframes, ProposeSettings())
@@ -284,7 +284,7 @@ def test_the_curves_enclose_the_average_precision(finished: Path, drive: Drive) 
 
 
 def test_pictures_come_from_the_log_where_the_run_kept_none(
-    verb: Verb, finished: Path, drive: Drive, tmp_path: Path
+    verb: Verb, finished: Path, drive: Demo, tmp_path: Path
 ) -> None:
     from vplog.results.mcap import write_mcap
 
@@ -473,7 +473,7 @@ PAINTED = """all => all.map((one) => one.width > 99 && one.getContext("2d").getI
 
 
 def test_closures_are_selected_and_rejected_and_the_next_run_knows(
-    browser: str, finished: Path, drive: Drive, verb: Verb, tmp_path: Path
+    browser: str, finished: Path, drive: Demo, verb: Verb, tmp_path: Path
 ) -> None:
     """By mouse and keys as a person would: pan, filter, select from map, matrix, chart and ledger, reject, download."""
     sync_api = pytest.importorskip("playwright.sync_api")

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
     Verb = Callable[..., Said]
 
@@ -272,7 +272,7 @@ OTHER_THINGS = {
 @pytest.mark.parametrize("force", [[], ["--force"]], ids=["plain", "force"])
 @pytest.mark.parametrize("holds", OTHER_THINGS)
 def test_a_folder_with_other_things_stays(
-    holds: str, force: list[str], drive: Drive, tmp_path: Path, verb: Callable[..., Said]
+    holds: str, force: list[str], drive: Demo, tmp_path: Path, verb: Callable[..., Said]
 ) -> None:
     out = tmp_path / "out"
     OTHER_THINGS[holds](out)
@@ -292,7 +292,7 @@ def test_a_folder_with_other_things_stays(
      "localize RUN LOG -o", "map export RUN -o", "map query RUN LOG -o"],
 )  # fmt: skip
 def test_logs_and_results_are_not_replaced_by_a_single_file(
-    command: str, finished: Path, drive: Drive, tmp_path: Path, verb: Callable[..., Said]
+    command: str, finished: Path, drive: Demo, tmp_path: Path, verb: Callable[..., Said]
 ) -> None:
     out = shutil.copytree(finished, tmp_path / "run")
     logs = {"a.mcap": drive.log.read_bytes(), "a.bag": b"#ROSBAG V2.0\n", "a.db3": b"SQLite format 3\0"}
@@ -327,7 +327,7 @@ def test_a_folder_is_no_file_to_write_and_is_refused_before_any_work(
     )
 
 
-def test_nothing_that_writes_a_file_replaces_a_log(finished: Path, drive: Drive, tmp_path: Path) -> None:
+def test_nothing_that_writes_a_file_replaces_a_log(finished: Path, drive: Demo, tmp_path: Path) -> None:
     log = Path(shutil.copy(drive.log, tmp_path))
     (tmp_path / "link").symlink_to(log)
     for path in (log, tmp_path / "link"):
@@ -336,7 +336,7 @@ def test_nothing_that_writes_a_file_replaces_a_log(finished: Path, drive: Drive,
     assert log.read_bytes() == drive.log.read_bytes()
 
 
-def test_libraries_and_demos_take_no_other_folder(tiny: Drive, tmp_path: Path, verb: Callable[..., Said]) -> None:
+def test_libraries_and_demos_take_no_other_folder(tiny: Demo, tmp_path: Path, verb: Callable[..., Said]) -> None:
     """A file of the name of a record makes no library or study."""
     for holds in ("files", "map", "study", "library"):
         out = tmp_path / holds
@@ -359,7 +359,7 @@ def test_libraries_and_demos_take_no_other_folder(tiny: Drive, tmp_path: Path, v
 
 
 def test_an_interrupted_library_leaves_the_one_before(
-    tiny: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Demo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, pipeline = tmp_path / "library", load_pipeline("default", QUICK)
     build_library([tiny.log], out, pipeline)
@@ -378,7 +378,7 @@ def test_an_interrupted_library_leaves_the_one_before(
     assert tree(out) != before
 
 
-def test_a_library_of_another_log_is_not_replaced_without_force(verb: Verb, tiny: Drive, tmp_path: Path) -> None:
+def test_a_library_of_another_log_is_not_replaced_without_force(verb: Verb, tiny: Demo, tmp_path: Path) -> None:
     """One of the same log is, with other settings too; a damaged one is of an unknown log."""
     out, other = tmp_path / "library", tmp_path / f"other{tiny.log.suffix}"
     shutil.copyfile(tiny.log, other)
@@ -405,7 +405,7 @@ def test_a_drive_may_be_called_library() -> None:
 
 
 def test_a_run_over_that_of_another_log_is_interrupted_killed_and_gone_on_with(
-    tiny: Drive, tiny_drives: list[Path], tmp_path: Path, verb: Callable[..., Said]
+    tiny: Demo, tiny_drives: list[Path], tmp_path: Path, verb: Callable[..., Said]
 ) -> None:
     """With --force; until it is whole every verb finds the run before, and then it is that of an empty folder."""
     other = tiny_drives[1] / "drive.mcap"
@@ -457,7 +457,7 @@ def test_explained_closures_go_with_the_run_that_they_are_of(log: Path, other: P
     }
 
 
-def test_what_cannot_be_begun_leaves_no_folder(drive: Drive, tmp_path: Path, verb: Callable[..., Said]) -> None:
+def test_what_cannot_be_begun_leaves_no_folder(drive: Demo, tmp_path: Path, verb: Callable[..., Said]) -> None:
     """Nor one above it, nor does it touch a run that is there, whatever fails before anything is computed."""
     bad, log, text = tmp_path / "bad", drive.log, written(tmp_path / "x.yaml", b"nothing: 1")
     bad.mkdir()

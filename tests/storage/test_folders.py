@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
     Verb = Callable[..., Said]
 
@@ -131,7 +131,7 @@ def refused(said: Said, bad: Path, outside: Path) -> None:
 
 @pytest.mark.parametrize("name", MAP_VERBS)
 def test_a_map_with_what_is_not_its_own_is_refused(
-    whole: Path, sound: Path, outside: Path, drive: Drive, verb: Verb, tmp_path: Path, name: str
+    whole: Path, sound: Path, outside: Path, drive: Demo, verb: Verb, tmp_path: Path, name: str
 ) -> None:
     for number, (place, kind) in enumerate(each_kind(PLACES.values(), list(MAP_VERBS).index(name))):
         here = tmp_path / f"map-{number}"
@@ -147,7 +147,7 @@ def test_a_map_with_what_is_not_its_own_is_refused(
 @pytest.mark.parametrize("name", MAP_VERBS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_map_whose_head_is_no_file_is_no_map(
-    root: Path, sound: Path, outside: Path, drive: Drive, verb: Verb, tmp_path: Path, name: str, kind: str
+    root: Path, sound: Path, outside: Path, drive: Demo, verb: Verb, tmp_path: Path, name: str, kind: str
 ) -> None:
     put_bad(root / "map.json", kind, outside)
     known = {"MAP": root, "LOG": drive.log, "OUT": tmp_path / "out", "SOUND": sound}
@@ -156,7 +156,7 @@ def test_a_map_whose_head_is_no_file_is_no_map(
 
 @pytest.mark.parametrize("name", RUN_VERBS)
 def test_a_run_with_what_is_not_its_own_is_refused(
-    whole: Path, outside: Path, drive: Drive, verb: Verb, tmp_path: Path, name: str
+    whole: Path, outside: Path, drive: Demo, verb: Verb, tmp_path: Path, name: str
 ) -> None:
     places = [
         "result.mcap",
@@ -179,7 +179,7 @@ def test_a_run_with_what_is_not_its_own_is_refused(
 @pytest.mark.parametrize("name", LIBRARY_VERBS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_library_with_what_is_not_its_own_is_refused(
-    root: Path, outside: Path, drive: Drive, verb: Verb, tmp_path: Path, name: str, kind: str
+    root: Path, outside: Path, drive: Demo, verb: Verb, tmp_path: Path, name: str, kind: str
 ) -> None:
     (root / "map.json").write_text(json.dumps({**run_record.read_run_json(root / "map.json"), "settings": {}}))
     place = ("references.parquet", "features.parquet", "more/deep")[(KINDS.index(kind) + len(name)) % 3]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 QUICK = [
     f"--set={one}"
@@ -42,14 +42,14 @@ def server() -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def log(server: str, tiny: Drive) -> str:
+def log(server: str, tiny: Demo) -> str:
     with local_output(located("gs://bucket/in")) as folder:
         folder.mkdir()
         (folder / "drive.mcap").write_bytes(tiny.log.read_bytes())
     return "gs://bucket/in/drive.mcap"
 
 
-def test_a_log_reads_as_the_file_does(tiny: Drive, log: str) -> None:
+def test_a_log_reads_as_the_file_does(tiny: Demo, log: str) -> None:
     there, here = logs.open(located(log)), logs.open(tiny.log)
     assert there.name == "drive"
     assert (there.stamps() == here.stamps()).all()
@@ -60,7 +60,7 @@ def test_a_log_reads_as_the_file_does(tiny: Drive, log: str) -> None:
     assert known.version().startswith(f"length {tiny.log.stat().st_size}, time 1")
 
 
-def test_a_run_goes_from_gs_to_gs_and_is_evaluated_there(tiny: Drive, log: str, verb: Callable[..., Said]) -> None:
+def test_a_run_goes_from_gs_to_gs_and_is_evaluated_there(tiny: Demo, log: str, verb: Callable[..., Said]) -> None:
     found = verb("run", log, "-o", "gs://bucket/runs/a", "--threads", 2, "--json", *QUICK).json
     assert (found["run"], found["log"], list(found["inputs"])) == ("gs://bucket/runs/a", log, ["drive.mcap"])
     names = {path.name for path in located("gs://bucket/runs/a").iterdir()}
@@ -109,14 +109,14 @@ def test_the_store_decides_who_writes(server: str) -> None:
     objects.remove(place)
 
 
-def test_what_is_not_there_is_one_line(server: str, drive: Drive, verb: Callable[..., Said]) -> None:
+def test_what_is_not_there_is_one_line(server: str, drive: Demo, verb: Callable[..., Said]) -> None:
     assert "no such file" in verb("info", "gs://bucket/none.mcap").error
     assert "there is no bucket of this name" in verb("info", "gs://no-such-bucket/a.mcap").error
     assert "there is no bucket no-such-bucket" in verb("run", drive.log, "-o", "gs://no-such-bucket/a").error
 
 
 def test_a_server_that_is_away_is_one_line(
-    monkeypatch: pytest.MonkeyPatch, drive: Drive, verb: Callable[..., Said]
+    monkeypatch: pytest.MonkeyPatch, drive: Demo, verb: Callable[..., Said]
 ) -> None:
     monkeypatch.setenv("STORAGE_EMULATOR_HOST", "127.0.0.1:1")
     assert "does not answer (Connection refused)" in verb("info", "gs://bucket/a.mcap").error

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 QUICK = [
     f"--set={one}"
@@ -93,7 +93,7 @@ def put(source: Path, url: str) -> None:
         (folder / source.name).write_bytes(source.read_bytes())
 
 
-def test_a_log_on_s3_reads_as_the_file_does(drive: Drive, bucket: str) -> None:
+def test_a_log_on_s3_reads_as_the_file_does(drive: Demo, bucket: str) -> None:
     put(drive.log, f"{bucket}/one")
     there, here = logs.open(located(f"{bucket}/one/drive.mcap")), logs.open(drive.log)
     assert (there.stamps() == here.stamps()).all()
@@ -107,7 +107,7 @@ def test_a_log_on_s3_reads_as_the_file_does(drive: Drive, bucket: str) -> None:
     assert there.name == "drive"
 
 
-def test_a_run_goes_from_s3_to_s3_and_is_evaluated_there(tiny: Drive, bucket: str, verb: Callable[..., Said]) -> None:
+def test_a_run_goes_from_s3_to_s3_and_is_evaluated_there(tiny: Demo, bucket: str, verb: Callable[..., Said]) -> None:
     put(tiny.log, f"{bucket}/two")
     found = verb("run", f"{bucket}/two/drive.mcap", "-o", f"{bucket}/runs/a", "--threads", 2, "--json", *QUICK).json
     assert found["run"] == f"{bucket}/runs/a"
@@ -123,7 +123,7 @@ def test_a_run_goes_from_s3_to_s3_and_is_evaluated_there(tiny: Drive, bucket: st
     assert verb("evaluate", f"{bucket}/runs/a", "--truth", "gps", "--json").json["ate_after"]["rmse_m"] > 0
 
 
-def test_a_web_server_is_asked_for_parts(drive: Drive, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_web_server_is_asked_for_parts(drive: Demo, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remote_path, "_BLOCK_BYTES", 1 << 18)
     with web(drive.log.parent) as url:
         log = logs.open(located(f"{url}/drive.mcap"))

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
     Verb = Callable[..., Said]
 
@@ -52,7 +52,7 @@ class SignedHandler(RangeHandler):
 
 
 @pytest.fixture
-def server(tiny: Drive, tmp_path: Path) -> Iterator[str]:
+def server(tiny: Demo, tmp_path: Path) -> Iterator[str]:
     folder = tmp_path / "served"
     folder.mkdir()
     shutil.copy(tiny.log, folder / "drive.mcap")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def changed(finished: Path, tmp_path: Path) -> Path:
     return out
 
 
-def test_a_run_does_not_differ_from_itself(finished: Path, drive: Drive) -> None:
+def test_a_run_does_not_differ_from_itself(finished: Path, drive: Demo) -> None:
     found = diff(finished, finished, str(drive.truth))
     assert found["settings"] == {}
     assert found["closures"]["gained"] == found["closures"]["lost"] == []

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
     Verb = Callable[..., Said]
 
@@ -204,7 +204,7 @@ def test_a_closure_is_named_by_row_by_keyframes_by_stamps_or_as_the_worst(verb: 
     assert ledger.residual_after[ask("--worst")] == np.nanmax(ledger.residual_after)
 
 
-def test_a_moved_log_is_named_and_may_be_given(verb: Verb, drive: Drive, copied: Path, tmp_path: Path) -> None:
+def test_a_moved_log_is_named_and_may_be_given(verb: Verb, drive: Demo, copied: Path, tmp_path: Path) -> None:
     number = of(copied, Verdict.ACCEPTED)
     changed(copied, log=str(tmp_path / "gone.mcap"))
     error = verb("explain", copied, "--closure", number).error
@@ -217,7 +217,7 @@ def test_a_moved_log_is_named_and_may_be_given(verb: Verb, drive: Drive, copied:
     assert (copied / f"closure-{number}.png").is_file()
 
 
-def test_errors_are_one_line(verb: Verb, drive: Drive, finished: Path, copied: Path, tmp_path: Path) -> None:
+def test_errors_are_one_line(verb: Verb, drive: Demo, finished: Path, copied: Path, tmp_path: Path) -> None:
     ledger = tables.read_closures(finished / "closures.parquet")
     count, number = len(ledger), of(finished, Verdict.ACCEPTED)
     for bad in (count, 10**12, -1):
@@ -259,7 +259,7 @@ def test_without_its_library_a_run_is_shown_without_boxes(verb: Verb, copied: Pa
 
 
 @pytest.mark.parametrize("kind", ["bovf", "bobb_paper"])
-def test_other_recognisers_are_shown_with_what_they_have(verb: Verb, tiny: Drive, tmp_path: Path, kind: str) -> None:
+def test_other_recognisers_are_shown_with_what_they_have(verb: Verb, tiny: Demo, tmp_path: Path, kind: str) -> None:
     run(tiny.log, tmp_path / "run", load_pipeline("default", [*QUICK, f"places.kind={kind}"]), execution=Execution(2))
     picture = tmp_path / "a.png"
     found = verb("explain", tmp_path / "run", "--closure", 0, "-o", picture, "--json").json

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from conftest import Said
 
     from vplog.data import Floats
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
     Verb = Callable[..., Said]
 
@@ -164,7 +164,7 @@ def test_utm_is_the_path_in_metres(exported: Callable[[str], Path], finished: Pa
 
 
 @pytest.mark.skipif(importlib.util.find_spec("rerun_cli") is None, reason="rerun-sdk is not installed")
-def test_rerun_reads_its_own_with_its_blueprint(verb: Verb, drive: Drive, finished: Path, tmp_path: Path) -> None:
+def test_rerun_reads_its_own_with_its_blueprint(verb: Verb, drive: Demo, finished: Path, tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     assert verb("export", finished, "--format", "rrd", "-o", path, "--truth", drive.truth).code == 0
     rerun(tmp_path, "rrd", "verify", str(path))

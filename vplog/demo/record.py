@@ -59,7 +59,7 @@ _TYPES = get_typestore(Stores.ROS2_HUMBLE)
 
 
 @dataclass(frozen=True, eq=False)
-class Drive(Scene):
+class Demo(Scene):
     """A recorded demo drive."""
 
     log: Path
@@ -67,7 +67,7 @@ class Drive(Scene):
     """TUM trajectory, world_from_body at every odometry sample and every frame."""
 
 
-def make_drive(folder: Path, settings: DemoSettings | None = None, execution: Execution | None = None) -> Drive:
+def make_drive(folder: Path, settings: DemoSettings | None = None, execution: Execution | None = None) -> Demo:
     """Write `folder`/drive.mcap and `folder`/truth.tum; the recorded drive.
 
     Frames are rendered on all cores where `execution` is None. Raises ResultError where the folder cannot be written.
@@ -84,7 +84,7 @@ def make_drive(folder: Path, settings: DemoSettings | None = None, execution: Ex
         _write_log(log, settings, scene, execution or Execution(allowed()))
     except OSError as error:
         raise ResultError(f"Cannot write the demo drive to {folder}: {error}. Choose another folder.") from None
-    return Drive(**vars(scene), log=log, truth=truth)
+    return Demo(**vars(scene), log=log, truth=truth)
 
 
 def _check_own(path: Path, mark: bytes) -> None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from vplog.data import Floats, Ints
-    from vplog.graph.joint import Drive, JoinSettings
+    from vplog.graph.joint import JoinSettings, SessionGraph
     from vplog.graph.refine import RefineSettings
     from vplog.stages import Optimiser
 
@@ -71,7 +71,7 @@ def turned_round(one: Between) -> Between:
     )
 
 
-def place(drive: Drive, anchored: Sequence[Anchored], solve: Optimiser, settings: JoinSettings) -> Placed:
+def place(drive: SessionGraph, anchored: Sequence[Anchored], solve: Optimiser, settings: JoinSettings) -> Placed:
     """The drive in the world of drives that it has closures with. Raises GraphError where it cannot be solved.
 
     While it is decided which closures are true, the drives met may have drifted against each other, as the drive's own
@@ -109,7 +109,7 @@ def place(drive: Drive, anchored: Sequence[Anchored], solve: Optimiser, settings
 
 
 def _against(
-    drive: Drive, anchored: Sequence[Anchored], start: Floats | None = None, *, hold: bool = False
+    drive: SessionGraph, anchored: Sequence[Anchored], start: Floats | None = None, *, hold: bool = False
 ) -> tuple[PoseGraph, list[slice]]:
     """The graph of a drive and of a pose for each drive that it meets, along its way, and where the edges of each are.
 
@@ -158,7 +158,7 @@ def _against(
 
 
 def solve_again(
-    drives: Sequence[Drive],
+    drives: Sequence[SessionGraph],
     between: Sequence[Between],
     weight: Sequence[Floats],
     solve: Optimiser,

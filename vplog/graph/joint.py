@@ -60,8 +60,8 @@ class JoinSettings(Settings):
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
-    """One drive as its own closures leave it."""
+class SessionGraph:
+    """The pose graph of one drive, as its own closures leave it."""
 
     graph: PoseGraph
     """Its odometry and its own closures that were kept, with the noise that its own solve found, from its own first
@@ -108,7 +108,7 @@ class Joined:
 
 
 def join(
-    drives: Sequence[Drive],
+    drives: Sequence[SessionGraph],
     between: Sequence[Between],
     solve: Optimiser,
     settings: JoinSettings,
@@ -180,7 +180,7 @@ def maps_of(count: int, between: Sequence[Between], joined: Sequence[bool]) -> l
 
 
 def as_one(
-    drives: Sequence[Drive] | Mapping[int, Drive],
+    drives: Sequence[SessionGraph] | Mapping[int, SessionGraph],
     members: Sequence[int],
     between: Sequence[Between],
     placed: Mapping[int, Floats] | None = None,
@@ -220,7 +220,7 @@ def as_one(
 
 
 def _placed(
-    drives: Sequence[Drive] | Mapping[int, Drive], members: Sequence[int], between: Sequence[Between]
+    drives: Sequence[SessionGraph] | Mapping[int, SessionGraph], members: Sequence[int], between: Sequence[Between]
 ) -> dict[int, Floats]:
     """(4, 4) map_from_drive of each, a start for the solve: by what most closures of a pair say, pair after pair."""
     placed = {members[0]: np.eye(4)}

@@ -16,7 +16,7 @@ from vplog.geometry import se3
 from vplog.loops import pose_refinement, undistort, verify_metric
 from vplog.loops.calibration import motion_covariance
 from vplog.loops.landmarks import Landmarks, with_rho
-from vplog.loops.pose_refinement import Matches
+from vplog.loops.pose_refinement import LandmarkMatches
 from vplog.loops.verify_metric import Pose
 
 if TYPE_CHECKING:
@@ -244,7 +244,7 @@ def _agreeing(query: _Query, fit: _Fit, place: KeyframeLandmarks, anchor: Floats
     """The landmarks of a place that agree with a pose in the camera `anchor` (4, 4), in that camera."""
     rays, noise, unknown = query.rays[fit.mine], query.noise[fit.mine], np.full(len(fit.mine), np.nan)
     points, covariance = _moved(se3.between(anchor, place.world_from_camera), place.landmarks, fit.rows)
-    squared, _ = pose_refinement.agreement(pose, Matches(points, covariance, rays, noise, unknown, unknown))
+    squared, _ = pose_refinement.agreement(pose, LandmarkMatches(points, covariance, rays, noise, unknown, unknown))
     agrees = squared < verify_metric.CHI2_2
     return points[agrees], covariance[agrees], fit.mine[agrees]
 

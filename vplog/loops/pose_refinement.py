@@ -29,7 +29,7 @@ _CONVERGED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Matches:
+class LandmarkMatches:
     """K landmarks (x, y, rho) of the match's camera, each observed by the query."""
 
     points: Floats
@@ -45,9 +45,9 @@ class Matches:
     variance: Floats
     """(K,) of rho."""
 
-    def rows(self, rows: Bools) -> Matches:
+    def rows(self, rows: Bools) -> LandmarkMatches:
         """Some of the matches."""
-        return Matches(**{name: values[rows] for name, values in vars(self).items()})
+        return LandmarkMatches(**{name: values[rows] for name, values in vars(self).items()})
 
     @property
     def cloud(self) -> Floats:
@@ -55,14 +55,14 @@ class Matches:
         return np.column_stack([self.points[:, :2], np.ones(len(self.points))]) / self.points[:, 2:]
 
 
-def agreement(match_from_query: Floats, matches: Matches) -> tuple[Floats, Floats]:
+def agreement(match_from_query: Floats, matches: LandmarkMatches) -> tuple[Floats, Floats]:
     """Squared Mahalanobis distances (K,) of the image errors of matches: with the landmarks' covariance, and without
     it. NaN behind the query."""
     query_from_match = se3.inverse(match_from_query)
     return _agreement(query_from_match, matches.points, matches.covariance, matches.rays, matches.noise)
 
 
-def fit(match_from_query: Floats, matches: Matches) -> tuple[Floats, Floats, float]:
+def fit(match_from_query: Floats, matches: LandmarkMatches) -> tuple[Floats, Floats, float]:
     """Gauss-Newton over all matches: the pose, its Hessian (6, 6), the residual variance over its expectation."""
     pose, hessian, cost = gauss_newton(match_from_query, lambda pose: normal_equations(pose, matches))
     return pose, hessian, cost / max(measurements(matches) - 6.0, 1.0)
@@ -86,12 +86,12 @@ def gauss_newton(
     return pose, hessian, cost
 
 
-def measurements(matches: Matches) -> int:
+def measurements(matches: LandmarkMatches) -> int:
     """Number of coordinates and depths measured."""
     return 2 * len(matches.points) + int(np.isfinite(matches.rho).sum())
 
 
-def normal_equations(match_from_query: Floats, matches: Matches) -> tuple[Floats, Floats, float]:
+def normal_equations(match_from_query: Floats, matches: LandmarkMatches) -> tuple[Floats, Floats, float]:
     """Hessian (6, 6), gradient (6,) and robust cost of all matches in front of the query."""
     return _normal_equations(
         se3.inverse(match_from_query), matches.points, matches.covariance, matches.rays, matches.noise, matches.rho,

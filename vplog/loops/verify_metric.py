@@ -18,7 +18,7 @@ from vplog.data import Bools, Camera, Features, Float32s, Floats, Ints, Verdict
 from vplog.geometry import se3
 from vplog.loops import pose_refinement, undistort
 from vplog.loops.landmarks import inverse_depth
-from vplog.loops.pose_refinement import Matches
+from vplog.loops.pose_refinement import LandmarkMatches
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
@@ -86,9 +86,9 @@ class Pose:
 
 def observe(
     landmarks: Landmarks, rows: Ints, rays: Floats, depth_m: Float32s, camera: Camera, settings: LandmarkSettings
-) -> Matches:
+) -> LandmarkMatches:
     """Known landmarks `rows` (K,) matched to rays (K, 2) of a camera, with measured depths (K,) in m, NaN unknown."""
-    return Matches(
+    return LandmarkMatches(
         np.column_stack([landmarks.rays[rows], landmarks.rho[rows]]),
         landmarks.covariance[rows],
         rays,
@@ -157,7 +157,7 @@ def solve(
 
 
 def refit(
-    match_from_query: Floats, inlier: Bools, matches: Matches, most_sigmas: float
+    match_from_query: Floats, inlier: Bools, matches: LandmarkMatches, most_sigmas: float
 ) -> tuple[Floats, Floats, float, Bools]:
     """The pose refitted to its inliers (K,), its Hessian, the residual variance over its expectation, and its inliers,
     which lie within `most_sigmas` of the pixels' noise."""

@@ -25,7 +25,7 @@ from vplog.loops.verify_metric import CHI2_2, MODELS, SAMPLE, SINGULAR, find_pos
 if TYPE_CHECKING:
     from vplog.data import Bools
     from vplog.execution.execution import Execution
-    from vplog.loops.pose_refinement import Matches
+    from vplog.loops.pose_refinement import LandmarkMatches
 
 _MOST_APART = np.cos(np.radians(50.0))
 """Between the optical axes of two cameras whose images are matched: beyond it a view of usual width shares little."""
@@ -42,7 +42,7 @@ class _Pair:
     cameras: tuple[int, int]
     mounts: tuple[Floats, Floats]
     """body_from_camera (4, 4) of both."""
-    matches: Matches
+    matches: LandmarkMatches
     place: Floats
     """(K, 2) in the query's image, in shares of its sides."""
     focal_px: float

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
     Verb = Callable[..., Said]
 
@@ -39,7 +39,7 @@ QUICK = (
 
 
 @pytest.fixture(scope="module")
-def traversals(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def traversals(drive: Demo, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folders = tmp_path_factory.mktemp("traversals") / "walk_day", tmp_path_factory.mktemp("traversals") / "walk_dusk"
     for folder in folders:
         folder.mkdir()
@@ -197,7 +197,7 @@ def test_an_interrupted_study_leaves_the_one_before_and_goes_on(
     assert {file.name for file in out.iterdir()} == figures | {"study.json", "trials.json"}
 
 
-def test_a_drive_and_its_own_past(verb: Verb, drive: Drive, tmp_path: Path) -> None:
+def test_a_drive_and_its_own_past(verb: Verb, drive: Demo, tmp_path: Path) -> None:
     arguments = ("study", drive.log, "--truth", drive.truth, "-o", tmp_path / "study", *QUICK, "--seeds", 1)
     assert "give two drives or more" in verb(*arguments, "--min-gap", 20, "--only", "library").error
     assert "--min-gap 50" in verb(*arguments).error

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 PIPELINE = load_pipeline("default", QUICK)
 HALVES = ("before", "after")
@@ -114,7 +114,7 @@ class Elsewhere(Executor):
         return future
 
 
-def test_the_halves_of_a_drive_are_one_component(whole: Path, drive: Drive) -> None:
+def test_the_halves_of_a_drive_are_one_component(whole: Path, drive: Demo) -> None:
     [component] = components_in(map_store.Store(whole)) or []
     assert component["drives"] == ["after", "before"]
     folder = whole / "joint" / component["folder"]
@@ -223,7 +223,7 @@ def test_a_drive_that_was_replaced_is_said(copy: Path, verb: Callable[..., Said]
 
 @pytest.mark.parametrize("name", ["..", "/etc", "a/../../b", "", 7])
 def test_a_record_that_names_other_folders_is_refused(
-    copy: Path, joint: Path, drive: Drive, verb: Callable[..., Said], tmp_path: Path, name: str
+    copy: Path, joint: Path, drive: Demo, verb: Callable[..., Said], tmp_path: Path, name: str
 ) -> None:
     record = run_record.read_run_json(copy / "joint.json")
     record["groups"][0]["components"][0]["folder"] = name
@@ -238,7 +238,7 @@ def test_a_record_that_names_other_folders_is_refused(
     assert f"{run}/run.json names drives outside its folder" in verb("evaluate", run, "--truth", drive.truth).error
 
 
-def test_a_query_says_what_cannot_be_found(copy: Path, drive: Drive, verb: Callable[..., Said], tmp_path: Path) -> None:
+def test_a_query_says_what_cannot_be_found(copy: Path, drive: Demo, verb: Callable[..., Said], tmp_path: Path) -> None:
     command = ["map", "query", copy, drive.log]
     assert "fewer keyframes than the window of 99 views" in verb(*command, "--sequence", 99).err
     assert "is a folder: name a file" in verb(*command, "-o", tmp_path).err

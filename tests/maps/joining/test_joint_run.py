@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 
-def test_the_halves_of_a_drive_are_put_together_and_a_drive_from_elsewhere_is_not(joint: Path, drive: Drive) -> None:
+def test_the_halves_of_a_drive_are_put_together_and_a_drive_from_elsewhere_is_not(joint: Path, drive: Demo) -> None:
     record = read_run_json(joint / "run.json")
     assert record["finished"] is True
     assert [found["drives"] for found in record["maps"]] == [["before", "after"], ["drive"]]
@@ -114,7 +114,7 @@ def test_from_python_a_joint_run_has_a_run_for_each_drive(joint: Path) -> None:
         _ = found.trajectory
 
 
-def test_a_joint_run_is_evaluated_map_by_map(joint: Path, drive: Drive, verb: Callable[..., Said]) -> None:
+def test_a_joint_run_is_evaluated_map_by_map(joint: Path, drive: Demo, verb: Callable[..., Said]) -> None:
     found = evaluate(joint, str(drive.truth))
     assert [len(one["drives"]) for one in found["maps"]] == [2, 1]
     assert found["maps"][0]["ate_after"]["rmse_m"] < 1.5
@@ -135,7 +135,7 @@ def test_a_joint_run_is_evaluated_map_by_map(joint: Path, drive: Drive, verb: Ca
 
 
 def test_a_drive_that_the_truth_does_not_cover_is_named(
-    joint: Path, drive: Drive, verb: Callable[..., Said], tmp_path: Path
+    joint: Path, drive: Demo, verb: Callable[..., Said], tmp_path: Path
 ) -> None:
     first_ns = int(tables.read_trajectory(joint / "after" / "trajectory.parquet")[0].stamp_ns[0])
     known = read_truth(drive.truth)
@@ -155,11 +155,11 @@ def test_verbs_of_one_drive_say_which_there_are(joint: Path, tmp_path: Path, ver
         assert f"{joint} holds 3 drives. Give one of them: {joint}/before" in verb(*asked).error
 
 
-def test_gps_of_several_drives_is_refused(drive: Drive, tmp_path: Path, verb: Callable[..., Said]) -> None:
+def test_gps_of_several_drives_is_refused(drive: Demo, tmp_path: Path, verb: Callable[..., Said]) -> None:
     assert "one drive at a time" in verb("run", drive.log, drive.log, "-o", tmp_path, "--gps").error
 
 
-def test_the_parts_of_one_recording_are_one_drive(drive: Drive, tmp_path: Path, verb: Callable[..., Said]) -> None:
+def test_the_parts_of_one_recording_are_one_drive(drive: Demo, tmp_path: Path, verb: Callable[..., Said]) -> None:
     before, after = cut(drive.log, int(drive.stamp_ns[-14]), tmp_path, mounted=False)
     options = [f"--set={one}" for one in (*QUICK, "propose.per_query=2")]
     told = verb("run", after, before, "--one-drive", "-o", tmp_path / "run", "--threads", 2, "--json", *options).json

@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 
     from tests.conftest import Said
     from vplog.data import Camera, Floats
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 Verb = Any
 
 
-def frames(drive: Drive) -> tuple[list[tuple[int, np.ndarray]], Camera]:
+def frames(drive: Demo) -> tuple[list[tuple[int, np.ndarray]], Camera]:
     log = vplog.open_log(drive.log)
     stamps = log.stamps()[1::6]
     return [(one.stamp_ns, one.decode().image) for one in log.frames(stamps)], log.camera()
 
 
 @pytest.fixture(scope="session")
-def pictures(drive: Drive, made_once: Callable[..., Path]) -> Path:
+def pictures(drive: Demo, made_once: Callable[..., Path]) -> Path:
     """Every sixth picture of the drive as a file, and its calibration beside the folder."""
 
     def fill(folder: Path) -> None:
@@ -67,7 +67,7 @@ def camera_at(run: Path, stamp_ns: int, camera: Camera) -> Floats:
     return se3.interpolate_at(found.stamp_ns, found.world_from_body, np.array([stamp_ns]))[0] @ camera.body_from_camera
 
 
-def test_pictures_are_where_they_were_taken(drive: Drive, run: Path) -> None:
+def test_pictures_are_where_they_were_taken(drive: Demo, run: Path) -> None:
     opened, (found, camera) = vplog.open_run(run), frames(drive)
     for stamp_ns, image in found:
         one = opened.localize(image, camera)
@@ -83,7 +83,7 @@ def test_pictures_are_where_they_were_taken(drive: Drive, run: Path) -> None:
     assert opened.localize(np.zeros_like(found[0][1]), camera).found.place < 0
 
 
-def test_the_place_on_earth_is_that_of_the_run(drive: Drive, run: Path, tmp_path: Path) -> None:
+def test_the_place_on_earth_is_that_of_the_run(drive: Demo, run: Path, tmp_path: Path) -> None:
     """By the georeference of its solve, as a run with GPS factors has it."""
     world_from_enu = se3.exp(np.array([0.0, 0.0, 0.3, 10.0, -4.0, 2.0]))
     shutil.copytree(run, tmp_path / "run")
@@ -129,7 +129,7 @@ def test_without_calibration_it_says_what_is_missing(verb: Callable[..., Said], 
     assert not out.exists()
 
 
-def test_a_log_is_joined_by_its_odometry(drive: Drive, run: Path, tmp_path: Path) -> None:
+def test_a_log_is_joined_by_its_odometry(drive: Demo, run: Path, tmp_path: Path) -> None:
     """Its odometry begins elsewhere, and half of its frames are dark: all samples still are where they were."""
     log = vplog.open_log(drive.log)
     odometry, out = log.odometry(), tmp_path / "log.tum"
@@ -175,7 +175,7 @@ def test_a_map_localises_in_the_frame_of_its_joined_drives(halves: Path, picture
     assert again["localized"] == 1
 
 
-def test_wrong_inputs_are_refused_in_a_line(verb: Callable[..., Said], drive: Drive, run: Path, tmp_path: Path) -> None:
+def test_wrong_inputs_are_refused_in_a_line(verb: Callable[..., Said], drive: Demo, run: Path, tmp_path: Path) -> None:
     assert "poses are a table or a trajectory" in verb("localize", run, drive.log, "-o", tmp_path / "poses.txt").error
     assert "no local file of an image" in verb("localize", run, drive.log, drive.log).error
     assert "No log at" in verb("localize", run, tmp_path / "none.png").error

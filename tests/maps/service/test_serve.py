@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Drive
+    from vplog.demo.record import Demo
 
 
 @contextmanager
@@ -63,7 +63,12 @@ def root(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_answers_are_those_of_the_verb(
-    root: Path, finished: Path, drive: Drive, verb: Callable[..., Said], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    root: Path,
+    finished: Path,
+    drive: Demo,
+    verb: Callable[..., Said],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     run = shutil.copytree(finished, tmp_path / "run")
     with served(root) as (_, ask):

@@ -16,7 +16,7 @@ from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.maps.condensation.redundancy import OwnQueries
 from vplog.maps.joining.joint_record import joint_components, keyframe_poses
-from vplog.maps.search.exact import Answers, best_places, merge, no_answers
+from vplog.maps.search.exact import RankedPlaces, best_places, merge, no_answers
 from vplog.maps.search.index import SegmentView, place_keyframes, read_column, update_index
 from vplog.maps.search.segment import Segment
 from vplog.maps.storage.layout import PICTURES
@@ -25,7 +25,7 @@ from vplog.stages import CodedState, PlaceState, index_of_part
 if TYPE_CHECKING:
     from vplog.maps.storage.map_store import Store
 
-    Search = Callable[[Sequence[Any], int], Answers]
+    Search = Callable[[Sequence[Any], int], RankedPlaces]
     """The best so many places for each view."""
 
 BEST = 16
@@ -122,7 +122,7 @@ def search_in_memory(places: OwnPlaces, state: PlaceState, execution: Execution 
         return lambda views, top: best_places([part], state, views, top, threads)
     indexes = [index_of_part(state, state.from_arrow(column)) for column in places.columns]
 
-    def by_drive(views: Sequence[Any], top: int) -> Answers:
+    def by_drive(views: Sequence[Any], top: int) -> RankedPlaces:
         best = no_answers(len(views), top)
         for number, index in enumerate(indexes):
             found = no_answers(len(views), top)

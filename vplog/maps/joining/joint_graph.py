@@ -30,7 +30,7 @@ class SolvedDrive:
     """A drive as its own run solved it."""
 
     keyframes: Keyframes
-    graph: graph_joint.Drive
+    graph: graph_joint.SessionGraph
     odometry: Callable[[], Odometry]
     """Needed for its trajectory alone."""
 
@@ -47,7 +47,7 @@ def solve_drives(
     return joined, dict(zip(ledgers, judged, strict=True))
 
 
-def own_drive(graph: PoseGraph, weight: Floats, closures: Closures) -> graph_joint.Drive:
+def own_drive(graph: PoseGraph, weight: Floats, closures: Closures) -> graph_joint.SessionGraph:
     """The graph of a drive at its solved poses, without the closures that its own solve rejected (`weight` (E,) 0)."""
     odometry = graph.odometry
     used = np.flatnonzero(np.isfinite(closures.weight))
@@ -62,7 +62,7 @@ def own_drive(graph: PoseGraph, weight: Floats, closures: Closures) -> graph_joi
         information=graph.information[edges],
         kind=[graph.kind[edge] for edge in edges.tolist()],
     )
-    return graph_joint.Drive(own, of_odometry[edges])
+    return graph_joint.SessionGraph(own, of_odometry[edges])
 
 
 def read_drive(name: str, run: Path) -> SolvedDrive:

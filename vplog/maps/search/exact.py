@@ -36,7 +36,7 @@ _PARTS_A_TASK = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Answers:
+class RankedPlaces:
     """The best places for Q views, best first: by falling score, then by drive, then by keyframe. Rows are filled up
     to K with none."""
 
@@ -55,18 +55,18 @@ class Answers:
         return (self.score > NO_SCORE).sum(axis=1)
 
 
-def no_answers(views: int, top: int) -> Answers:
+def no_answers(views: int, top: int) -> RankedPlaces:
     """(Q, K) none, to be written to."""
     drive, keyframe, support = np.zeros((3, views, top), np.int32)
-    return Answers(drive, keyframe, np.full((views, top), NO_SCORE, np.float32), support)
+    return RankedPlaces(drive, keyframe, np.full((views, top), NO_SCORE, np.float32), support)
 
 
-def merge(parts: Sequence[Answers], top: int) -> Answers:
+def merge(parts: Sequence[RankedPlaces], top: int) -> RankedPlaces:
     """The best of all parts: exactly those of one search, where each part gives its own best in this order."""
     columns = [np.concatenate([vars(part)[name] for part in parts], axis=1) for name in vars(parts[0])]
     drive, keyframe, score, _ = columns
     order = np.lexsort((keyframe, drive, -score), axis=1)[:, :top]
-    return Answers(*(np.take_along_axis(column, order, axis=1) for column in columns))
+    return RankedPlaces(*(np.take_along_axis(column, order, axis=1) for column in columns))
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ class Shard:
 def best_places(
     parts: Sequence[SegmentView], state: CodedState, views: Sequence[Place], top: int,
     execution: Execution = Execution(), executor: Executor | None = None,
-) -> Answers:  # fmt: skip
+) -> RankedPlaces:  # fmt: skip
     """The `top` best of all places for each of Q views. With an executor its workers search, each some of the parts,
     whose files they see under the same path, or fetch into their own caches. The same answers for any execution."""
     every = Shard(
@@ -110,7 +110,7 @@ def best_places(
     return best
 
 
-def search_shard(shard: Shard) -> Answers:
+def search_shard(shard: Shard) -> RankedPlaces:
     """The best of the shard's places for each view. Raises ResultError where a segment is gone or damaged."""
     best = no_answers(len(shard.views), shard.top)
     with ThreadPoolExecutor(shard.execution.threads) as pool:
@@ -133,8 +133,8 @@ def _open(where: Path | StoredFile) -> Segment:
 
 
 def _search_segment(
-    segment: Segment, numbers: Int32s, shard: Shard, best: Answers, pool: ThreadPoolExecutor
-) -> list[Answers]:
+    segment: Segment, numbers: Int32s, shard: Shard, best: RankedPlaces, pool: ThreadPoolExecutor
+) -> list[RankedPlaces]:
     """The best of a segment for each view: by view where they are many, else by view and stretch of blocks."""
     index, threads = CodeIndex(segment.lists, shard.overlap, shard.pairing), shard.execution.threads
     runs = segment.first[:-1], numbers >= 0

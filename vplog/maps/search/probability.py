@@ -19,13 +19,13 @@ from vplog.places.sequence import SequenceSettings
 from vplog.storage.scratch import scratch
 
 if TYPE_CHECKING:
-    from vplog.maps.search.exact import Answers
+    from vplog.maps.search.exact import RankedPlaces
     from vplog.maps.storage.map_store import Store
     from vplog.stages import PlaceState
 
 
 def answer_probabilities(
-    store: Store, drives: Mapping[int, str], state: PlaceState, descriptors: Sequence[Any], answers: Answers,
+    store: Store, drives: Mapping[int, str], state: PlaceState, descriptors: Sequence[Any], answers: RankedPlaces,
     look_alikes: LookAlikes | None, execution: Execution = Execution(),
 ) -> Floats:  # fmt: skip
     """(Q,) probability of the first answer of each view; NaN without one, and of all where too few have look-alikes.

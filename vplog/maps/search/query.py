@@ -18,7 +18,7 @@ from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
 from vplog.loops.match_probability import LookAlikes
 from vplog.maps.geo_bounds import DriveBounds, box_of_fixes
-from vplog.maps.search.exact import Answers, best_places
+from vplog.maps.search.exact import RankedPlaces, best_places
 from vplog.maps.search.index import SegmentView, place_keyframes, read_column, update_index
 from vplog.maps.search.probability import answer_probabilities
 from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, LineSearch, best_lines, drives_by_credit
@@ -89,7 +89,7 @@ def query_map(
         DriveBounds(known).within(query.drives, query.box, str(store))  # before any work
         stamps, descriptors, warnings = describe_log(log, pipeline, state, execution)
 
-        def attempt() -> tuple[list[str], Answers, list[str], pa.Table, list[dict[str, Any]]]:
+        def attempt() -> tuple[list[str], RankedPlaces, list[str], pa.Table, list[dict[str, Any]]]:
             drives = map_store.common_library(store)[1]
             names = list(drives)
             numbers, short = DriveBounds(drives).within(query.drives, query.box, str(store))
@@ -225,7 +225,7 @@ def _descriptors(
 def search(
     store: Store, drives: Mapping[str, Mapping[str, Any]], state: PlaceState, descriptors: Sequence[Any],
     query: MapQuery, lines: LineSearch, execution: Execution = Execution(),
-) -> tuple[Answers, list[str]]:  # fmt: skip
+) -> tuple[RankedPlaces, list[str]]:  # fmt: skip
     """The best places of the map's drives, or of `query.drives` of them, for each of Q views in order, and warnings.
 
     Ties go to the earlier drive, then row. Single views are ranked exactly, by the map's index where the recogniser is
@@ -289,7 +289,7 @@ def _named(
 
 
 def _add_evidence(
-    named: Sequence[dict[str, Any]], store: Store, drives: Sequence[str], answers: Answers, state: EvidenceState,
+    named: Sequence[dict[str, Any]], store: Store, drives: Sequence[str], answers: RankedPlaces, state: EvidenceState,
     descriptors: Sequence[Any],
 ) -> None:  # fmt: skip
     """Write into the best answer of each view what most of its score is of, as `evidence`."""
@@ -306,7 +306,7 @@ def _add_evidence(
             one["evidence"] = found[one["query"]]
 
 
-def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints, p_match: Floats) -> pa.Table:
+def _table(store: Store, drives: Sequence[str], answers: RankedPlaces, stamps: Ints, p_match: Floats) -> pa.Table:
     there = np.arange(answers.score.shape[1]) < answers.count[:, None]
     query, rank = np.nonzero(there)
     number, keyframe = answers.drive[there], answers.keyframe[there]

@@ -18,7 +18,7 @@ import numpy as np
 
 from vplog.data import Float32s, Floats, Int32s, Ints, Ranking
 from vplog.execution.execution import Execution
-from vplog.maps.search.exact import NO_SCORE, Answers, merge, no_answers
+from vplog.maps.search.exact import NO_SCORE, RankedPlaces, merge, no_answers
 from vplog.maps.search.index import read_column, rows_on_keyframes
 from vplog.maps.storage.damage import reading_drive
 from vplog.places.dense import best_rows
@@ -51,7 +51,7 @@ class LineSearch:
 def best_lines(
     store: Store, drives: Mapping[int, str], state: PlaceState, descriptors: Sequence[Any], top: int,
     search: LineSearch, execution: Execution,
-) -> Answers:  # fmt: skip
+) -> RankedPlaces:  # fmt: skip
     """The `top` best places of some drives, by their numbers in the map, for each of Q views in order.
 
     Drives are read one after the other, so memory is that of the largest; of lines, look-alikes are taken from the
@@ -117,7 +117,7 @@ class _OnKeyframes:
         return best_rows(self.scores(descriptor, stop), k)
 
 
-def drives_by_credit(single: Answers, length: int) -> Ints:
+def drives_by_credit(single: RankedPlaces, length: int) -> Ints:
     """Numbers of the drives in which lines may be, rising, by the best places of each single view.
 
     Stretches of `length` views, each half over the last, name the drives with most credit.
@@ -132,7 +132,7 @@ def drives_by_credit(single: Answers, length: int) -> Ints:
     return np.unique(np.concatenate(chosen)) if chosen else np.empty(0, np.int64)
 
 
-def drive_credits(single: Answers) -> tuple[Ints, Int32s, Floats]:
+def drive_credits(single: RankedPlaces) -> tuple[Ints, Int32s, Floats]:
     """(C,) views, rising, drives, and the vote of each view for the drive.
 
     A vote is the score of the drive's best place less that of the last of the view's places, so a view that resembles

@@ -14,7 +14,7 @@ from vplog.features.matching import MatchSettings, match_features
 from vplog.features.sift import SiftSettings
 from vplog.geometry import se3
 from vplog.loops import undistort
-from vplog.loops.pose_refinement import Matches
+from vplog.loops.pose_refinement import LandmarkMatches
 from vplog.loops.verify_metric import MetricSettings, find_pose, log10_false_alarms, refit
 from vplog.run.visual_odometry.sensor import Points, Sensor, follow
 
@@ -151,7 +151,7 @@ def solve(reference: ReferenceFrame, rows: np.ndarray, observed: Points, sensor:
         return None
     xyrho = np.column_stack([points.rays, points.rho])
     variance = np.nan_to_num(observed.variance)
-    matches = Matches(xyrho, reference.covariance[rows], observed.rays, observed.noise, observed.rho, variance)
+    matches = LandmarkMatches(xyrho, reference.covariance[rows], observed.rays, observed.noise, observed.rho, variance)
     most = _SETTINGS.max_error_px / sensor.pixel_sigma
     pose, hessian, excess, inlier = refit(se3.inverse(found[0]), found[1], matches, most)
     count, area = int(inlier.sum()), float(sensor.camera.width * sensor.camera.height)
