@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import EdgeKind, PoseGraph, Verdict
+from vplog.data import Bools, Closures, EdgeKind, Floats, Int32s, Ints, Keyframes, PoseGraph, Verdict
 from vplog.errors import GraphError, plural
 from vplog.geometry import se3
-
-if TYPE_CHECKING:
-    from vplog.data import Bools, Closures, Floats, Int32s, Ints, Keyframes
 
 AXES = {2: [2, 3, 4], 3: [0, 1, 2, 3, 4, 5]}
 """Rows and columns of (6, 6) matrices that a graph of this dimension uses."""

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, X
 
+from vplog.data import Floats, Ints
 from vplog.geometry import se3
-
-if TYPE_CHECKING:
-    from vplog.data import Floats, Ints
 
 _HUBER = 1.5
 """Sigmas beyond which an error counts linearly, as in the refinement of a single pose."""

@@ -17,23 +17,19 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, eigsh, splu
+from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
+from vplog.data import Bools, Floats, Ints, PoseGraph, Solution
 from vplog.graph.build import informed, parts, subgraph
 from vplog.graph.consistency import odometry_chain
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import relaxed
 from vplog.graph.lm import LmSettings, solve_weighted
 from vplog.graph.sparse.symbolic import dissected
-
-if TYPE_CHECKING:
-    from scipy.sparse.linalg import SuperLU
-
-    from vplog.data import Bools, Floats, Ints, PoseGraph, Solution
 
 MOST_POSES = 30_000
 """Poses up to which a certificate is tried: on a planar city 3 s of CPU, and 12 s at 100 000, but graphs in space fill

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from vplog.data import Bools, Ints
+from vplog.data import Bools, Ints
 
 
 def largest_clique(joined: Bools, most_steps: int) -> tuple[Ints, bool]:

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
 from scipy.special import chdtri
 
-from vplog.data import EdgeKind
+from vplog.data import Bools, EdgeKind, Floats, Int32s, Ints, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed
 from vplog.graph.normal_equations import edge_costs
-
-if TYPE_CHECKING:
-    from vplog.data import Bools, Floats, Int32s, Ints, PoseGraph
 
 
 def residual_sigma(graph: PoseGraph, world_from_body: Floats, edges: Ints | None = None) -> Floats:

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from vplog.data import Trajectory
+from vplog.data import Floats, Keyframes, Odometry, Trajectory
 from vplog.geometry import se3
-
-if TYPE_CHECKING:
-    from vplog.data import Floats, Keyframes, Odometry
 
 
 def correct_trajectory(odometry: Odometry, keyframes: Keyframes, world_from_body: Floats) -> Trajectory:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Bools, Floats, Ints, PoseGraph
 from vplog.graph.build import parts
 from vplog.graph.sparse.symbolic import Elimination
-
-if TYPE_CHECKING:
-    from vplog.data import Bools, Floats, Ints, PoseGraph
 
 _ALIKE = 0.99
 """Share of a shape's edges that are still there for it to serve: a new one costs as much as a few steps."""

@@ -8,11 +8,12 @@ several starts is compared (`hypotheses`).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
+from vplog.data import Bools, Floats, Ints, PoseGraph, Solution
 from vplog.graph.build import checked
 from vplog.graph.consistency import (
     OdometryChain,
@@ -33,9 +34,6 @@ from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import truncated_weights
 from vplog.graph.sparse.workers import Workers
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.data import Bools, Floats, Ints, PoseGraph, Solution
 
 _BRANCHES = 200
 """Branches of the search for the largest set of closures between two pieces of odometry: an exact search of some

@@ -4,26 +4,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
 
-from vplog.data import RECEIVER_SIGMA_M
+from vplog.data import RECEIVER_SIGMA_M, Bools, Floats, Gps, Ints, Keyframes, Odometry
 from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
 from vplog.graph.build import informed
 from vplog.graph.consistency import chi2_quantile
+from vplog.graph.factors import Factors
 from vplog.graph.least_squares import GAUGE_SIGMA, Objective, Positions, minimised
 from vplog.graph.marginals import positions_redundancy
 from vplog.graph.robust_kernels import truncated_weights
 from vplog.graph.variance_components import most_likely_variance
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.data import Bools, Floats, Gps, Ints, Keyframes, Odometry
-    from vplog.graph.factors import Factors
 
 _LEAST = 3
 """Fixes that fix where a graph is and how it is turned."""

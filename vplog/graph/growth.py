@@ -6,27 +6,21 @@ among give way when the whole is solved: by least squares with the closures that
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from vplog.data import EdgeKind, PoseGraph
+from vplog.data import EdgeKind, Floats, Ints, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, residual_sigma
 from vplog.graph.factors import Factors
-from vplog.graph.joint import Between, Joined, as_one, maps_of, middle, places
+from vplog.graph.joint import Between, Joined, JoinSettings, SessionGraph, as_one, maps_of, middle, places
 from vplog.graph.least_squares import descend
-from vplog.graph.refine import Refined, refine, rescaled
+from vplog.graph.refine import Refined, RefineSettings, refine, rescaled
 from vplog.graph.solve import decided
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from vplog.data import Floats, Ints
-    from vplog.graph.joint import JoinSettings, SessionGraph
-    from vplog.graph.refine import RefineSettings
-    from vplog.stages import Optimiser
+from vplog.stages import Optimiser
 
 _STAYS, _LEAVES = 0.99, 0.999999
 """Quantiles of the chi-square of a closure in the solved whole: one that was rejected comes back below the first, one

@@ -9,18 +9,15 @@ and a lever of a metre turned gravity by 0.7 degrees.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, S, V, X
 from scipy import sparse
 
-from vplog.data import SCALE_WANDER
+from vplog.data import SCALE_WANDER, Bools, Floats, Imu, Ints
 from vplog.geometry import se3
-
-if TYPE_CHECKING:
-    from vplog.data import Bools, Floats, Imu, Ints
 
 GRAVITY = 9.81
 """m/s^2; it varies by 0.3 % over the earth."""

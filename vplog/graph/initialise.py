@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Floats, PoseGraph
 from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.consistency import is_loop, odometry_chain, residual_sigma
@@ -15,7 +16,6 @@ from vplog.graph.sparse.cholesky import Cholesky
 from vplog.graph.sparse.frontal import Blocks
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, PoseGraph
     from vplog.graph.factors import Factors
 
 

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
 
-from vplog.data import EdgeKind, PoseGraph
+from vplog.data import Bools, EdgeKind, Floats, Ints, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.build import parts
 from vplog.graph.consistency import residual_sigma
-from vplog.graph.refine import RefineSettings, refine
+from vplog.graph.refine import Refined, RefineSettings, refine
 from vplog.graph.solve import decided
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from vplog.data import Bools, Floats, Ints
-    from vplog.graph.refine import Refined
-    from vplog.stages import Optimiser
+from vplog.stages import Optimiser
 
 
 class JoinSettings(Settings):

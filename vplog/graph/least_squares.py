@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vplog.data import Floats, Ints
 from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.normal_equations import edge_costs, normal_equations
 from vplog.graph.sparse.cholesky import OPEN, Cholesky
+from vplog.graph.sparse.frontal import Blocks
 from vplog.graph.sparse.workers import Workers
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, Ints
     from vplog.graph.factors import Factors
-    from vplog.graph.sparse.frontal import Blocks
 
 GAUGE_SIGMA = 1e-6
 """rad and m; holds pose 0 where it is, so that the rest has one best place. What it lets through is undone after."""

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Floats, Int32s, Ints, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed, parts
 from vplog.graph.consistency import OdometryChain
 from vplog.graph.least_squares import Objective
 from vplog.graph.marginals import edge_covariances, joint_covariance
+from vplog.graph.sparse.cholesky import Cholesky
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, Int32s, Ints, PoseGraph
     from vplog.graph.factors import Factors
-    from vplog.graph.sparse.cholesky import Cholesky
 
 _ALONE = 1e-9
 """Least redundancy of a closure, so that no quotient is infinite."""

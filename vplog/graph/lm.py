@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
-from vplog.data import Solution
+from vplog.data import Floats, PoseGraph, Solution
 from vplog.errors import plural
 from vplog.graph.build import checked
 from vplog.graph.consistency import residual_sigma
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
-from vplog.graph.least_squares import descend
+from vplog.graph.least_squares import Fit, descend
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.data import Floats, PoseGraph
-    from vplog.graph.least_squares import Fit
 
 
 class LmSettings(Settings):

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from vplog.data import Bools, Floats, Ints
 from vplog.geometry import se3
 from vplog.graph.build import AXES, parts
+from vplog.graph.least_squares import Objective
 from vplog.graph.normal_equations import normal_equations
+from vplog.graph.sparse.cholesky import Cholesky
 from vplog.graph.sparse.selected_inversion import inverse_blocks, joint_inverse
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from vplog.data import Bools, Floats, Ints
     from vplog.graph.factors import Factors
-    from vplog.graph.least_squares import Objective
-    from vplog.graph.sparse.cholesky import Cholesky
 
 _STEP = 1e-4
 """Step of a scale for differences: far above rounding, and errors of edges are linear in it."""

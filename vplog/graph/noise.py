@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
+from vplog.data import Bools, Floats, Ints, Odometry
 from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.data import Bools, Floats, Ints, Odometry
 
 _UNKNOWN_VARIANCE = 1e3
 """m^2 or rad^2; drivers write 1e3, 99999, 1e6 or more on an axis that they do not measure."""

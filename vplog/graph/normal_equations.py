@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import atan2, cos, sin, sqrt
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
+from vplog.data import Floats, Int32s, Ints, PoseGraph
 from vplog.graph.sparse.frontal import Blocks
 from vplog.graph.sparse.workers import Workers
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from vplog.data import Floats, Int32s, Ints, PoseGraph
-
-    Terms = Callable[[Ints, int, int, "_Edges", Floats, "_Sums"], None]
+Terms = Callable[[Ints, int, int, "_Edges", Floats, "_Sums"], None]
 
 
 _LEAST_SHARE = 4096

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Bools, Floats, Ints, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed
 from vplog.graph.consistency import OdometryChain
 from vplog.graph.evidence import log_room, runs
 from vplog.graph.variance_components import Sigmas, claimed_times
-
-if TYPE_CHECKING:
-    from vplog.data import Bools, Floats, Ints, PoseGraph
 
 _ODOMETRY = 2.0 ** np.arange(-5, 6)
 _CLOSURES = 2.0 ** np.arange(-1, 4)

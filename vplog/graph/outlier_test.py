@@ -8,17 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Floats, Ints
 from vplog.errors import GraphError
 from vplog.graph.build import informed
-from vplog.graph.consistency import chi2_quantile, degrees_of_freedom, residual_sigma
+from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, residual_sigma
 from vplog.graph.least_squares import Objective, descend
-from vplog.graph.leave_one_out import cost_together, distance, group_costs, groups, tension
+from vplog.graph.leave_one_out import Tension, cost_together, distance, group_costs, groups, tension
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, Ints
-    from vplog.graph.consistency import OdometryChain
     from vplog.graph.factors import Factors
-    from vplog.graph.leave_one_out import Tension
 
 _WORST_SHARE = 0.5
 """Closures that cost at least this share of the worst one's cost are rejected with it; others may suffer from it."""

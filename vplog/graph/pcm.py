@@ -6,11 +6,12 @@ Merging, ICRA 2018. Needs no start, and works where odometry does not join the e
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
+from vplog.data import Bools, Ints, PoseGraph, Solution
 from vplog.geometry import se3
 from vplog.graph.build import checked
 from vplog.graph.clique import largest_clique
@@ -20,9 +21,6 @@ from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.graph.lm import solve_weighted
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.data import Bools, Ints, PoseGraph, Solution
 
 _PAIRS = 1 << 12
 """Pairs of closures that are compared at once: some megabytes."""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Floats, Ints, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.consistency import is_loop
 from vplog.graph.joint import JoinSettings, spaced_apart
@@ -16,9 +16,6 @@ _TIMES = 10.0
 """A break's sigmas as a multiple of the spread of the closures across it: a hundredth of one closure's weight."""
 _LEAST = np.array([0.001] * 3 + [0.01] * 3)
 """rad and m; closures do not agree better."""
-
-if TYPE_CHECKING:
-    from vplog.data import Floats, Ints, PoseGraph
 
 
 def pieces_placed(graph: PoseGraph, broken: Ints) -> PoseGraph:

@@ -8,22 +8,18 @@ power as where a model leaves things out (Miller and Dunson, Robust Bayesian inf
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Bools, Floats, Ints, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.consistency import residual_sigma
 from vplog.graph.evidence import Accidents, agreeing
 from vplog.graph.factors import Factors
 from vplog.graph.hypotheses import AtSigmas, attempted
 from vplog.graph.variance_components import Sigmas
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from vplog.data import Bools, Floats, Ints, PoseGraph
 
 _MOST = 16
 """Runs of closures that are turned, of either verdict by either order: each costs a solve from the map as it is."""

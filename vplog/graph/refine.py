@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
 
+from vplog.data import Bools, Floats, PoseGraph, Solution
 from vplog.graph.consistency import residual_sigma
 from vplog.graph.evidence import runs
 from vplog.graph.factors import Factors
@@ -16,9 +16,6 @@ from vplog.graph.least_squares import Objective, minimised
 from vplog.graph.marginals import SharedScale, positions_redundancy
 from vplog.graph.variance_components import Sigmas, claimed_times, estimate, extrapolated
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.data import Bools, Floats, PoseGraph, Solution
 
 _STEP = 1e-4
 """Step of the scale for differences: far above rounding, far below what any drive determines."""

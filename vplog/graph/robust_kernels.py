@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Callable
+from typing import Any, Literal
 
 import numpy as np
 from gtsam.noiseModel import mEstimator
 from pydantic import Field
 
+from vplog.data import Floats, PoseGraph, Solution
 from vplog.graph.build import checked
 from vplog.graph.consistency import chi2_quantile, degrees_of_freedom, is_loop, residual_sigma
 from vplog.graph.factors import Factors
@@ -16,11 +18,6 @@ from vplog.graph.initialise import initial_poses
 from vplog.graph.least_squares import Loss, Objective, minimised
 from vplog.graph.lm import as_solution
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from vplog.data import Floats, PoseGraph, Solution
 
 
 class KernelSettings(Settings):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from pydantic import Field
 
-from vplog.data import Solution
+from vplog.data import Floats, PoseGraph, Solution
 from vplog.graph.build import checked
 from vplog.graph.consistency import is_loop
 from vplog.graph.factors import Factors
@@ -16,11 +16,10 @@ from vplog.graph.lm import LmSettings, solve_weighted
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import CauchySettings, DcsSettings, GemanMcClureSettings
 from vplog.graph.variance_components import Sigmas
+from vplog.stages import Optimiser
 
 if TYPE_CHECKING:
-    from vplog.data import Floats, PoseGraph
     from vplog.graph.hypotheses import Cost
-    from vplog.stages import Optimiser
 
 OptimiserSettings = Annotated[
     GncSettings | PcmSettings | DcsSettings | CauchySettings | GemanMcClureSettings | LmSettings,

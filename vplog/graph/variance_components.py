@@ -7,19 +7,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from vplog.data import Bools, Floats, PoseGraph
 from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed
 from vplog.graph.consistency import degrees_of_freedom
+from vplog.graph.least_squares import Objective
 from vplog.graph.marginals import edge_covariances
-
-if TYPE_CHECKING:
-    from vplog.data import Bools, Floats, PoseGraph
-    from vplog.graph.least_squares import Objective
 
 _SPREAD = 2.0 * math.log(4.0)
 """Sigma of the logarithm of a variance factor before anything was measured: drivers claim sigmas that are off by four

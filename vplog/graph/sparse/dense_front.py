@@ -6,14 +6,11 @@ same order, whoever does it.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numba
 import numpy as np
 
-if TYPE_CHECKING:
-    from vplog.data import Floats
-    from vplog.graph.sparse.workers import Workers
+from vplog.data import Floats
+from vplog.graph.sparse.workers import Workers
 
 AT_ONCE = 8
 """Rows that are taken away from others in one loop: as many as a processor keeps pointers to."""

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
+from vplog.data import Floats, Int32s, Ints
 from vplog.graph.sparse.dense_front import eliminate_front
 
-if TYPE_CHECKING:
-    from vplog.data import Floats, Int32s, Ints
-
-    Listed = tuple[Ints, Ints, Ints]
-    """Result of `by_supernode`."""
+Listed = tuple[Ints, Ints, Ints]
+"""Result of `by_supernode`."""
 
 
 class Blocks(NamedTuple):

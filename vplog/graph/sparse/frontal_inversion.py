@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numba
 import numpy as np
 
+from vplog.data import Bools, Floats, Ints
 from vplog.graph.sparse.dense_front import AT_ONCE, STRIP, subtract_scaled
-from vplog.graph.sparse.frontal import found, rows_of_child
+from vplog.graph.sparse.frontal import Form, found, rows_of_child
+from vplog.graph.sparse.workers import Workers
 
-if TYPE_CHECKING:
-    from vplog.data import Bools, Floats, Ints
-    from vplog.graph.sparse.frontal import Form
-    from vplog.graph.sparse.workers import Workers
-
-    Wanted = tuple[Ints, Ints, Ints, Floats]
-    """Which pairs each supernode has, (S + 1,), their columns (K,), (K,), and room for their blocks (3, K, d, d)."""
-    Tree = tuple[Ints, Ints, Ints]
-    """Where the children of each supernode begin, (S + 1,), these, and how many rows each hands down, (S,)."""
+Wanted = tuple[Ints, Ints, Ints, Floats]
+"""Which pairs each supernode has, (S + 1,), their columns (K,), (K,), and room for their blocks (3, K, d, d)."""
+Tree = tuple[Ints, Ints, Ints]
+"""Where the children of each supernode begin, (S + 1,), these, and how many rows each hands down, (S,)."""
 
 SHARED = 1024
 """Rows from which on a front is worth sharing between threads: eight of them then take four milliseconds of one."""

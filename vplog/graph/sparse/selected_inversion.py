@@ -7,19 +7,14 @@ as two factorisations. What is above all subtrees comes first, front by front, t
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numba
 import numpy as np
 
-from vplog.graph.sparse.frontal import found, rows_of_child
+from vplog.data import Floats, Int32s, Ints
+from vplog.graph.sparse.cholesky import Cholesky
+from vplog.graph.sparse.frontal import Form, found, rows_of_child
 from vplog.graph.sparse.frontal_inversion import hand_down, invert_run, invert_together, store_blocks
 from vplog.graph.sparse.workers import Workers
-
-if TYPE_CHECKING:
-    from vplog.data import Floats, Int32s, Ints
-    from vplog.graph.sparse.cholesky import Cholesky
-    from vplog.graph.sparse.frontal import Form
 
 
 def inverse_blocks(factor: Cholesky, a: Int32s | Ints, b: Int32s | Ints) -> tuple[Floats, Floats, Floats]:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
 
-if TYPE_CHECKING:
-    from vplog.data import Floats, Ints
-    from vplog.graph.sparse.frontal import Form
+from vplog.data import Floats, Ints
+from vplog.graph.sparse.frontal import Form
 
 _PIECES = 64
 """A run takes no more than this share of the work: 16 threads have four each, and few fronts are above them all."""

@@ -8,17 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import gtsam
 import numba
 import numpy as np
 
+from vplog.data import Int32s, Ints
 from vplog.graph.sparse.frontal import Form
 from vplog.graph.sparse.subtrees import Subtrees
-
-if TYPE_CHECKING:
-    from vplog.data import Int32s, Ints
 
 _RELAXED = 0.1
 """A supernode is merged with the one that it leads to where no more than this share of the entries is zeros: dense work

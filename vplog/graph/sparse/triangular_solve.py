@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numba
 import numpy as np
 
-from vplog.graph.sparse.frontal import found
-
-if TYPE_CHECKING:
-    from vplog.data import Floats, Ints
-    from vplog.graph.sparse.frontal import Form
+from vplog.data import Floats, Ints
+from vplog.graph.sparse.frontal import Form, found
 
 
 @numba.njit(cache=True, nogil=True)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vplog.execution.cores import allowed
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 
 class Workers:
