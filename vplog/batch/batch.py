@@ -28,12 +28,12 @@ from vplog.maps.joining.join import load_places
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings
 from vplog.maps.storage.layout import folder_name
+from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline, load_pipeline, pipeline_from
 from vplog.storage.remote_path import RemotePath, located
 
 if TYPE_CHECKING:
     from vplog.batch.engine import Engine
-    from vplog.maps.storage.map_store import Store
 
 _FREE_BYTES = 10**10
 """Free space of the map's disk below which stage caches are removed: what a drive of several hours needs while it is

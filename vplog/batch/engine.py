@@ -9,18 +9,16 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
+from vplog.batch.ray_engine import RayEngine
 from vplog.batch.worker import DriveState, Outcome, Task, compute_drive
 from vplog.errors import SettingsError, VplogError
 from vplog.execution.process_limits import OVER_MEMORY, OVER_TIME
 from vplog.execution.process_pool import OwnProcesses, ProcessExpired
 from vplog.storage.urls import shown
 
-if TYPE_CHECKING:
-    from vplog.batch.ray_engine import RayEngine
-
-    Engine: TypeAlias = "LocalEngine | RayEngine"
+Engine: TypeAlias = "LocalEngine | RayEngine"
 
 ENGINES = ("local", "ray")
 RETRIES = 2

@@ -7,19 +7,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vplog import logs
+from vplog.batch.plan import DriveInput
 from vplog.errors import LibraryError, LogError, VplogError
 from vplog.execution.execution import Execution
 from vplog.maps.storage import map_store
+from vplog.maps.storage.map_store import Store
 from vplog.places.library_files import read_library_record
 from vplog.places.reference_choice import PAPER_SIZE, evenly
 from vplog.run.reference_library import check_library, library_of_logs
+from vplog.stages import Log
 from vplog.storage.scratch import copy_folder
 
 if TYPE_CHECKING:
-    from vplog.batch.plan import DriveInput
-    from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
-    from vplog.stages import Log
 
 _TRIED = 8
 """Frames of a log, over the whole drive, that are decoded before it is relied on: one that does is enough."""

@@ -12,11 +12,11 @@ import pyarrow as pa
 from pyarrow import csv
 
 from vplog.data import Int32s
+from vplog.evaluate.retrieval import Ranks
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
     from vplog.benchmark.traversals import Traversal
-    from vplog.evaluate.retrieval import Ranks
 
 COLUMNS = pa.schema({
     "method": pa.string(), "query": pa.int64(), "query_name": pa.string(), "match": pa.int64(),

@@ -10,27 +10,25 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from shutil import disk_usage
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from vplog.benchmark.published_answers import AnswersSettings, fill_scores
+from vplog.benchmark.traversals import Traversal
 from vplog.data import Float32s, Floats, Ints, Reference
 from vplog.errors import ResultError
 from vplog.evaluate import retrieval
 from vplog.evaluate.open_set import score_open_set
+from vplog.evaluate.pairs import Pairs
 from vplog.evaluate.retrieval import Ranks, Reliability, reliability
 from vplog.execution.execution import Execution
 from vplog.loops.match_probability import match_probabilities
+from vplog.places import PlaceSettings
 from vplog.places.sequence import SequenceSettings, sequence_rows
 from vplog.places.views import views_of
 from vplog.stages import EvidenceState, FrameState, PlaceIndex, PlaceState, ProbableIndex, StoredState
-
-if TYPE_CHECKING:
-    from vplog.benchmark.traversals import Traversal
-    from vplog.evaluate.pairs import Pairs
-    from vplog.places import PlaceSettings
 
 ANSWERS = 10
 """Rows that a timed search returns: what `vplog run` requests by default, and the deepest recall reported."""

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.benchmark.feature_cache import FeatureFolder
+from vplog.cache.feature_shards import Extracted
 from vplog.data import Bytes, Floats, Ints, Reference
 from vplog.errors import LogError
 from vplog.execution.execution import Execution
 from vplog.geometry.masking import masked
 from vplog.places.self_recognition import NO_IMAGE
-
-if TYPE_CHECKING:
-    from vplog.benchmark.feature_cache import FeatureFolder
-    from vplog.cache.feature_shards import Extracted
-    from vplog.stages import Extractor, Log
+from vplog.stages import Extractor, Log
 
 
 @dataclass(frozen=True, eq=False)

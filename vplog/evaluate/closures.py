@@ -7,20 +7,18 @@ between the true poses, as in `vplog compare`.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vplog.data import Bools, Closures, Floats, Int32s, Ints, Keyframes, Verdict
 from vplog.errors import TruthError
+from vplog.evaluate.body_truth import BodyTruth, TruthAt
 from vplog.evaluate.closure_pose import PoseBounds, pose_bounds, pose_errors
 from vplog.evaluate.pairs import optical_axis, pose_pairs
 from vplog.evaluate.place_truth import DISTANCE_M, HEADING_DEG
 from vplog.evaluate.retrieval import Curve, average_precision, recall_at_full_precision
 from vplog.geometry import se3
-
-if TYPE_CHECKING:
-    from vplog.evaluate.body_truth import BodyTruth, TruthAt
 
 _OPPOSITE_DEG = 90.0
 """Degrees; beyond it a forward camera looks the other way."""

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 from vplog.errors import VplogError, was_interrupted
 
-if TYPE_CHECKING:
-    Task = TypeVar("Task")
-    Result = TypeVar("Result")
+Task = TypeVar("Task")
+Result = TypeVar("Result")
 
 _AHEAD = 64
 """Tasks given out and not yet taken back: enough for any machine, and few in memory."""

@@ -12,10 +12,10 @@ from vplog.data import Features, Frame
 from vplog.errors import LogError
 from vplog.features.stereo_depth import StereoSettings, stereo_depth
 from vplog.geometry.masking import masked
+from vplog.stages import EncodedFrame, Extractor
 
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution
-    from vplog.stages import EncodedFrame, Extractor
 
 
 def extract_frames(

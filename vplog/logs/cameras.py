@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import Camera
+from vplog.data import Camera, Floats
 from vplog.logs.formats.container import Notes
-
-if TYPE_CHECKING:
-    from vplog.data import Floats
-    from vplog.logs.messages.records import CalibrationMessage
-    from vplog.logs.tf_odometry import FrameTree
+from vplog.logs.messages.records import CalibrationMessage
+from vplog.logs.tf_odometry import FrameTree
 
 _LENSES = {
     "plumb_bob": ("plumbbob", "radtan", "radialtangential", "brownconrady", "rationalpolynomial", ""),

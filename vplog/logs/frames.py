@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -10,29 +11,23 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from vplog.data import Frame
+from vplog.data import Bools, Bytes, Camera, Float32s, Floats, Frame
 from vplog.errors import LogError, plural
 from vplog.geometry.masking import filled
 from vplog.logs.cameras import camera_from_image
-from vplog.logs.masks import resized_mask
+from vplog.logs.formats.container import Channel, Container, Notes, Octets, Place
+from vplog.logs.masks import Mask, resized_mask
 from vplog.logs.messages import pixels, video
 from vplog.logs.messages.decode import decode
-from vplog.logs.messages.pixels import depth_m, levels_of, spread
-from vplog.logs.messages.records import BadMessageError, ImageMessage
+from vplog.logs.messages.pixels import Levels, depth_m, levels_of, spread
+from vplog.logs.messages.records import BadMessageError, CalibrationMessage, ImageMessage
 from vplog.logs.messages.video import VideoStream
+from vplog.logs.rectification import Pair
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
     from av import VideoFrame
 
-    from vplog.data import Bools, Bytes, Camera, Float32s, Floats
     from vplog.logs.content import LogContent
-    from vplog.logs.formats.container import Channel, Container, Notes, Octets, Place
-    from vplog.logs.masks import Mask
-    from vplog.logs.messages.pixels import Levels
-    from vplog.logs.messages.records import CalibrationMessage
-    from vplog.logs.rectification import Pair
 
 
 _HALF = 127

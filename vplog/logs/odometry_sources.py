@@ -9,26 +9,20 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import Odometry, OdometrySource, Trajectory
+from vplog.data import Floats, Gps, Ints, Odometry, OdometrySource, Trajectory
 from vplog.errors import plural
 from vplog.logs.continuity import find_jumps
 from vplog.logs.dead_reckoning import dead_reckoned, odometry_of_fixes, turned_by_gyro
-from vplog.logs.formats.container import Channel, Notes
+from vplog.logs.formats.container import Channel, Contents, Notes
+from vplog.logs.gather import TopicCollector
 from vplog.logs.messages.records import short_type
 from vplog.logs.stamps import NONE
 from vplog.logs.tf_odometry import FrameTree, clean
-from vplog.logs.topic_selection import SOURCES
-
-if TYPE_CHECKING:
-    from vplog.data import Floats, Gps, Ints
-    from vplog.logs.formats.container import Contents
-    from vplog.logs.gather import TopicCollector
-    from vplog.logs.topic_selection import Selection
-    from vplog.logs.tracks import PoseTrack
+from vplog.logs.topic_selection import SOURCES, Selection
+from vplog.logs.tracks import PoseTrack
 
 TRUTH = Channel("truth", "ground truth", "")
 """The ground truth of a data set as a source; it is no topic."""

@@ -7,19 +7,15 @@ into a gap the motion decides, which leads on from one message to the next in th
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.data import Floats, Ints
 from vplog.logs.clocks import GAP_NS, GAP_PERIODS, STEP_PERIODS
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from vplog.data import Floats, Ints
-    from vplog.logs.formats.container import Notes
-    from vplog.logs.stamps import Stamps
+from vplog.logs.formats.container import Notes
+from vplog.logs.stamps import Stamps
 
 _ALTERNATIONS = 3
 """Turns from one side of a step to the other in the order of time that mere neighbours make: A B A B."""

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import Lidar
+from vplog.data import Ints, Lidar, Scan
 from vplog.logs.cameras import BODY
+from vplog.logs.formats.container import Container, Notes
 from vplog.logs.messages.clouds import scan_of
 from vplog.logs.messages.decode import decode
 from vplog.logs.messages.records import BadMessageError, CloudMessage
@@ -17,11 +19,7 @@ from vplog.logs.stamps import rows_of
 from vplog.logs.tf_odometry import clean
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from vplog.data import Ints, Scan
     from vplog.logs.content import LogContent
-    from vplog.logs.formats.container import Container, Notes
 
 _BESIDE_NS = 10**9
 """ns before the first image and behind the last, from which scans are taken, too: the images' motion lies within."""

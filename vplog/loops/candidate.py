@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
@@ -15,14 +14,10 @@ from vplog.features.matching import MatchSettings, first_matches, match_features
 from vplog.geometry import se3
 from vplog.loops import undistort, verify_epipolar, verify_metric
 from vplog.loops.calibration import CalibrationSettings, motion_covariance
-from vplog.loops.landmarks import Landmarks, LandmarkSettings, landmarks_of
+from vplog.loops.landmarks import FeaturesOf, Landmarks, LandmarkSettings, landmarks_of
 from vplog.loops.verify_epipolar import EpipolarSettings
 from vplog.loops.verify_metric import MetricSettings, Pose
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.loops.landmarks import FeaturesOf
-
 
 _LENIENT = {"min_inliers": 6, "min_spread": 0.0, "max_depths": np.inf, "max_distance_m": np.inf}
 """Metric settings under which a pose is found wherever chance does not explain it."""

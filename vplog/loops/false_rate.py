@@ -18,13 +18,13 @@ from pydantic import Field
 
 from vplog.data import Bools, Closures, Floats, Ints, Verdict
 from vplog.features.sift import mirrored
+from vplog.loops.candidate import Drive
 from vplog.loops.propose import Proposals
 from vplog.loops.verify import verify_between
 from vplog.settings import Settings
 
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution
-    from vplog.loops.candidate import Drive
 
 _VERIFIED = (Verdict.ACCEPTED, Verdict.NO_CALIBRATION)
 """Geometry found one place."""

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,13 +16,11 @@ from vplog.loops import pose_refinement, undistort, verify_metric
 from vplog.loops.calibration import motion_covariance
 from vplog.loops.landmarks import Landmarks, with_rho
 from vplog.loops.pose_refinement import LandmarkMatches
+from vplog.loops.verify import VerifySettings
 from vplog.loops.verify_metric import Pose
 
-if TYPE_CHECKING:
-    from vplog.loops.verify import VerifySettings
-
-    _Agreeing = tuple[Floats, Floats, Ints]
-    """Landmarks (A, 3), their covariance (A, 3, 3), and the picture's features (A,) that match them."""
+_Agreeing = tuple[Floats, Floats, Ints]
+"""Landmarks (A, 3), their covariance (A, 3, 3), and the picture's features (A,) that match them."""
 
 _GROUP = 3
 """Places that are verified before it is decided whether others are."""

@@ -7,8 +7,8 @@ query as another such triple; poses move as match_from_query exp(d), d rotation 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
@@ -16,9 +16,6 @@ import scipy
 
 from vplog.data import Bools, Floats
 from vplog.geometry import se3
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 _HUBER = 1.5
 """Sigmas beyond which an error counts linearly: 96 % as efficient as least squares on Gaussian errors (Huber 1981)."""

@@ -13,10 +13,10 @@ from vplog.data import Bools, Camera, Closures, Float32s, Floats, Ints, Structur
 from vplog.features.matching import MatchSettings, match_features
 from vplog.geometry import se3
 from vplog.loops import undistort
+from vplog.loops.landmarks import FeaturesOf
 
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution
-    from vplog.loops.landmarks import FeaturesOf
 
 _NEIGHBOURS = 3
 """Keyframes before each that its features are matched with."""

@@ -12,12 +12,11 @@ from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.loops.calibration import body_twists, motion_covariance, rotation_share, stamp_covariance, turning_pairs
 from vplog.loops.candidate import Drive, Row, VerifySettings, check_queries, check_reverse
-from vplog.loops.landmarks import for_stereo
+from vplog.loops.landmarks import FeaturesOf, for_stereo
+from vplog.loops.propose import Proposals
 
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution
-    from vplog.loops.landmarks import FeaturesOf
-    from vplog.loops.propose import Proposals
 
 _LOG = logging.getLogger(__name__)
 _WARNED_SHARE = 0.05

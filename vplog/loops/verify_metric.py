@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import comb, log10
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -17,12 +16,9 @@ from pydantic import Field
 from vplog.data import Bools, Camera, Features, Float32s, Floats, Ints, Verdict
 from vplog.geometry import se3
 from vplog.loops import pose_refinement, undistort
-from vplog.loops.landmarks import inverse_depth
+from vplog.loops.landmarks import Landmarks, LandmarkSettings, inverse_depth
 from vplog.loops.pose_refinement import LandmarkMatches
 from vplog.settings import Settings
-
-if TYPE_CHECKING:
-    from vplog.loops.landmarks import Landmarks, LandmarkSettings
 
 SAMPLE = 3
 """Points that determine a calibrated camera's pose: P3P; a fourth selects among its up to four solutions."""

@@ -14,18 +14,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import Closures, Floats, Ints, Verdict
+from vplog.data import Bools, Closures, Floats, Ints, Verdict
 from vplog.features.matching import match_features
 from vplog.geometry import se3
 from vplog.loops import pose_refinement, undistort
 from vplog.loops.calibration import body_twists, motion_covariance, stamp_covariance
 from vplog.loops.candidate import Drive, agree
+from vplog.loops.pose_refinement import LandmarkMatches
 from vplog.loops.verify_metric import CHI2_2, MODELS, SAMPLE, SINGULAR, find_pose, inliers, log10_false_alarms, observe
 
 if TYPE_CHECKING:
-    from vplog.data import Bools
     from vplog.execution.execution import Execution
-    from vplog.loops.pose_refinement import LandmarkMatches
 
 _MOST_APART = np.cos(np.radians(50.0))
 """Between the optical axes of two cameras whose images are matched: beyond it a view of usual width shares little."""

@@ -7,16 +7,13 @@ tower of equal storeys that is seldom so, and patches, which see the layout, are
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vplog.data import Bools, Floats, Ints, Reference
+from vplog.execution.execution import Execution
 from vplog.places.matches import PATCH_WEIGHT, WeighedMatchSettings, index_references
 from vplog.places.reference_choice import PAPER_SIZE, LibrarySettings, choose
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
 
 RECOGNISED = 0.8
 """Share of recognised references from which on they are enough. A drive that comes back to a part of its way has

@@ -12,14 +12,18 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 
 from vplog.data import ACCEPTED, Camera, Closures, Floats, Gps, Ints, Keyframes, PoseGraph, Verdict
 from vplog.geometry import se3
 from vplog.results import foxglove, geo
+from vplog.results.foxglove import PoseVector
+from vplog.results.geo import Earth
 from vplog.results.messages import descriptor_set, loop_closure_class
 from vplog.results.previews import jpeg
 from vplog.results.tables import TableMetadata, covariance_of
@@ -28,15 +32,8 @@ from vplog.storage.json_records import canonical_json
 from vplog.storage.scratch import replacing
 from vplog.version import __version__
 
-if TYPE_CHECKING:
-    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-    from google.protobuf.message import Message
-
-    from vplog.results.foxglove import PoseVector
-    from vplog.results.geo import Earth
-
-    Timed = tuple[int, str, Message]
-    """Log time in ns, topic, message."""
+Timed = tuple[int, str, Message]
+"""Log time in ns, topic, message."""
 
 _CHUNK_BYTES = 1 << 20
 """A reader inflates one chunk at a time; 1 MiB is what the format's own tools write."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,10 +15,8 @@ from vplog.errors import ResultError
 from vplog.geometry import se3
 from vplog.results.geo import on_earth
 from vplog.results.mcap_read import read_camera_pose, read_images, read_topics
+from vplog.results.report.page import Tracks, TruthComparison
 from vplog.storage.scratch import put_in_place
-
-if TYPE_CHECKING:
-    from vplog.results.report.page import Tracks, TruthComparison
 
 _GREY, _BLUE, _GREEN, _RED = (150, 150, 150), (60, 130, 240), (40, 200, 80), (230, 50, 50)
 _AMBER, _VIOLET = (240, 180, 30), (170, 90, 220)

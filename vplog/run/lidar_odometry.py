@@ -7,21 +7,18 @@ not show; by how far it is off, its distance from the pose by points and planes 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vplog.data import Odometry
+from vplog.data import Floats, Lidar, Odometry, Scan
 from vplog.errors import LogError
 from vplog.geometry import se3
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from scipy.spatial import KDTree
-
-    from vplog.data import Floats, Lidar, Scan
 
 _FARTHEST_M = 100.0
 """m; KISS-ICP's largest range, whose hundredth is the side of its voxels."""

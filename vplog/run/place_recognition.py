@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vplog.cache.codecs import columns_codec, descriptors_codec
+from vplog.cache.feature_shards import Extracted
 from vplog.cache.steps import step
 from vplog.data import Int32s, Keyframes, SharedReferences
+from vplog.execution.execution import Execution
 from vplog.loops.propose import Proposals, ProposeSettings, candidate_stops, propose
 from vplog.places.sequence import SequenceSettings, rank_places
 from vplog.places.views import views_of
 from vplog.stages import BoxState, Log, PlaceState
-
-if TYPE_CHECKING:
-    from vplog.cache.feature_shards import Extracted
-    from vplog.execution.execution import Execution
 
 
 @step(

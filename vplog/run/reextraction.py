@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 from vplog.data import Features, Ints
 from vplog.errors import LogError
 from vplog.features.extraction import extract_frames
+from vplog.features.store import FeatureStore
+from vplog.stages import Log
 
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution
-    from vplog.features.store import FeatureStore
     from vplog.run.feature_extraction import Extraction
-    from vplog.stages import Log
 
 _BLOCK = 16
 """Keyframes extracted together where one was not announced: its neighbours are needed next, and to read a log again

@@ -7,25 +7,19 @@ the scale solved first: two views of one place, each with landmarks in the unit 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import sparse
 
 from vplog.cache.codecs import json_codec
 from vplog.cache.steps import step
-from vplog.data import SCALE_WANDER
+from vplog.data import SCALE_WANDER, Camera, Floats, Ints, Keyframes, Odometry
+from vplog.execution.execution import Execution
 from vplog.geometry import se3
-from vplog.loops.candidate import check_queries
-from vplog.run.verification import for_verification
+from vplog.loops.candidate import Drive, Row, check_queries
+from vplog.loops.propose import Proposals
+from vplog.run.verification import DriveFeatures, for_verification
 from vplog.run.visual_odometry.metres import scaled
-
-if TYPE_CHECKING:
-    from vplog.data import Camera, Floats, Ints, Keyframes, Odometry
-    from vplog.execution.execution import Execution
-    from vplog.loops.candidate import Drive, Row
-    from vplog.loops.propose import Proposals
-    from vplog.run.verification import DriveFeatures
 
 _RANKS = 2
 """Candidates of a keyframe that are looked at: neighbours tell the same."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from vplog import logs
 from vplog.data import Closures, Floats, Gps, Keyframes, Trajectory
 from vplog.errors import ResultError, SettingsError, TruthError
 from vplog.evaluate import closures, trajectory
@@ -20,13 +22,7 @@ from vplog.results import mcap_read, run_record, tables
 from vplog.run.provenance import reopened
 from vplog.storage.folders import is_below
 from vplog.storage.urls import shown
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from vplog import logs
-    from vplog.verbs.limits import Limit
-
+from vplog.verbs.limits import Limit
 
 _FIGURES = {
     "ate_m": ("ate_after", "rmse_m"),

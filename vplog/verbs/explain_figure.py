@@ -12,12 +12,12 @@ import numpy as np
 from vplog.data import ACCEPTED, Bytes, Floats
 from vplog.results.report.charts import subsampled
 from vplog.run.figures.canvas import as_text, saved_figure
+from vplog.verbs.explain_text import Explanation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from vplog.run.figures.closure_view import Agreement, SharedBoxes
-    from vplog.verbs.explain_text import Explanation
 
 _COLOURS = ("#ff9d2e", "#4cc3ff", "#ff5fa8", "#b9e04a")
 """One for each reference drawn, apart from each other and from the lines, bright on grey pictures."""

@@ -7,31 +7,28 @@ from dataclasses import dataclass, replace
 from glob import escape
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 
 from vplog import logs
 from vplog.data import Bytes, Camera, Features, Floats, Ints, Structure
+from vplog.execution.execution import Execution
 from vplog.features.extraction import describe
 from vplog.features.store import FeatureStore
 from vplog.geometry import se3
 from vplog.loops.structure import pairs_to_match, triangulate
-from vplog.pipeline import recorded_pipeline
+from vplog.pipeline import Pipeline, recorded_pipeline
 from vplog.results import colmap, run_record, tables
 from vplog.results.previews import jpeg
 from vplog.results.staging import check_contents, staged
 from vplog.run.cameras import pictures_at
 from vplog.run.provenance import reopened
+from vplog.stages import EncodedFrame, Log
 from vplog.storage.folders import check_regular, is_below
 from vplog.storage.scratch import files_in, scratch
 from vplog.version import __version__
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
-    from vplog.pipeline import Pipeline
-    from vplog.stages import EncodedFrame, Log
 
 _WRITERS = {"colmap": colmap.write_colmap, "nerfstudio": colmap.write_nerfstudio}
 FOLDERS = tuple(_WRITERS)

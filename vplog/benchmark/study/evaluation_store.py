@@ -10,25 +10,25 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vplog.benchmark.feature_cache import FeatureFolder
 from vplog.benchmark.method_scores import describe_traversal, ranked, score_table, search, stored_bytes
 from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal, images_at, references_of
 from vplog.data import Bytes, Ints, Reference
 from vplog.errors import ResultError
 from vplog.evaluate import retrieval
 from vplog.evaluate.open_set import score_open_set
+from vplog.evaluate.pairs import Pairs
+from vplog.evaluate.place_truth import PlaceTruth
+from vplog.evaluate.retrieval import Ranks
 from vplog.execution.execution import Execution
 from vplog.places.library_files import references_hash
 from vplog.places.reference_choice import LibrarySettings, choose
 from vplog.results.run_record import read_run_json, write_run_json
+from vplog.stages import Log, PlaceState
 from vplog.storage.json_records import key_of
 
 if TYPE_CHECKING:
-    from vplog.benchmark.feature_cache import FeatureFolder
-    from vplog.evaluate.pairs import Pairs
-    from vplog.evaluate.place_truth import PlaceTruth
-    from vplog.evaluate.retrieval import Ranks
     from vplog.pipeline import Pipeline
-    from vplog.stages import Log, PlaceState
 
 SCORES = ("r_at_1", "r_at_5", "r_at_10", "anr", "ap", "recall_at_p100")
 """Scores of an evaluation, as `evaluate.retrieval` defines them."""

@@ -8,16 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vplog.benchmark.study.evaluation_store import Bench
 from vplog.benchmark.study.experiments import StudyOptions, box_methods
 from vplog.benchmark.study.score_charts import explain
 from vplog.data import Boxes, Bytes, Floats, Ints
 from vplog.run.figures.canvas import as_text, saved_figure
+from vplog.stages import BoxState
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from vplog.benchmark.study.evaluation_store import Bench
-    from vplog.stages import BoxState
 
 _SHOWN = 4
 """References drawn for an example, and of the most and least used: the paper's J, and its number in Fig. 9."""

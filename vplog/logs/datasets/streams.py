@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
+from vplog.data import Bytes, Float32s, Gps, Ints, Trajectory
 from vplog.errors import LogError
 from vplog.geometry import se3
+from vplog.logs.calibrations.camera import CalibratedCamera
 from vplog.logs.cameras import BODY
 from vplog.logs.datasets.text_tables import numbers_of, rows_of, stamps_ns
-from vplog.logs.formats.container import BRIEF, Channel, Contents, Message, by_topic
+from vplog.logs.formats.container import BRIEF, Channel, Contents, Message, Notes, Place, by_topic
 from vplog.logs.messages.pixels import scaled_depth_m
-from vplog.logs.messages.records import BadMessageError, FixMessage, ImageMessage, ImuMessage, PoseMessage
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
-    from pathlib import Path
-
-    from vplog.data import Bytes, Float32s, Gps, Ints, Trajectory
-    from vplog.logs.calibrations.camera import CalibratedCamera
-    from vplog.logs.formats.container import Notes, Place
-    from vplog.logs.messages.records import CalibrationMessage, Record
+from vplog.logs.messages.records import (
+    BadMessageError,
+    CalibrationMessage,
+    FixMessage,
+    ImageMessage,
+    ImuMessage,
+    PoseMessage,
+    Record,
+)
 
 _LATEST_NS = 2**32 * 10**9
 """ns; stamps of ROS 1 end in 2106."""

@@ -7,7 +7,6 @@ import io
 import shutil
 import threading
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 import lz4.frame
 import zstandard
@@ -17,15 +16,13 @@ try:
 except ImportError:  # no wheel for this processor
     from zlib import crc32
 
+from collections.abc import Iterator
+from pathlib import Path
+
 from vplog.errors import LogError
+from vplog.logs.formats.container import Octets
+from vplog.storage.remote_path import RemotePath
 from vplog.storage.scratch import scratch
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from vplog.logs.formats.container import Octets
-    from vplog.storage.remote_path import RemotePath
 
 MAX_RATIO = 200
 """Output bytes a chunk may claim per input byte, above the free allowance; images and numbers pack 1 to 20 fold."""

@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vplog.data import Floats
 from vplog.geometry import se3
+from vplog.logs.formats.container import Octets
 from vplog.logs.messages.flatbuffers import parse_flatbuffer
 from vplog.logs.messages.records import (
     BadMessageError,
@@ -23,17 +26,12 @@ from vplog.logs.messages.records import (
     FixMessage,
     ImageMessage,
     PoseMessage,
+    Record,
     nanoseconds,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from google.protobuf.message import Message as Proto
-
-    from vplog.data import Floats
-    from vplog.logs.formats.container import Octets
-    from vplog.logs.messages.records import Record
 
 _UNKNOWN_COVARIANCE = 0
 """LocationFix.PositionCovarianceType.UNKNOWN."""

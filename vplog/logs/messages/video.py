@@ -8,22 +8,20 @@ frame.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, cast
 
 import cv2
 import numpy as np
 
+from vplog.data import Bytes
 from vplog.errors import LogError
 from vplog.logs.messages.h264 import FrameNumbers
 from vplog.logs.messages.records import BadMessageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from av import VideoFrame
-
-    from vplog.data import Bytes
 
 _CODECS = {
     "264": ("h264", "H.264"),

@@ -19,18 +19,19 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vplog.cache.code_hash import code_of
 from vplog.data import Closures
 from vplog.errors import NewerError, ResultError, VplogError
+from vplog.execution.execution import Execution
 from vplog.graph.build import parts
 from vplog.loops.verify import no_closures
 from vplog.maps.joining.drive_pairs import fetch_inputs
 from vplog.maps.joining.growth import Growth, LostPosesError
-from vplog.maps.joining.join_states import write_states
+from vplog.maps.joining.join_states import JoinState, write_states
 from vplog.maps.joining.joint_graph import (
     pair_record,
     read_drive,
@@ -40,18 +41,14 @@ from vplog.maps.joining.joint_graph import (
     write_ledgers,
 )
 from vplog.maps.joining.joint_record import is_whole, read_joint, write_joint
+from vplog.maps.joining.members import Member
 from vplog.maps.storage.damage import DamagedDriveError
 from vplog.maps.storage.layout import folder_name
+from vplog.maps.storage.map_store import Store
+from vplog.pipeline import Pipeline
 from vplog.results import g2o, run_record, tables
 from vplog.storage.json_records import key_of
 from vplog.storage.scratch import put_in_place
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
-    from vplog.maps.joining.join_states import JoinState
-    from vplog.maps.joining.members import Member
-    from vplog.maps.storage.map_store import Store
-    from vplog.pipeline import Pipeline
 
 
 @dataclass(frozen=True)

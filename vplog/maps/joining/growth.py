@@ -9,16 +9,18 @@ what they were: its entry in `judged`.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vplog.data import Closures, Floats, Keyframes
 from vplog.errors import GraphError, ResultError
 from vplog.geometry import se3
 from vplog.graph.growth import Anchored, place, solve_again, turned_round
 from vplog.graph.joint import middle
+from vplog.graph.refine import Refined
 from vplog.maps.joining.joint_graph import (
     SolvedDrive,
     pair_record,
@@ -33,16 +35,12 @@ from vplog.maps.joining.joint_graph import (
 from vplog.maps.joining.joint_record import fetch_poses, is_whole
 from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.layout import folder_name
+from vplog.maps.storage.map_store import Store
 from vplog.results import run_record, tables
 from vplog.storage.json_records import key_of
 from vplog.storage.scratch import put_in_place
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from vplog.data import Closures, Floats, Keyframes
-    from vplog.graph.refine import Refined
-    from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
 
 

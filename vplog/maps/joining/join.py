@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from vplog.data import ACCEPTED
 from vplog.errors import VplogError
@@ -25,6 +25,7 @@ from vplog.execution.timing import StageTimer
 from vplog.maps.joining import drive_pairs
 from vplog.maps.joining.candidate_drives import candidates_of, places_of
 from vplog.maps.joining.components import Drives, PairLedger, solve_groups
+from vplog.maps.joining.drive_pairs import PairTask
 from vplog.maps.joining.inter_session import DrivePair, likely_pairs
 from vplog.maps.joining.join_states import JoinState, read_states, write_states
 from vplog.maps.joining.members import CameraTrust, Member, member_of
@@ -35,10 +36,7 @@ from vplog.maps.storage.map_store import Store, reading, writing
 from vplog.maps.storage.snapshot import LostRaceError
 from vplog.pipeline import Pipeline
 from vplog.results import tables
-
-if TYPE_CHECKING:
-    from vplog.maps.joining.drive_pairs import PairTask
-    from vplog.stages import PlaceState
+from vplog.stages import PlaceState
 
 _FLUSH_EVERY_S = 300.0
 """Interval at which ledgers are sent to a map on an object store."""

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+from vplog.data import Floats
 from vplog.errors import ResultError
 from vplog.maps.storage.damage import damaged_table, reading_drive
 from vplog.maps.storage.layout import folder_name, write_changed
+from vplog.maps.storage.map_store import Store
 from vplog.results import run_record, tables
 from vplog.storage.folders import is_below
 from vplog.storage.parquet_limits import check_version
-
-if TYPE_CHECKING:
-    from vplog.data import Floats
-    from vplog.maps.storage.map_store import Store
 
 
 class Component(NamedTuple):

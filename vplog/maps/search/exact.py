@@ -20,14 +20,13 @@ from vplog.errors import ResultError
 from vplog.execution.execution import Execution
 from vplog.maps.search.segment import Segment, open_segment
 from vplog.maps.storage.download_cache import cache_in
-from vplog.places.code_search import CodeIndex
+from vplog.places.bobb import Place
+from vplog.places.code_search import CodeIndex, Pairing
+from vplog.stages import CodedState
 
 if TYPE_CHECKING:
     from vplog.maps.search.index import SegmentView
     from vplog.maps.storage.remote_map import StoredFile
-    from vplog.places.bobb import Place
-    from vplog.places.code_search import Pairing
-    from vplog.stages import CodedState
 
 NO_SCORE = np.float32(-np.inf)
 """Score of no answer."""

@@ -17,7 +17,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import anyio.to_thread
 import numpy as np
@@ -33,13 +33,11 @@ from vplog.logs import TopicChoice
 from vplog.maps.geo_bounds import box_around
 from vplog.maps.localization.localize import described, localize_frame
 from vplog.maps.search.query import MapQuery
+from vplog.maps.service.open_state import NewestState, OpenState
 from vplog.results import tables
 from vplog.stages import FrameState
 from vplog.storage.scratch import scratch
 from vplog.version import __version__
-
-if TYPE_CHECKING:
-    from vplog.maps.service.open_state import NewestState, OpenState
 
 _PARQUET = b"PAR1"
 

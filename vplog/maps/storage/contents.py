@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 from urllib.parse import unquote
 
 from vplog.errors import LibraryError, NewerError, ResultError, nearest_path
@@ -24,17 +24,15 @@ from vplog.maps.storage.damage import (
     rows_of,
 )
 from vplog.maps.storage.layout import FORMAT, HASH, RUN_TABLES, drive_record, folder_name, write_changed
+from vplog.maps.storage.remote_map import Mirror
 from vplog.maps.storage.upload import send_rest, update_failures, write_head
 from vplog.results import run_record
+from vplog.results.geo import Earth
 from vplog.storage.folders import names_in, regular_files
 from vplog.storage.parquet_limits import check_version
 from vplog.version import __version__
 
-if TYPE_CHECKING:
-    from vplog.maps.storage.remote_map import Mirror
-    from vplog.results.geo import Earth
-
-    T = TypeVar("T")
+T = TypeVar("T")
 
 _TRIES, _PAUSE_S = 6, 0.02
 """Reads of a drive that is replaced meanwhile, with a pause that doubles: 1.3 s in all. A batch replaces each drive

@@ -27,7 +27,7 @@ import pyarrow.parquet as pq
 
 from vplog.errors import ResultError
 from vplog.maps.storage import delta_log, objects
-from vplog.maps.storage.contents import skip_damaged
+from vplog.maps.storage.contents import Store, skip_damaged
 from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.layout import TABLES
 from vplog.maps.storage.snapshot import store_errors
@@ -36,13 +36,11 @@ from vplog.storage import remote_path
 from vplog.storage.json_records import has_checksum, key_of, with_checksum
 from vplog.storage.object_store import plain_errors
 from vplog.storage.parquet_limits import check_version
+from vplog.storage.remote_path import RemotePath
 from vplog.storage.scratch import scratch
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
-
-    from vplog.maps.storage.contents import Store
-    from vplog.storage.remote_path import RemotePath
 
 _FORMAT = 1
 """Version of the commits."""

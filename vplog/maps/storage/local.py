@@ -9,16 +9,13 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
 
 from vplog.errors import ResultError, SettingsError
+from vplog.maps.storage.contents import Store
 from vplog.maps.storage.damage import complete_record
 from vplog.maps.storage.layout import ADD_AGAIN, TABLES, drive_record, folder_name, sha256_of
 from vplog.storage.folders import check_regular, regular_files
 from vplog.storage.scratch import made_folder, replacing, sync, sync_all
-
-if TYPE_CHECKING:
-    from vplog.maps.storage.contents import Store
 
 _HERE, _EXCHANGE = -100, 2
 """AT_FDCWD and RENAME_EXCHANGE of renameat2(2)."""

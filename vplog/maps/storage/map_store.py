@@ -22,12 +22,13 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from vplog.errors import LibraryError, ResultError, SettingsError, VplogError
 from vplog.maps.storage import delta, local, upload
 from vplog.maps.storage.contents import Head, Store, common_library
 from vplog.maps.storage.damage import UnreachableError, complete_record, damaged_table
+from vplog.maps.storage.download_cache import Cache
 from vplog.maps.storage.layout import HASH, RUN_TABLES, TABLES, folder_name, free_name, renamed, set_drive_id
 from vplog.maps.storage.remote_map import Mirror
 from vplog.results import run_record
@@ -35,9 +36,6 @@ from vplog.storage.folders import check_regular, regular_files
 from vplog.storage.object_store import STORES
 from vplog.storage.remote_path import RemotePath, check_writable
 from vplog.storage.scratch import put_in_place, scratch
-
-if TYPE_CHECKING:
-    from vplog.maps.storage.download_cache import Cache
 
 __all__ = ["TABLES", "Head", "Store", "add_library", "common_library", "folder_name", "publish", "reading", "remove"]
 __all__ += ["RUN_TABLES", "annotate", "writing"]

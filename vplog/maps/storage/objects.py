@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 from vplog.storage import remote_path
 from vplog.storage.object_store import plain_errors
+from vplog.storage.remote_path import RemotePath
 
 if TYPE_CHECKING:
     from obstore import ObjectMeta, PutResult, UpdateVersion
-
-    from vplog.storage.remote_path import RemotePath
 
 _BLOCK_BYTES = 1 << 20
 """Bytes copied from the store at once."""

@@ -26,22 +26,20 @@ from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import zstandard
 
 from vplog.errors import ResultError
 from vplog.maps.storage import objects
 from vplog.maps.storage.damage import DamagedDriveError, UnreachableError
+from vplog.maps.storage.download_cache import Cache
 from vplog.maps.storage.layout import ADD_AGAIN, RUN_TABLES, TABLES, folder_name
 from vplog.maps.storage.snapshot import Manifest, Snapshot, store_errors
 from vplog.results import run_record
 from vplog.storage.object_store import plain_errors
 from vplog.storage.remote_path import RemotePath, located, objects_below, reason
 from vplog.storage.scratch import files_in
-
-if TYPE_CHECKING:
-    from vplog.maps.storage.download_cache import Cache
 
 MOST_SECTION = 1 << 21
 """Bytes of files that are compressed as one, and fetched for any of them: zstd finds what is alike in as much."""

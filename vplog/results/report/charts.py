@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+from vplog.data import Floats, Ints
 
-    from numpy.typing import NDArray
-
-    from vplog.data import Floats, Ints
-
-    Line = tuple[str, str, list[float | None]]
+Line = tuple[str, str, list[float | None]]
 
 _BINS, _QUANTILE = 40, 0.995
 """Bins of a distribution; values above that quantile stand in the last one."""

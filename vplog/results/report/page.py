@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import base64
 import shlex
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import USED, Verdict
+from vplog.data import USED, Bools, Closures, Floats, Ints, Keyframes, Trajectory, Verdict
 from vplog.errors import plural
 from vplog.geometry import geodesy, se3
 from vplog.results.html import figure, mapping, render
 from vplog.results.report import charts
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from vplog.data import Bools, Closures, Floats, Ints, Keyframes, Trajectory
     from vplog.results.geo import Earth
     from vplog.results.mcap import McapContent
 

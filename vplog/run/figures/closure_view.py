@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from vplog.data import Bytes, Camera, Features, Float32s, Floats
 from vplog.features.matching import match_features
 from vplog.geometry import se3
 from vplog.loops import undistort
+from vplog.loops.verify import VerifySettings
 from vplog.loops.verify_epipolar import epipolar_inliers
-
-if TYPE_CHECKING:
-    from vplog.data import Bytes, Camera, Features, Float32s, Floats
-    from vplog.loops.verify import VerifySettings
-    from vplog.stages import BoxState
+from vplog.stages import BoxState
 
 SHOWN = 4
 """References that are shown of a closure: more colours are not distinct."""

@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.data import ACCEPTED, USED, Verdict
+from vplog.data import ACCEPTED, USED, Bytes, Camera, Closures, Features, Floats, Gps, Reference, Trajectory, Verdict
 from vplog.errors import ResultError
 from vplog.geometry import geodesy, se3
+from vplog.loops.verify import VerifySettings
 from vplog.results import closure_views
 from vplog.results.collage import FramePanel, ReferencePanel, collage
 from vplog.results.geo import Earth
 from vplog.results.mcap import McapExtras, ReferenceBoxes
-from vplog.results.previews import jpeg, scaled_size, shrink, thumbnail
+from vplog.results.previews import PictureSettings, jpeg, scaled_size, shrink, thumbnail
 from vplog.run.figures.closure_view import find_agreement, find_boxes
-from vplog.stages import BoxState
+from vplog.stages import BoxState, PlaceState
 from vplog.storage.image_file import decode_image
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from vplog.data import Bytes, Camera, Closures, Features, Floats, Gps, Reference, Trajectory
     from vplog.execution.execution import Execution
-    from vplog.loops.verify import VerifySettings
-    from vplog.results.previews import PictureSettings
     from vplog.run.cameras import View
-    from vplog.stages import PlaceState
 
 _REFERENCE_MEGAPIXELS = 0.05
 """Size of a reference's picture: 260 x 195, 8 kB; it is written for every keyframe that it explains best."""

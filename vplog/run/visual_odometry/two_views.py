@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import cv2
 import numpy as np
 
+from vplog.data import Bools, Floats
 from vplog.geometry import se3
 from vplog.graph.bundle import Observations, adjust
 
 if TYPE_CHECKING:
-    from vplog.data import Bools, Floats
     from vplog.run.visual_odometry.sensor import Points
 
 UNIT_DEPTH = 10.0
