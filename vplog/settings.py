@@ -38,7 +38,7 @@ def _describe(schema: dict[str, Any], settings: type[BaseModel]) -> None:
 
 @cache
 def _sentences(settings: type[BaseModel]) -> dict[str, str]:
-    """What stands below each field in the source, as cleaned text; without a source, as in a shell, nothing."""
+    """The text below each field in the source, cleaned; without a source, as in a shell, nothing."""
     found = {}
     with suppress(OSError):
         for field, below in pairwise(ast.walk(ast.parse(dedent(getsource(settings))))):

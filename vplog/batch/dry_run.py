@@ -1,4 +1,4 @@
-"""What a batch would compute, and what that would take, without reading or writing a drive."""
+"""The drives that a batch would compute and the time and bytes of that, without reading or writing a drive."""
 
 from __future__ import annotations
 

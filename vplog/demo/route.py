@@ -23,7 +23,7 @@ ORIGIN_DEG = (48.137, 11.575)
 """Latitude and longitude of the world's origin."""
 ORIGIN_ALTITUDE_M = 520.0
 _LATERAL_OFFSET_M = 0.8
-"""How far left of the first lap's track the car is after it."""
+"""Distance of the later laps' track to the left of the first one's."""
 SHIFT_LENGTH_M = 10.0
 """Distance before the end of the first lap over which the car moves to its new track and the light changes."""
 

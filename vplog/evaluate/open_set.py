@@ -35,7 +35,7 @@ def score_open_set(ranks: Ranks) -> dict[str, Any]:
 
 
 def reliability_of_matches(ranks: Ranks) -> Reliability:
-    """How often answers of a `p_match` are right. Raises TruthError where none has one, ValueError without any."""
+    """The share of right answers by `p_match`. Raises TruthError where none has one, ValueError without any."""
     if ranks.p_match is None:
         raise ValueError("no probabilities")
     known = ~np.isnan(ranks.p_match)

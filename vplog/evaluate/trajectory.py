@@ -1,4 +1,4 @@
-"""How far an estimated trajectory is from the truth: ATE and RPE, defined as evo computes them, and KITTI's drift.
+"""Errors of an estimated trajectory against the truth: ATE and RPE, defined as evo computes them, and KITTI's drift.
 
 Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012, sections IV.A and IV.B; Geiger et al.,
 "Are we ready for autonomous driving?", CVPR 2012, and the odometry development kit.

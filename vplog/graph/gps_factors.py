@@ -245,10 +245,10 @@ def _without_jumps(
     noise = max(float(np.median(chi2)) / chi2_quantile(0.5, 3), 1.0)
     noisy = replace(fixes, covariance=fixes.covariance * noise)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], inlier, [0]])))
-    kept = [np.arange(first, last) for first, last in edges.reshape(-1, 2).tolist()]
+    runs = [np.arange(first, last) for first, last in edges.reshape(-1, 2).tolist()]
     between = [
         run
-        for before, run, after in zip(kept[:-2], kept[1:-1], kept[2:], strict=True)
+        for before, run, after in zip(runs[:-2], runs[1:-1], runs[2:], strict=True)
         if run[0] - before[-1] > _JUMP and after[0] - run[-1] > _JUMP and len(run) < len(fixes) / 2
     ]
     if not between:

@@ -93,11 +93,11 @@ def place(drive: SessionGraph, anchored: Sequence[Anchored], solve: Optimiser, s
         if loose:
             continue
         held, rows = _against(drive, [anchored[at] for at in used], decision.solution.world_from_body, hold=True)
-        kept = decision.solution.weight[len(graph.a) - len(held.a) :]
-        poses = descend(Factors.of(held), kept, held.world_from_body, 100, 1e-6).world_from_body
+        anchored_weight = decision.solution.weight[len(graph.a) - len(held.a) :]
+        poses = descend(Factors.of(held), anchored_weight, held.world_from_body, 100, 1e-6).world_from_body
         after = residual_sigma(held, poses)
         for at, part in zip(used, rows, strict=True):
-            weight[at], residual[at] = kept[part], after[part]
+            weight[at], residual[at] = anchored_weight[part], after[part]
         return Placed(poses[1:], weight, residual, apart)
     return Placed(None, weight, residual, apart)
 

@@ -29,7 +29,7 @@ _LEAST, _POSES = 4, 40_000
 """Fewer are turned, but so many at least, where the graph has so many poses that each takes long."""
 _POWER = 0.1
 """Power of the evidence: the closures of a run, some ten, see the same things and err together."""
-_KEPT = 0.005
+_LEAST_P_FALSE = 0.005
 """Least probability that what is in the solution is false, whatever the evidence says: false closures that agree with
 each other make it. The share of false ones kept that the back end is held to on random worlds."""
 
@@ -68,7 +68,7 @@ def questions(graph: PoseGraph, weight: Floats, log_odds: Floats, decided: Bools
             used = weight[turned[0]] > 0
             odds = _POWER * (then.log_evidence - now.log_evidence)
             odds += float(log_odds[turned].mean()) * (1.0 if used else -1.0)
-            p_wrong = max(1.0 / (1.0 + math.exp(min(-odds, 700.0))), _KEPT if used else 0.0)
+            p_wrong = max(1.0 / (1.0 + math.exp(min(-odds, 700.0))), _LEAST_P_FALSE if used else 0.0)
             one = Question(closures, p_wrong, _moved_m(now.poses, then.poses))
             first = int(closures[0])
             best[first] = max(best.get(first, one), one, key=lambda one: one.expected_m)

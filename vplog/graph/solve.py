@@ -51,13 +51,13 @@ def decided(
         return Decision(graph, optimiser(graph), Sigmas())
     best = best_hypothesis(graph, optimiser, cost, log_odds)
     graph = bounded(graph)
-    count, kept = int(loops.sum()), int(best.weight[loops].sum())
-    if kept == 0:
+    count, inliers = int(loops.sum()), int(best.weight[loops].sum())
+    if inliers == 0:
         why = f"Odometry was kept: the {count} closures are likelier to be all false than any of them to be true."
         return Decision(graph, Solution(best.poses, best.weight, 0.0, 0.0, 0, True, why), Sigmas())  # nothing tells
     if not isinstance(optimiser, GncSettings):
         return Decision(graph, optimiser(graph), best.sigmas)
-    found = f"{kept} of {count} closures were kept. "
+    found = f"{inliers} of {count} closures were kept. "
     solution = solve_weighted(
         Factors.of(graph), best.weight, best.poses, optimiser.max_iterations, optimiser.tolerance, found
     )

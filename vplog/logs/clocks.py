@@ -177,7 +177,7 @@ def _skew_of(own: int, clocks: list[int | None], number: int, limit: float) -> i
 
 
 def _log_jumps(header_ns: Ints, log_ns: Ints, limit: float) -> int:
-    """How often the recorder's clock was set while the headers' went on."""
+    """The number of times that the recorder's clock was set while the headers' went on."""
     step, log_step = np.diff(header_ns), np.diff(log_ns)
     set_at = (
         np.flatnonzero((np.abs(step - log_step) > limit) & (np.abs(step) <= limit) & (np.abs(log_step) > limit)) + 1

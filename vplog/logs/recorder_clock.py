@@ -132,7 +132,7 @@ def _duplicates(one: Stamps, log_ns: Ints, header_ns: Ints, before: Ints, behind
 
 
 def _alternations(before_ns: Ints, behind_ns: Ints) -> int:
-    """How often the messages in order of time change from one side of a step to the other."""
+    """The number of times that messages in order of time change from one side of a step to the other."""
     side = np.repeat([False, True], [len(before_ns), len(behind_ns)])
     return int((np.diff(side[np.argsort(np.concatenate([before_ns, behind_ns]), kind="stable")]) != 0).sum())
 

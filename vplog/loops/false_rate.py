@@ -1,4 +1,4 @@
-"""How probable it is that a verified closure is false, calibrated on impossible and on certain pairs of its drive.
+"""The probability that a verified closure is false, calibrated on impossible and on certain pairs of its drive.
 
 Pairs that odometry rules out were proposed as its best by the same recogniser and passed the same geometry, so a false
 candidate does no better than they do: its conformal p-value is the share of them that does as well (Vovk, Gammerman and

@@ -1,4 +1,4 @@
-"""How probable it is that a query's best row is its place, learned on the queries' own scores without a truth.
+"""The probability that a query's best row is its place, learned on the queries' own scores without a truth.
 
 Two groups (Efron, Large-Scale Inference, 2010, chapter 5): queries that are somewhere in the map, and queries that are
 nowhere, whose best row is the best of rows that only look alike. What such rows reach each query shows by its second

@@ -175,7 +175,7 @@ class Coverage:
 def measure_coverage(
     keyframes: Keyframes, features_of: Callable[[int], Features], library: Library, execution: Execution
 ) -> Coverage:
-    """How far the library explains the keyframes of a drive: 48 of them, evenly, or 200 where that leaves it open
+    """Coverage of a drive's keyframes by the library: 48 of them, evenly, or 200 where that leaves it open
     whether the library is poor. Own images do not count."""
     own = [(row, one) for row, one in enumerate(library.references) if one.drive == keyframes.drive]
     itself, stamp_ns = {one.stamp_ns: row for row, one in own}, keyframes.stamp_ns

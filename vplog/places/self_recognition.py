@@ -1,4 +1,4 @@
-"""How well the references of a library are recognised by each other: evidence on recognition that needs no truth.
+"""Recognition of a library's references by each other: evidence on recognition that needs no truth.
 
 A reference is recognised where, of all others, one that its drive passed just before or after explains it most. In a
 tower of equal storeys that is seldom so, and patches, which see the layout, are misled more often than keypoints.

@@ -24,7 +24,7 @@ _MOST_ID = 2**63 - 1
 _LEFT_OUT = re.compile(r"(VERTEX|EDGE|PARAMS|DATA|ROBOT|FLASER|RAWLASER|TRUEPOSE|LASER)[A-Z0-9_:]*$")
 """Tags of the format's other elements: landmarks, priors, sensor data. A pose graph is solved without them."""
 _QUATERNION_OFF = 0.1
-"""How far a quaternion's length may be from 1: rounded to one digit passes, another quantity does not."""
+"""Largest difference of a quaternion's length from 1: rounded to one digit passes, another quantity does not."""
 _FURTHEST_M = 1e8
 """A coordinate beyond it is no place on earth, in any frame that drives are recorded in (UTM, ECEF: below 1e7)."""
 

@@ -104,7 +104,7 @@ class Written:
     descriptors: pa.Array
     """The column of descriptors.parquet."""
     graph_sha256: str
-    """Of graph.g2o."""
+    """sha256 of graph.g2o."""
 
 
 @step("write")

@@ -40,7 +40,7 @@ def diff(
     topics: logs.TopicChoice | None = None,
     options: TruthOptions | None = None,
 ) -> dict[str, Any]:
-    """How the run in a folder differs from the one of the same drive in `baseline`.
+    """The differences of the run in a folder from the one of the same drive in `baseline`.
 
     `settings` and `seconds` of stages hold pairs (baseline, run) by name. `closures` lists those gained and lost by the
     stamps of their keyframes. `trajectory` is how far the run's is from the baseline's, aligned by its positions, in m

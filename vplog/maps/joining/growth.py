@@ -160,7 +160,9 @@ class Growth:
                 moved = {one: self._keyframes(one)[1] for one, folder in part.folders.items() if not folder}
                 moved[drive] = placed.world_from_body
             else:  # a component more comes along as it is
-                rows = np.concatenate([one.query[kept > 0.5] for one, kept in zip(between, placed.weight, strict=True)])
+                rows = np.concatenate(
+                    [one.query[weight > 0.5] for one, weight in zip(between, placed.weight, strict=True)]
+                )
                 shift = middle(moved[drive][rows] @ se3.inverse(placed.world_from_body[rows]))
                 moved |= {one: shift @ self._keyframes(one)[1] for one in part.folders}
                 ledgers |= self._ledgers(part)

@@ -44,7 +44,7 @@ _PARQUET = b"PAR1"
 
 @dataclass(frozen=True)
 class Limits:
-    """How much the service takes on."""
+    """Limits of the service."""
 
     threads: int = 1
     """Requests that are worked on at once."""

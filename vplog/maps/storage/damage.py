@@ -98,7 +98,7 @@ def complete_record(made: Path, hashed: bool) -> None:
 
 
 def _difference(path: Path, wanted: dict[str, Any], hashed: bool = True) -> str:
-    """How a file differs from its entry in drive.json; empty where it does not."""
+    """The difference of a file from its entry in drive.json; empty where it does not."""
     try:
         if not path.is_file():
             return f"{path} is not a file." if path.exists() else f"{path} is not there."

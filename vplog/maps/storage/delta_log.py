@@ -27,7 +27,7 @@ _NAMES = {
     pa.float64(): "double", pa.bool_(): "boolean", pa.string(): "string", pa.binary(): "binary",
 }  # fmt: skip
 _PROTOCOL = {"minReaderVersion": 1, "minWriterVersion": 2}
-"""What every reader has: no feature that came later is used."""
+"""The version that every reader has: no feature that came later is used."""
 _MAP = pa.map_(pa.string(), pa.string())
 _ADD = {
     "path": pa.string(), "partitionValues": _MAP, "size": pa.int64(), "modificationTime": pa.int64(),

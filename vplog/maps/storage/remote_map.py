@@ -304,7 +304,7 @@ class Mirror:
             return self._section(token, *section)[at : at + about["bytes"]]
 
     def _fetch_section(self, token: str, start: int, stop: int) -> bytes:
-        """What is in a section of a pack; nothing of a damaged one. Raises OSError."""
+        """The content of a section of a pack; nothing of a damaged one. Raises OSError."""
         if not 0 <= start < stop <= start + 2 * MOST_SECTION:
             return b""
         try:

@@ -459,7 +459,7 @@ def _distributions(content: ReportContent) -> list[tuple[str, charts.Chart | Non
 
 
 def _references(content: ReportContent) -> dict[str, Any] | None:
-    """How often each reference explains a keyframe; None for a recogniser without boxes."""
+    """The number of keyframes that each reference explains; None for a recogniser without boxes."""
     library = mapping(content.record.get("library"))
     used = _list(library.get("used"))
     if not used or not all(isinstance(one, int) for one in used):
