@@ -292,6 +292,23 @@ def test_a_library_of_another_drive_is_used_and_named(tiny: Demo, tmp_path: Path
     assert state.to_arrow(restored).equals(column)
 
 
+def test_a_log_that_changes_while_it_is_read_has_its_report_all_the_same(
+    tiny: Demo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its pictures are in the cache until the run ends, and nothing stays there."""
+    log, written = Path(shutil.copy(tiny.log, tmp_path)), tables.write_trajectory
+
+    def touched(*given: Any) -> None:
+        os.utime(log, ns=(0, 0))
+        written(*given)
+
+    monkeypatch.setattr(tables, "write_trajectory", touched)
+    done = run(log, tmp_path / "run", load_pipeline("default", [*CLOSE, "pictures.megapixels=0.05"]))
+    assert any("changed while it was read" in text for text in done.record["warnings"])
+    assert '"thumbnails":{"' in (tmp_path / "run/report.html").read_text(encoding="utf-8").replace(" ", "")
+    assert not (tmp_path / "run/.cache").exists()
+
+
 def test_result_mcap_decodes_by_the_schemas_it_carries(finished: Path) -> None:
     """As a viewer does it, which knows nothing of vplog."""
     classes: dict[int, Any] = {}

@@ -271,8 +271,8 @@ class StageCache:
         inputs, changed = self.inputs, stat_signature(self.drive) != self.inputs.signature
         if changed:
             self._warnings.append("The log changed while it was read, so nothing is cached for another run.")
-            self._remove(set())
-        if self.keep and not changed:
+            self.keep = False
+        if self.keep:
             known = {
                 "look": inputs.signature,
                 "token": inputs.token,
