@@ -96,7 +96,10 @@ def write(
         earth=earth_of(trajectory, gps, about_gps(run.solved)),
         about={"versions": provenance.versions(), "inputs": steps.cache.hashes()},
     )
-    tables.write_descriptors(folder / "descriptors.parquet", keyframes, run.state.to_arrow(run.places), header)
+    places = [place for view in run.views for place in view.places]
+    further = [(view.row, view.pictures.keyframes.stamp_ns) for view in run.views[1:]]
+    described = run.state.to_arrow(places)
+    tables.write_descriptors(folder / "descriptors.parquet", keyframes, described, header, further)
     tables.write_keyframes(folder / "keyframes.parquet", keyframes, poses, header, keyframe_covariances(run.solved))
     tables.write_closures(folder / "closures.parquet", run.closures, keyframes, header)
     residual = consistency.residual_sigma(run.graph, poses)
@@ -107,7 +110,7 @@ def write(
     mcap.write_mcap(folder / "result.mcap", keyframes, poses, run.graph, run.closures, header, extras)
     if run.library is None:
         run.state.save(folder / "library")
-    steps.cache.finish(run.features.files)
+    steps.cache.finish([view.pictures.features.files for view in run.views])
 
 
 @step("report")

@@ -120,7 +120,7 @@ def _questions(folder: Path, content: ReportContent) -> list[ClosureQuestion]:
 
 def _references(folder: Path, content: ReportContent) -> Ints | None:
     """Numbers (N, K) of the references of each keyframe, as descriptors.parquet has them; None of other recognisers."""
-    column, _ = tables.read_descriptors(folder / "descriptors.parquet")
+    column, _ = tables.read_first_camera(folder / "descriptors.parquet")
     count = mapping(content.record.get("library")).get("references")
     at = column.type.get_field_index("references") if pa.types.is_struct(column.type) else -1
     if at < 0 or not isinstance(count, int) or len(column) != len(content.tracks.keyframes.stamp_ns):

@@ -19,7 +19,7 @@ from vplog.features.extraction import extract_frames
 from vplog.loops.match_probability import LookAlikes
 from vplog.maps.geo_bounds import DriveBounds, box_of_fixes
 from vplog.maps.search.exact import Answers, best_places
-from vplog.maps.search.index import SegmentView, place_keyframes, read_column, update_index
+from vplog.maps.search.index import SegmentView, pictures_of, read_column, update_index
 from vplog.maps.search.probability import answer_probabilities
 from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, LineSearch, best_lines, drives_by_credit
 from vplog.maps.storage import map_store
@@ -315,7 +315,7 @@ def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints, 
     for one in set(numbers):
         path = store.file(drives[one], "descriptors.parquet")
         with reading_drive(drives[one]):
-            known, keyframe_of = tables.read_stamps(path), place_keyframes(store, drives[one])
+            known, (keyframe_of, _) = tables.read_stamps(path), pictures_of(store, drives[one])
         rows = keyframe[number == one]
         if rows.max() >= len(known):
             raise ResultError(f"{path} was replaced while the map was searched. Run the query again.")
