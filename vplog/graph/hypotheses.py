@@ -51,6 +51,9 @@ _VERY_STRONG = 5.0
 """Log of the odds by which closures must be likelier true than all false to be used, as a false one does more harm than
 a true one good: Kass and Raftery, Bayes Factors, 1995, call it very strong. What another method that was chosen makes
 of them is used where the odds are even."""
+_STRONG = 3.0
+"""Likewise, where recognition tells the closures of this drive from its pairs that are none: there, 20 to 1 is strong
+evidence, and more cannot be counted from some hundred pairs."""
 _FLIPS, _MOST_FLIPS = 4, 10
 """Runs of either kind that are tried at once, and turns."""
 _COMPARED = 4
@@ -175,7 +178,7 @@ def _under_student_t(at: AtSigmas, one: Hypothesis, cost: Cost | None) -> tuple[
 def _recognised(
     claimed: Factors, one: Hypothesis, chain: OdometryChain, log_odds: Floats | None, cost: Cost | None
 ) -> bool:
-    """Whether recognition is very sure of its runs of closures, less what speaks against them where odometry drifts as
+    """Whether recognition is sure of its runs of closures, less what speaks against them where odometry drifts as
     it claims: how well it agrees with itself along a run does not tell what it gathers over the drive."""
     if log_odds is None:
         return False
@@ -187,7 +190,7 @@ def _recognised(
         by_graph -= cost(at.factors, true.weight, true.poses) - cost(at.factors, none.weight, none.poses)
     accepted = np.flatnonzero(is_loop(claimed.graph) & (one.weight > 0))
     sure = -sum(float(log_odds[run].mean()) for run in runs(claimed.graph, accepted))
-    return sure + min(by_graph, 0.0) > _VERY_STRONG
+    return sure + min(by_graph, 0.0) > _STRONG
 
 
 def _least_cost(claimed: Factors, found: list[Hypothesis], cost: Cost) -> Hypothesis:
