@@ -186,7 +186,7 @@ PLACED = pa.schema(
         column("rank", pa.int32(), "1", "0 is the view's best answer."),
         column("drive", pa.string(), "", "Drive of the place; with keyframe it joins with MAP/keyframes."),
         column("keyframe", pa.int32(), "row", "Keyframe of that drive, 0 is the first."),
-        column("stamp_ns", pa.int64(), "ns", "Stamp of the keyframe, in its log's clock."),
+        column("stamp_ns", pa.int64(), "ns", "Stamp of the picture, in its log's clock."),
         column("score", pa.float32(), "1", "Similarity by the recogniser; of a sequence, how much above the usual."),
         column("support", pa.int32(), "1", "Other views of the window that agree; 0 where views stand alone."),
         column(
@@ -197,6 +197,7 @@ PLACED = pa.schema(
             "compares between views; null for other answers, and where too few views have look-alikes.",
             True,
         ),
+        column("camera", pa.int32(), "", "Number of the picture's camera in run.json; 0 is the first.", True),
     ]
 )
 """Answers of a query of a map, by view, then by rank."""

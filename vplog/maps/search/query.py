@@ -310,20 +310,22 @@ def _table(store: Store, drives: Sequence[str], answers: Answers, stamps: Ints, 
     there = np.arange(answers.score.shape[1]) < answers.count[:, None]
     query, rank = np.nonzero(there)
     number, keyframe = answers.drive[there], answers.keyframe[there]
-    stamp = np.empty(len(query), np.int64)
+    stamp, camera = np.empty(len(query), np.int64), np.empty(len(query), np.int32)
     numbers: list[int] = number.tolist()
     for one in set(numbers):
         path = store.file(drives[one], "descriptors.parquet")
         with reading_drive(drives[one]):
-            known, (keyframe_of, _) = tables.read_stamps(path), pictures_of(store, drives[one])
+            known, (keyframe_of, camera_of) = tables.read_stamps(path), pictures_of(store, drives[one])
         rows = keyframe[number == one]
         if rows.max() >= len(known):
             raise ResultError(f"{path} was replaced while the map was searched. Run the query again.")
-        stamp[number == one], keyframe[number == one] = known[rows], keyframe_of[rows]
+        stamp[number == one], keyframe[number == one], camera[number == one] = (
+            values[rows] for values in (known, keyframe_of, camera_of)
+        )
     names = [drives[one] for one in numbers]
     return tables.placed_table(
         [
             query.astype(np.int32), stamps[query], rank.astype(np.int32), names, keyframe, stamp,
-            answers.score[there], answers.support[there], np.where(rank == 0, p_match[query], np.nan),
+            answers.score[there], answers.support[there], np.where(rank == 0, p_match[query], np.nan), camera,
         ]
     )  # fmt: skip
