@@ -197,7 +197,7 @@ PLACED = pa.schema(
             "compares between views; null for other answers, and where too few views have look-alikes.",
             True,
         ),
-        column("camera", pa.int32(), "", "Number of the picture's camera in run.json; 0 is the first.", True),
+        column("camera", pa.int32(), "1", "Number of the picture's camera in run.json; 0 is the first.", True),
     ]
 )
 """Answers of a query of a map, by view, then by rank."""
@@ -230,7 +230,7 @@ def descriptors_schema(descriptor: pa.DataType) -> pa.Schema:
             column("keyframe", pa.int32(), "row", "Row of the keyframe, 0 is the first."),
             column("stamp_ns", pa.int64(), "ns", "Stamp of the picture."),
             column("descriptor", descriptor, "", "The place, in the recogniser's own Arrow type."),
-            column("camera", pa.int32(), "", "Number of the camera in run.json; null where it has one.", True),
+            column("camera", pa.int32(), "1", "Number of the camera in run.json; null where it has one.", True),
         ]
     )
 

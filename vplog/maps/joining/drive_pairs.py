@@ -95,11 +95,10 @@ def compute_pair(task: PairTask) -> bytes:
 
         pair = DrivePair(0, 0, task.proposals, task.shared)
         ledger = closures_by_cameras(pair, later, earlier, task.pipeline.join, share, task.execution)
-        header, keyframes = (
-            tables.TableMetadata(depends(task.pipeline)["settings"], task.library),
-            (one[0].drive.keyframes for one in (later, earlier)),
-        )
-        return tables.joins_as_bytes([(*keyframes, ledger)], header, task.key)
+        header = tables.TableMetadata(depends(task.pipeline)["settings"], task.library)
+        return tables.joins_as_bytes(
+            [(later[0].drive.keyframes, earlier[0].drive.keyframes, ledger)], header, task.key
+        )  # fmt: skip
 
 
 def compute_camera(member: Member, pipeline: Pipeline, execution: Execution) -> CameraTrust:

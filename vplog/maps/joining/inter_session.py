@@ -253,9 +253,9 @@ def closures_by_cameras(
         queries, matches = later[q], earlier[m]
         fetch = partial(_fetch, queries, matches)
         ledger = closures_between(proposals, queries.drive, matches.drive, settings, share(q, m), execution, fetch)
-        known = pair.shared
-        shared = ([values[row] for row in rows.tolist()] for values in (known.references, known.overlap))
-        ledger = with_shared(ledger, proposals, SharedReferences(*shared))
+        known, chosen = pair.shared, rows.tolist()
+        shared = SharedReferences([known.references[row] for row in chosen], [known.overlap[row] for row in chosen])
+        ledger = with_shared(ledger, proposals, shared)
         pictures = [CameraPictures(one.row, one.drive.keyframes) for one in (queries, matches)]
         ledgers.append(of_keyframes(ledger, pictures, (q, m), keyframes) if q or m else ledger)
     return once(ledgers)
