@@ -210,7 +210,7 @@ def _ours(run: Path, query_log: Any) -> tuple[list[Answer], int, str]:
             if one.found.world_from_camera is not None:
                 found.append(Answer(frame.stamp_ns, one.found.world_from_camera, one.found.inliers, seconds))
         known = places.drives[0].loaded
-        return found, len(known.world_from_body), known.table.scale
+        return found, len(known.world_from_body), known.tables[0].scale
 
 
 def _hloc(folder: Path) -> tuple[list[Answer], dict[str, Any]]:

@@ -192,7 +192,7 @@ def test_a_condensed_map_works_as_before(whole: Path, halves: Path, tmp_path: Pa
 
 def kept_of(root: Path, drive: str) -> tuple[np.ndarray, np.ndarray]:
     path = Store(root).file(drive, "descriptors.parquet")
-    return tables.read_place_keyframes(path), tables.read_stamps(path)
+    return tables.read_pictures(path)[0], tables.read_stamps(path)
 
 
 def check_rows(whole: Path, small: Path, drive: str, count: int) -> None:

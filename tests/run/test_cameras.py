@@ -26,6 +26,7 @@ from vplog.logs.formats.container import Channel
 from vplog.logs.topic_selection import Candidate, Selection, TopicChoice, further_cameras
 from vplog.loops.propose import Proposals
 from vplog.results import tables
+from vplog.results.camera_pictures import CameraPictures
 from vplog.results.mcap_read import read_pictures
 from vplog.results.run_record import read_run_json
 from vplog.run import cameras
@@ -170,8 +171,8 @@ def test_a_closure_of_pictures_is_carried_to_the_keyframes() -> None:
     found = ledger(query, match, se3.between(world_from_picture[match], world_from_picture[query]))
     square = rng.normal(size=(2, 6, 6))
     found = replace(found, information=square @ np.swapaxes(square, 1, 2) + np.eye(6))
-    view: Any = type("View", (), {"row": row, "pictures": type("Pictures", (), {"keyframes": pictures})})
-    carried = cameras._of_keyframes(found, (view, 1), (view, 2), keyframes)
+    both = [CameraPictures(row, pictures)] * 2, (1, 2), [keyframes] * 2
+    carried = cameras.of_keyframes(found, *both)
     true = se3.between(world_from_keyframe[match], world_from_keyframe[query])
     assert np.allclose(carried.match_from_query, true)
     assert (carried.query_camera.tolist(), carried.match_camera.tolist()) == ([1, 1], [2, 2])
@@ -179,7 +180,7 @@ def test_a_closure_of_pictures_is_carried_to_the_keyframes() -> None:
     sigmas = []
     for one, at in (
         (moved, found.match_from_query),
-        (cameras._of_keyframes(moved, (view, 1), (view, 2), keyframes), true),
+        (cameras.of_keyframes(moved, *both), true),
     ):
         error = se3.log(se3.between(at, one.match_from_query))
         sigmas.append(
@@ -196,7 +197,7 @@ def test_of_each_query_the_best_candidates_of_all_cameras_are_verified() -> None
             np.array(score, np.float32), np.zeros(count, np.int32),
         )  # fmt: skip
 
-    best = cameras._best({1: found([4, 4, 5], [0.9, 0.2, 0.1]), 2: found([4, 5, 5], [0.5, 0.3, 0.2])}, 2)
+    best = cameras.best_together({1: found([4, 4, 5], [0.9, 0.2, 0.1]), 2: found([4, 5, 5], [0.5, 0.3, 0.2])}, 2)
     assert {m: list(zip(one.query.tolist(), one.match.tolist(), strict=True)) for m, one in best.items()} == {
         1: [(4, 0)],
         2: [(4, 0), (5, 1), (5, 2)],
@@ -208,8 +209,8 @@ def test_a_pair_of_keyframes_is_once_in_the_ledger_as_the_cameras_that_agree_bes
     verdicts = [Verdict.ACCEPTED, Verdict.TOO_FAR, Verdict.TOO_FAR, Verdict.ACCEPTED, Verdict.ACCEPTED]
     inliers, number = np.array([30, 90, 10, 40, 20], np.int32), np.arange(5, dtype=np.int32)
     found = replace(found, verdict=verdicts, inliers=inliers, query_camera=number)
-    assert cameras._once(found).query_camera.tolist() == [2, 3, 4]
-    assert len(cameras._once(found.rows(number[:0].astype(np.int64)))) == 0
+    assert cameras.once([found]).query_camera.tolist() == [2, 3, 4]
+    assert len(cameras.once([found.rows(number[:0].astype(np.int64))])) == 0
 
 
 MASKS = "/rear/mask/compressed"

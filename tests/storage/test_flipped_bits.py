@@ -85,7 +85,7 @@ def write_tables(folder: Path) -> dict[Path, list[Read]]:
     tables.write_joins(joins, [(RUN.keyframes, RUN.keyframes, RUN.closures)], METADATA)
     rows = np.arange(9, dtype=np.int32)
     share = rows.astype(np.float32) / 9
-    values = [rows, rows.astype(np.int64), rows, ["a"] * 9, rows, rows.astype(np.int64), share, rows, share]
+    values = [rows, rows.astype(np.int64), rows, ["a"] * 9, rows, rows.astype(np.int64), share, rows, share, rows]
     tables.write_placed(answers, tables.placed_table(values), METADATA)
     geo.write_geoparquet(folder / "geo.parquet", RUN.trajectory, Earth((48.0, 11.0, 500.0), np.eye(4)), {})
     world = RUN.solution.world_from_body

@@ -265,8 +265,9 @@ class StageCache:
             self._write_inputs({**known, "look": inputs.signature, "token": inputs.token, "hashes": hashes})
         return hashes
 
-    def finish(self, parts: Sequence[str]) -> None:
-        """The run is done: remove what it did not use. `parts` are the files of its features, in order."""
+    def finish(self, parts: Sequence[Sequence[str]]) -> None:
+        """The run is done: remove what it did not use. `parts` are the files of the features of each camera, in
+        order."""
         self.hashes()
         inputs, changed = self.inputs, stat_signature(self.drive) != self.inputs.signature
         if changed:
@@ -279,7 +280,7 @@ class StageCache:
                 "hashes": inputs.hashes,
                 **_read_inputs(self.folder),
             }
-            self._write_inputs({**known, "parts": list(parts)})
+            self._write_inputs({**known, "parts": list(map(list, parts))})
             self._remove({*self._used, INPUTS})
 
     def drop(self) -> None:
@@ -300,7 +301,8 @@ class StageCache:
                 file.unlink(missing_ok=True)
 
 
-def finished_parts(cache: Path) -> list[str]:
-    """Names of the files of a finished run's features, in order; none where no run was finished."""
+def finished_parts(cache: Path, camera: int = 0) -> list[str]:
+    """Names of the files of the features of a finished run's camera, in order; none where no run was finished."""
     parts = _read_inputs(cache).get("parts")
-    return [str(name) for name in parts if "/" not in str(name)] if isinstance(parts, list) else []
+    own = parts[camera] if isinstance(parts, list) and camera < len(parts) else []
+    return [str(name) for name in own if "/" not in str(name)] if isinstance(own, list) else []

@@ -173,7 +173,7 @@ def _link_join_inputs(other: Store, drive: str, store: Store, taken: str) -> Non
     """Link what later closures are verified by, so that these need the logs no more than in the source."""
     source, target = (one.root / "joins" / folder_name(name) for one, name in ((other, drive), (store, taken)))
     other.fetch_beside(f"joins/{folder_name(drive)}/{name}" for name in DRIVE_FILES)
-    for name in DRIVE_FILES:
+    for name in (*DRIVE_FILES, *(path.name for path in source.glob("features-*.parquet"))):
         if (source / name).is_file():
             try:
                 target.mkdir(parents=True, exist_ok=True)

@@ -75,11 +75,12 @@ class DrivePlaces:
 
 
 def read_places(folder: Path, drive: str | None = None) -> DrivePlaces:
-    """All places of a run, under the name of its drive or the one given. Raises ResultError."""
-    column, _ = tables.read_descriptors(folder / "descriptors.parquet")
+    """All places of a run's first camera, under the name of its drive or the one given. Raises ResultError."""
+    column, _ = tables.read_first_camera(folder / "descriptors.parquet")
     header = tables.read_metadata(folder / "descriptors.parquet")
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
-    rows, count = tables.read_place_keyframes(folder / "descriptors.parquet"), len(keyframes.stamp_ns)
+    pictures, count = tables.read_pictures(folder / "descriptors.parquet"), len(keyframes.stamp_ns)
+    rows = pictures[0][pictures[1] == 0]
     if len(rows) and rows[-1] >= count:
         raise ResultError(f"{folder} has a descriptor of keyframe {rows[-1]}, and {count} keyframes. Run again.")
     stamps, poses = keyframes.stamp_ns[rows], world_from_body[rows]

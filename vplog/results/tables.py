@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -185,7 +186,7 @@ PLACED = pa.schema(
         column("rank", pa.int32(), "1", "0 is the view's best answer."),
         column("drive", pa.string(), "", "Drive of the place; with keyframe it joins with MAP/keyframes."),
         column("keyframe", pa.int32(), "row", "Keyframe of that drive, 0 is the first."),
-        column("stamp_ns", pa.int64(), "ns", "Stamp of the keyframe, in its log's clock."),
+        column("stamp_ns", pa.int64(), "ns", "Stamp of the picture, in its log's clock."),
         column("score", pa.float32(), "1", "Similarity by the recogniser; of a sequence, how much above the usual."),
         column("support", pa.int32(), "1", "Other views of the window that agree; 0 where views stand alone."),
         column(
@@ -196,6 +197,7 @@ PLACED = pa.schema(
             "compares between views; null for other answers, and where too few views have look-alikes.",
             True,
         ),
+        column("camera", pa.int32(), "1", "Number of the picture's camera in run.json; 0 is the first.", True),
     ]
 )
 """Answers of a query of a map, by view, then by rank."""
@@ -226,8 +228,9 @@ def descriptors_schema(descriptor: pa.DataType) -> pa.Schema:
     return pa.schema(
         [
             column("keyframe", pa.int32(), "row", "Row of the keyframe, 0 is the first."),
-            column("stamp_ns", pa.int64(), "ns", "Stamp of the keyframe."),
+            column("stamp_ns", pa.int64(), "ns", "Stamp of the picture."),
             column("descriptor", descriptor, "", "The place, in the recogniser's own Arrow type."),
+            column("camera", pa.int32(), "1", "Number of the camera in run.json; null where it has one.", True),
         ]
     )
 
@@ -439,34 +442,61 @@ def read_trajectory(path: Path) -> tuple[Trajectory, Odometry]:
     return Trajectory(stamp_ns, read_poses(table, "")), Odometry(stamp_ns, read_poses(table, "odom_"), None)
 
 
-def write_descriptors(path: Path, keyframes: Keyframes, descriptors: pa.Array, metadata: TableMetadata) -> None:
-    """descriptors.parquet, in the order of the keyframes. Raises ResultError where not each of them has one."""
-    count = len(keyframes.stamp_ns)
-    if len(descriptors) != count:
-        raise ResultError(f"{path}: {len(descriptors)} descriptors came for {count} keyframes; each keyframe has one.")
-    arrays = [pa.array(np.arange(count, dtype=np.int32)), pa.array(keyframes.stamp_ns, pa.int64()), descriptors]
-    table = pa.Table.from_arrays(arrays, schema=descriptors_schema(descriptors.type))
+def write_descriptors(
+    path: Path, keyframes: Keyframes, descriptors: pa.Array, metadata: TableMetadata,
+    further: Sequence[tuple[Ints, Ints]] = (),
+) -> None:  # fmt: skip
+    """descriptors.parquet: the pictures of the first camera in the order of the keyframes, then those of each further
+    one by their keyframes' rows and their stamps. Raises ResultError where not each picture has a descriptor."""
+    rows = [np.arange(len(keyframes.stamp_ns)), *(row for row, _ in further)]
+    stamp_ns = np.concatenate([keyframes.stamp_ns, *(stamps for _, stamps in further)])
+    if len(descriptors) != len(stamp_ns):
+        each = f"{len(stamp_ns)} {'pictures' if further else 'keyframes'}; each has one"
+        raise ResultError(f"{path}: {len(descriptors)} descriptors came for {each}.")
+    camera = np.repeat(np.arange(len(rows)), list(map(len, rows)))
+    arrays = [pa.array(np.concatenate(rows), pa.int32()), pa.array(stamp_ns, pa.int64()), descriptors]
+    table = pa.Table.from_arrays(
+        [*arrays, pa.array(camera, pa.int32())], schema=descriptors_schema(descriptors.type)
+    )  # fmt: skip
+    table = table if further else table.drop_columns(["camera"])
     _write(path, "descriptors", table, metadata, DESCRIPTORS_PER_GROUP)
 
 
 def read_descriptors(path: Path) -> tuple[pa.Array, str]:
-    """The descriptors in the order of the keyframes, and the hash of the library they belong to. In a condensed map not
-    every keyframe has one: `read_place_keyframes` tells which."""
+    """The descriptors in the order of `read_pictures`, and the hash of the library they belong to."""
     with reading(path), open_table(path) as file:
         _check_name(path, "descriptors", file.schema_arrow)
         table = read_table(path, file, ["descriptor"])
         return table["descriptor"].combine_chunks(), (table.schema.metadata or {}).get(b"vplog.library", b"").decode()
 
 
-def read_place_keyframes(path: Path) -> Int32s:
-    """(P,) rows of the keyframes whose descriptors a table holds, increasing: all of them unless it is of a condensed
-    map. Raises ResultError."""
+def read_pictures(path: Path) -> tuple[Int32s, Int32s]:
+    """(P,) rows of the keyframes of the pictures whose descriptors a table holds, and (P,) their cameras: by camera,
+    then keyframe. The first camera has one at each keyframe, unless the table is of a condensed map. Raises
+    ResultError."""
     with reading(path), open_table(path) as file:
-        keyframe = read_table(path, file, ["keyframe"])["keyframe"]
-    rows = keyframe.to_numpy() if keyframe.type == pa.int32() and not keyframe.null_count else np.array([-1])
-    if np.any(np.diff(rows, prepend=-1) <= 0):
+        named = [name for name in ("keyframe", "camera") if name == "keyframe" or name in file.schema_arrow.names]
+        table = read_table(path, file, named)
+    sound = all(one.type == pa.int32() and not one.null_count for one in table.columns)
+    rows, *known = (one.to_numpy().astype(np.int64) for one in table.columns) if sound else [np.array([-1])]
+    camera = known[0] if known else np.zeros_like(rows)
+    # a new camera begins the keyframes anew, and each camera there has a picture
+    steps = np.where(np.diff(camera, prepend=0) == 0, np.diff(rows, prepend=-1), rows + 1)
+    if np.any(steps <= 0) or np.any((np.diff(camera, prepend=0) < 0) | (camera < 0)):
         raise ResultError(f"{path} is damaged: its keyframes do not increase. Run `vplog run` again.")
-    return np.asarray(rows, np.int32)
+    return rows.astype(np.int32), camera.astype(np.int32)
+
+
+def pictures_by_camera(pictures: tuple[Int32s, Int32s]) -> list[tuple[int, slice]]:
+    """The cameras of `read_pictures`, each with its rows there."""
+    first = np.flatnonzero(np.diff(pictures[1], prepend=-1)).tolist()
+    return [(int(pictures[1][a]), slice(a, b)) for a, b in pairwise([*first, len(pictures[1])])]
+
+
+def read_first_camera(path: Path) -> tuple[pa.Array, str]:
+    """The descriptors of the first camera's pictures, and the hash of their library. Raises ResultError."""
+    column, library = read_descriptors(path)
+    return column.take(pa.array(np.flatnonzero(read_pictures(path)[1] == 0))), library
 
 
 def on_keyframes(keyframe: Int32s) -> Ints | None:
@@ -482,7 +512,8 @@ def write_some_descriptors(source: Path, path: Path, rows: Ints, descriptors: pa
     """Some rows of a table of descriptors (N,), by a library of this hash, else as they are. Raises ResultError."""
     with reading(source), open_table(source) as file:
         _check_name(source, "descriptors", file.schema_arrow)
-        table = read_table(source, file, ["keyframe", "stamp_ns", "descriptor"])
+        known = ("keyframe", "stamp_ns", "descriptor", "camera")
+        table = read_table(source, file, [name for name in known if name in file.schema_arrow.names])
     field = table.schema.field("descriptor")
     table = table.set_column(2, field, descriptors.cast(field.type)).take(pa.array(rows))
     header = {key: value for key, value in (table.schema.metadata or {}).items() if key != VERSION_KEY.encode()}

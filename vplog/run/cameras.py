@@ -25,6 +25,7 @@ from vplog.loops.propose import Proposals, ProposeSettings, candidate_stops, pro
 from vplog.loops.verify import VerifySettings, verify_between
 from vplog.loops.verify_rig import Rig, verify_together
 from vplog.places.sequence import SequenceSettings, rank_places
+from vplog.results.camera_pictures import CameraPictures
 from vplog.run.feature_extraction import Extraction, decoded, extract
 from vplog.run.place_recognition import describe, shared_of
 from vplog.run.reference_library import own_images, own_references
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from vplog.stages import Log, PlaceState
 
 _log = logging.getLogger(__name__)
-_VIEW_BY_VIEW = SequenceSettings(length=1)
+VIEW_BY_VIEW = SequenceSettings(length=1)
 """Between two cameras the places of a way may come in either order."""
 
 
@@ -151,21 +152,22 @@ def verify_cameras(
         for m, earlier in enumerate(views):
             if q == m == 0:  # of the first camera they are verified already
                 continue
-            sequence = settings.sequence if q == m else _VIEW_BY_VIEW
+            sequence = settings.sequence if q == m else VIEW_BY_VIEW
             stops = _stops(later, earlier, settings.propose)
             ranked = rank_places(indexes[m], later.places, stops, settings.propose.ranked, sequence, execution)
             found[m] = propose(ranked, settings.propose)
         own = {q: found.pop(q)} if q else {}
-        for m, proposals in (own | _best(found, settings.propose.per_query)).items():
+        for m, proposals in (own | best_together(found, settings.propose.per_query)).items():
             if len(proposals.query):
                 share = max(shares[q], shares[m])
                 ledger = steps.part(verify_pair, proposals, share, later.pictures, views[m].pictures)
-                ledgers.append(_of_keyframes(ledger, (later, q), (views[m], m), views[0].pictures.keyframes))
-    closures, drives = _once(merged(ledgers, _numbered(ledgers))), [view.pictures for view in views]
+                ends = [CameraPictures(one.row, one.pictures.keyframes) for one in (later, views[m])]
+                ledgers.append(of_keyframes(ledger, ends, (q, m), [views[0].pictures.keyframes] * 2))
+    closures, drives = once(ledgers), [view.pictures for view in views]
     return steps.part(verify_by_all, closures, drives, [view.row for view in views], max(shares))
 
 
-def _best(found: dict[int, Proposals], count: int) -> dict[int, Proposals]:
+def best_together(found: dict[int, Proposals], count: int) -> dict[int, Proposals]:
     """The best of the candidates in all other cameras together, so many of each query: with six cameras there are not
     six times as many to verify."""
     query, score = (np.concatenate([getattr(one, name) for one in found.values()]) for name in ("query", "score"))
@@ -204,15 +206,14 @@ def _stops(later: View, earlier: View, settings: ProposeSettings) -> Ints:
     return np.where(stops > 0, found, 0).astype(np.int64)
 
 
-def _of_keyframes(
-    found: Closures, later: tuple[View, int], earlier: tuple[View, int], keyframes: Keyframes
+def of_keyframes(
+    found: Closures, pictures: Sequence[CameraPictures], cameras: tuple[int, int], keyframes: Sequence[Keyframes]
 ) -> Closures:
-    """The ledger of two views with rows, poses and information of keyframes instead of pictures."""
-    (queries, query_camera), (matches, match_camera) = later, earlier
-    query, match = queries.row[found.query], matches.row[found.match]
-    to_query, to_match = (
-        se3.between(keyframes.odom_from_body[row], view.pictures.keyframes.odom_from_body[picture])
-        for view, row, picture in ((queries, query, found.query), (matches, match, found.match))
+    """The ledger of two cameras with rows, poses and information of keyframes instead of pictures: of those of the
+    queries, then of those of the matches."""
+    (query, to_query), (match, to_match) = (
+        (own.row[rows], se3.between(drive.odom_from_body[own.row[rows]], own.keyframes.odom_from_body[rows]))
+        for own, drive, rows in zip(pictures, keyframes, (found.query, found.match), strict=True)
     )
     Ad = se3.adjoint(se3.inverse(to_query))  # T exp(d) inv(Q) = T inv(Q) exp(Ad_Q d)
     return replace(
@@ -221,8 +222,8 @@ def _of_keyframes(
         match=match.astype(np.int32),
         match_from_query=to_match @ found.match_from_query @ se3.inverse(to_query),
         information=np.swapaxes(Ad, -1, -2) @ found.information @ Ad,
-        query_camera=np.full(len(found), query_camera, np.int32),
-        match_camera=np.full(len(found), match_camera, np.int32),
+        query_camera=np.full(len(found), cameras[0], np.int32),
+        match_camera=np.full(len(found), cameras[1], np.int32),
     )
 
 
@@ -232,9 +233,10 @@ def _numbered(ledgers: Sequence[Closures]) -> list[Ints]:
     return [np.arange(begin, end) for begin, end in pairwise(ends)]
 
 
-def _once(closures: Closures) -> Closures:
-    """Every pair of keyframes once, ordered by query, then rank: accepted rather than not, then with most inliers, then
-    of the first cameras."""
+def once(ledgers: Sequence[Closures]) -> Closures:
+    """Every pair of keyframes of several ledgers once, ordered by query, then rank: accepted rather than not, then with
+    most inliers, then of the first ledgers."""
+    closures = merged(ledgers, _numbered(ledgers))
     order = np.lexsort([-closures.inliers, -closures.accepted.astype(int), closures.match, closures.query])
     pair = np.stack([closures.query, closures.match])[:, order]
     best = order[np.insert((np.diff(pair) != 0).any(axis=0), 0, True)] if len(order) else order

@@ -150,9 +150,9 @@ def put_part(cache: Path, part: ExtractionPart, data: bytes) -> None:
         stream.write(data)
 
 
-def stored_features(cache: Path) -> Extracted | None:
-    """The features of a finished run's keyframes by their rows; None where the cache does not hold them all."""
-    names, found = finished_parts(cache), Extracted()
+def stored_features(cache: Path, camera: int = 0) -> Extracted | None:
+    """The features of the pictures of a finished run's camera; None where the cache does not hold them all."""
+    names, found = finished_parts(cache, camera), Extracted()
     try:
         for name in names:
             check_file(cache / name)

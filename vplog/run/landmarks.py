@@ -19,7 +19,7 @@ from vplog.features.store import FeatureStore
 from vplog.loops.candidate import Drive
 from vplog.loops.undistort import project
 from vplog.loops.verify import VerifySettings, drive_of
-from vplog.results import tables
+from vplog.results.camera_pictures import camera_pictures, camera_topics
 from vplog.results.landmark_table import write_landmarks
 from vplog.results.run_record import CACHE
 from vplog.run.feature_extraction import Extraction, stored_features
@@ -28,8 +28,6 @@ from vplog.run.reextraction import ReextractedFeatures
 from vplog.storage.json_records import key_of
 from vplog.storage.scratch import scratch
 
-LANDMARKS = "landmarks.parquet"
-"""Name of the file."""
 MOST = 150
 """Landmarks of a keyframe, the strongest: where a quarter is found again, half being out of sight and half not matched,
 there are nearly twice the inliers that a pose needs."""
@@ -44,25 +42,33 @@ class DriveSettings(Extraction, Protocol):
     def verify(self) -> VerifySettings: ...
 
 
+def landmarks_file(camera: int) -> str:
+    """Name of the file of a camera, by its number in the run."""
+    return f"landmarks-{camera}.parquet" if camera else "landmarks.parquet"
+
+
 @contextmanager
-def run_drive(folder: Path, record: dict[str, Any], settings: DriveSettings, execution: Execution) -> Iterator[Drive]:
-    """A finished run as its closures are verified: with the features in its cache, or extracted from its log again.
-    Raises VplogError where the log is gone."""
-    keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
-    log = reopened(record, None, logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json"))
+def run_drive(
+    folder: Path, record: dict[str, Any], settings: DriveSettings, camera: int, execution: Execution
+) -> Iterator[Drive]:
+    """The pictures of a finished run's camera as closures are verified: with the features in its cache, or extracted
+    from its log again. Raises VplogError where the log is gone."""
+    _, keyframes = camera_pictures(folder, camera)
+    topics = logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json")
+    log = reopened(record, None, topics.of_camera(camera_topics(record)[camera]) if camera else topics)
     with ExitStack() as stack:
-        features: Any = stored_features(folder / CACHE)
+        features: Any = stored_features(folder / CACHE, camera)
         if features is None or not np.array_equal(features.stamp_ns, keyframes.stamp_ns):
             store = stack.enter_context(FeatureStore(stack.enter_context(scratch("features")) / "features"))
             features = ReextractedFeatures(log, keyframes.stamp_ns, settings, store, execution)
         yield drive_of(keyframes, log.camera(), features.__getitem__, settings.verify)
 
 
-def landmark_key(folder: Path, record: dict[str, Any], settings: DriveSettings) -> str:
-    """sha256 over all that the landmarks of a finished run depend on."""
+def landmark_key(folder: Path, record: dict[str, Any], settings: DriveSettings, camera: int) -> str:
+    """sha256 over all that the landmarks of a finished run's camera depend on."""
     made_from = {
         "inputs": record.get("inputs"), "topics": record.get("topics"), "most": MOST,
-        "keyframes": tables.read_stamps(folder / "keyframes.parquet").tolist(),
+        "keyframes": camera_pictures(folder, camera).keyframes.stamp_ns.tolist(), "camera": camera,
         "features": settings.features.identity(), "stereo": settings.stereo.model_dump(mode="json"),
         "verify": settings.verify.model_dump(mode="json"), **code_of(__name__, type(settings.features).__module__),
     }  # fmt: skip

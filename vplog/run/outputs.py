@@ -130,8 +130,10 @@ def write(
         earth=earth_of(trajectory, gps, about_gps(run.solved)),
         about={"versions": provenance.versions(), "inputs": steps.cache.hashes()},
     )
-    descriptors, covariance = run.state.to_arrow(run.places), keyframe_covariances(run.solved)
-    tables.write_descriptors(folder / "descriptors.parquet", keyframes, descriptors, header)
+    places = [place for view in run.views for place in view.places]
+    further = [(view.row, view.pictures.keyframes.stamp_ns) for view in run.views[1:]]
+    descriptors, covariance = run.state.to_arrow(places), keyframe_covariances(run.solved)
+    tables.write_descriptors(folder / "descriptors.parquet", keyframes, descriptors, header, further)
     tables.write_keyframes(folder / "keyframes.parquet", keyframes, poses, header, covariance)
     tables.write_closures(folder / "closures.parquet", run.closures, keyframes, header)
     residual = consistency.residual_sigma(run.graph, poses)
@@ -142,8 +144,9 @@ def write(
     mcap.write_mcap(folder / "result.mcap", keyframes, poses, run.graph, run.closures, header, extras)
     if run.library is None:
         run.state.save(folder / "library")
-    steps.cache.finish(run.features.files)
-    return Written(extras, covariance, descriptors, graph_sha256)
+    steps.cache.finish([view.pictures.features.files for view in run.views])
+    first = len(run.views[0].places)  # the report shows those of the first camera
+    return Written(extras, covariance, descriptors[:first], graph_sha256)
 
 
 @step("report")

@@ -97,7 +97,7 @@ def gather(
     covariance = tables.read_keyframe_covariance(folder / "keyframes.parquet")
     closures = tables.read_closures(folder / "closures.parquet")
     pictures = pictures or Pictures(tracks.found.views, tracks.found.references)
-    column, _ = tables.read_descriptors(folder / "descriptors.parquet")
+    column, _ = tables.read_first_camera(folder / "descriptors.parquet")
     count = mapping(record.get("library")).get("references")
     content = ReportContent(
         record, tracks, covariance, closures, pictures, judged=judged, questions=_questions(folder, tracks, closures),

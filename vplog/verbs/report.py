@@ -130,7 +130,7 @@ def recorded_places(
     or where not all keyframes have one."""
     with library_at(folder, record) as library:
         state = pipeline.places.load(library, execution)
-        column, made_by = tables.read_descriptors(folder / "descriptors.parquet")
+        column, made_by = tables.read_first_camera(folder / "descriptors.parquet")
         if made_by != state.hash:
             raise LibraryError(
                 f"{original(library)} is not the library of the run in {folder}, so its boxes cannot be drawn."

@@ -110,7 +110,8 @@ def condense_places(
     removable, along_m = shown_by_others(places, distance_m) | (posed & answers.faded), np.cumsum(places.steps_m())
     total = int(removable.sum())
     most_lost -= len(whole_answers.place) - len(answers.place)
-    candidates = RemovalCandidates(places.drive, along_m, removable, answers.faded)
+    _, way = np.unique(np.stack([places.drive, places.frame], 1), axis=0, return_inverse=True)  # a camera's of a drive
+    candidates = RemovalCandidates(way.ravel(), along_m, removable, answers.faded)
     removal, lost = remove_cross_validated(
         answers.queries, answers.place % 2 == 0, candidates, most_lost,
         lambda done: execution.progress("remove", done, total),
@@ -187,7 +188,8 @@ def _account(found: Condensed, store: Store, new: Store, warnings: list[str]) ->
             "faded": int((own & faded & ~retained).sum()),
         })  # fmt: skip
     recall = [round(right / max(posed, 1), 6) for right in (answered, len(found.answers.place) - found.lost)]
-    if len(set(places.frame.tolist())) == len(places.drives) > 1:
+    frames = places.frame.tolist()
+    if len(places.drives) > 1 and len(set(frames)) == len(set(zip(places.drive.tolist(), frames, strict=True))):
         warnings.append(
             "No drives are joined in one frame, so none stands in for another: places are compared within each. Join "
             f"the drives first: vplog map join {store}"

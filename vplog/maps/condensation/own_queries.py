@@ -17,7 +17,7 @@ from vplog.geometry import se3
 from vplog.maps.condensation.redundancy import OwnQueries
 from vplog.maps.joining.joint_record import joint_components, keyframe_poses
 from vplog.maps.search.exact import RankedPlaces, best_places, merge, no_answers
-from vplog.maps.search.index import SegmentView, place_keyframes, read_column, update_index
+from vplog.maps.search.index import SegmentView, pictures_of, read_column, update_index
 from vplog.maps.search.segment import Segment
 from vplog.maps.storage.layout import PICTURES
 from vplog.stages import CodedState, PlaceState, index_of_part
@@ -85,16 +85,18 @@ def read_own_places(store: Store, drives: Mapping[str, Mapping[str, Any]], state
     numbers: dict[Any, int] = {}
     for drive in names:
         columns.append(read_column(store, drive, state))
-        keyframe = place_keyframes(store, drive)
+        keyframe, camera = pictures_of(store, drive)
         known = keyframe_poses(store, joint, drive)
-        if len(keyframe) and keyframe[-1] >= len(known):
+        if len(keyframe) and keyframe.max() >= len(known):
             wrong = f"{store} has more keyframes of {drive} than the graph that joins it."
             raise ResultError(f"{wrong} Join the drives again: vplog map join {store}")
-        frame = numbers.setdefault(joint[drive].folder if drive in joint else drive, len(numbers))
+        where = joint[drive].folder if drive in joint else drive
+        # two cameras at one place show different things
+        frame = [numbers.setdefault((where, one), len(numbers)) for one in camera.tolist()]
         keyframes.append(keyframe)
         poses.append(known[keyframe])
         steps.append(np.linalg.norm(np.diff(known[:, :3, 3], axis=0), axis=1))
-        frames.append(np.full(len(keyframe), -1 if drives[drive].get(PICTURES) else frame))
+        frames.append(np.where(bool(drives[drive].get(PICTURES)), -1, np.array(frame, np.int64)))
     number = np.repeat(np.arange(len(names)), list(map(len, columns)))
     keyframe, frame, pose = (np.concatenate(parts) for parts in (keyframes, frames, poses))
     step = np.concatenate(steps)

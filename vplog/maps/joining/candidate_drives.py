@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from vplog.execution.execution import Execution
 from vplog.maps.geo_bounds import DriveBounds
-from vplog.maps.joining.inter_session import Candidates, candidates_among
+from vplog.maps.joining.inter_session import Candidates, PlacesByCamera, candidates_among
 from vplog.maps.search.exact import best_places
 from vplog.maps.search.index import read_column, rows_on_keyframes, update_index
 from vplog.maps.search.sequences import PLACES_A_VIEW, drive_credits
@@ -30,13 +30,18 @@ _AT_ONCE = 64
 
 
 def places_of(store: Store, drive: str, state: PlaceState) -> Sequence[Any]:
-    """The place of each keyframe of a drive; of a condensed map the nearest. Raises DamagedDriveError where they are of
-    another recogniser."""
-    column, nearest = read_column(store, drive, state), rows_on_keyframes(store, drive)
-    if nearest is not None:
-        column = column.take(pa.array(nearest))
+    """The place of each keyframe of a drive, of a condensed map the nearest; with further cameras, then those of their
+    pictures. Raises DamagedDriveError where they are of another recogniser."""
+    column, rows_of = read_column(store, drive, state), rows_on_keyframes(store, drive)
+    _, nearest = rows_of.get(0, (None, None))
+    if nearest is not None and len(rows_of) > 1:  # pictures of further cameras come after those of all keyframes
+        more = store.rows("keyframes", drive) - len(nearest)
+        nearest = np.concatenate([nearest, np.repeat(nearest[-1:], more)])
     with reading_drive(drive):
-        return state.from_arrow(column)
+        found = {camera: state.from_arrow(column[rows]) for camera, (rows, _) in rows_of.items() if camera}
+        first = column if not found else column[rows_of[0][0]]
+        own = state.from_arrow(first if nearest is None else first.take(pa.array(nearest)))
+    return PlacesByCamera([own, *(found.get(n, []) for n in range(1, max(found) + 1))]) if found else own
 
 
 def candidates_of(

@@ -2,6 +2,7 @@
 
     MAP/joins/drive=NEW/camera.json          the drive's camera, for those that come after it
     MAP/joins/drive=NEW/features.parquet     the features of its keyframes for verification, likewise
+    MAP/joins/drive=NEW/features-1.parquet   those of the pictures of a further camera
     MAP/joins/drive=NEW/match=OLD.parquet    the ledger of its keyframes in a drive before it
     MAP/joins/states-...                     after which drives each came (join_states.py)
 
@@ -11,14 +12,15 @@ What two drives have in common lies with the one that came later, so a new drive
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from dataclasses import asdict, dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog.cache.code_hash import code_of
 from vplog.data import SharedReferences
 from vplog.errors import ResultError
-from vplog.maps.joining.inter_session import closures_between, with_shared
+from vplog.maps.joining.inter_session import CameraDrive, DrivePair, closures_by_cameras
 from vplog.maps.joining.members import CameraTrust, Member, camera_trust, keep_features, opened_drive
 from vplog.maps.storage.damage import damaged_table
 from vplog.maps.storage.layout import folder_name, quoted
@@ -61,7 +63,7 @@ class PairTask:
         """sha256 over all that the ledger depends on."""
         proposed = [getattr(self.proposals, name).tolist() for name in ("query", "match", "rank", "score", "support")]
         members = [
-            [one.drive, one.key, asdict(camera)]
+            [one.drive, one.key, camera.record()]
             for one, camera in ((self.later, self.later_camera), (self.earlier, self.earlier_camera))
         ]
         return key_of({"members": members, "proposed": proposed, **depends(self.pipeline)})
@@ -79,28 +81,33 @@ def compute_pair(task: PairTask) -> bytes:
 
     Raises LogError where features have to be extracted again and a log is gone or another one.
     """
-    verify, execution = task.pipeline.verify, task.execution
-    with (
-        opened_drive(task.later, task.later_camera, verify, execution) as (later, of_later),
-        opened_drive(task.earlier, task.earlier_camera, verify, execution) as (earlier, of_earlier),
-    ):
+    ends = (task.later, task.later_camera), (task.earlier, task.earlier_camera)
+    with ExitStack() as stack:
 
-        def fetch(queries: Any, matches: Any) -> None:
-            of_later(queries)
-            of_earlier(matches)
+        def opened(member: Member, known: CameraTrust) -> CameraDrive:
+            drive, fetch = stack.enter_context(opened_drive(member, known, task.pipeline.verify, task.execution))
+            return CameraDrive(member.pictures.row, drive, fetch)
 
-        share = max(task.later_camera.rotation_share, task.earlier_camera.rotation_share)
-        ledger = closures_between(task.proposals, later, earlier, task.pipeline.join, share, execution, fetch)
-        ledger = with_shared(ledger, task.proposals, task.shared)
+        later, earlier = (list(map(opened, member.each_camera, trust.each)) for member, trust in ends)
+
+        def share(query: int, match: int) -> float:
+            return max(task.later_camera.each[query].rotation_share, task.earlier_camera.each[match].rotation_share)
+
+        pair = DrivePair(0, 0, task.proposals, task.shared)
+        ledger = closures_by_cameras(pair, later, earlier, task.pipeline.join, share, task.execution)
         header = tables.TableMetadata(depends(task.pipeline)["settings"], task.library)
-        return tables.joins_as_bytes([(later.keyframes, earlier.keyframes, ledger)], header, task.key)
+        return tables.joins_as_bytes(
+            [(later[0].drive.keyframes, earlier[0].drive.keyframes, ledger)], header, task.key
+        )  # fmt: skip
 
 
 def compute_camera(member: Member, pipeline: Pipeline, execution: Execution) -> CameraTrust:
-    """The camera of a drive, as a task; features in the cache of its run are stored for later drives."""
-    if pipeline.join.keep_features:
-        keep_features(member, pipeline.verify)
-    return camera_trust(member, pipeline.verify, execution)
+    """The cameras of a drive, as a task; features in the cache of its run are stored for later drives."""
+    each = member.each_camera
+    for one in each if pipeline.join.keep_features else ():
+        keep_features(one, pipeline.verify)
+    first, *further = (camera_trust(one, pipeline.verify, execution) for one in each)
+    return replace(first, further=tuple(further))
 
 
 def folder_of(store: Store, drive: str) -> Path:
@@ -131,14 +138,15 @@ def known_camera(store: Store, member: Member, pipeline: Pipeline) -> CameraTrus
     if record.get("made_from") != _camera_key(member, pipeline):
         return None
     try:
-        return CameraTrust(dict(record["camera"]), float(record["rotation_share"]))
-    except (KeyError, TypeError, ValueError):
+        known = CameraTrust.of(record)
+    except (LookupError, TypeError, ValueError, AttributeError):
         return None
+    return known if len(known.each) == len(member.cameras) else None
 
 
 def put_camera(store: Store, member: Member, pipeline: Pipeline, camera: CameraTrust) -> None:
     """Store the camera of a drive. Raises ResultError."""
-    record = {"drive": member.drive, **asdict(camera), "made_from": _camera_key(member, pipeline)}
+    record = {"drive": member.drive, **camera.record(), "made_from": _camera_key(member, pipeline)}
     run_record.write_run_json(folder_of(store, member.drive) / "camera.json", record)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -11,8 +13,10 @@ import numpy as np
 from vplog.data import Bools, Closures, Int32s, Ints, SharedReferences, Verdict
 from vplog.execution.execution import Execution
 from vplog.loops.propose import Proposals, ProposeSettings, propose
-from vplog.loops.verify import Drive, verify_between
+from vplog.loops.verify import Drive, no_closures, verify_between
 from vplog.places.sequence import rank_places
+from vplog.results.camera_pictures import CameraPictures
+from vplog.run.cameras import VIEW_BY_VIEW, best_together, of_keyframes, once
 from vplog.run.place_recognition import shared_of
 from vplog.run.verification import merged
 from vplog.stages import PlaceState, index_of_part
@@ -41,6 +45,43 @@ class Candidates:
         return self.proposals.rows(self.drive == number)
 
 
+class PlacesByCamera(list[Any]):
+    """The places of a drive's pictures, one camera after the other."""
+
+    def __init__(self, cameras: Sequence[Sequence[Any]]) -> None:
+        super().__init__(chain.from_iterable(cameras))
+        ends = np.cumsum([0, *map(len, cameras)]).tolist()
+        self.cameras = [slice(*pair) for pair in pairwise(ends)]
+
+
+def _cameras(places: Sequence[Any]) -> list[slice]:
+    return places.cameras if isinstance(places, PlacesByCamera) else [slice(0, len(places))]
+
+
+def proposed_by_cameras(
+    later: Sequence[Any], earlier: Sequence[Any], state: PlaceState, pipeline: Pipeline, execution: Execution
+) -> tuple[Proposals, Proposals]:
+    """The candidates of the places `later` among those of one drive, of the same cameras and of any two others: between
+    these places of a way may come in either order, and a score of single views is none of a line of them."""
+    same, crossed = [propose([], ProposeSettings())], [propose([], ProposeSettings())]
+    alone = pipeline.model_copy(update={"sequence": VIEW_BY_VIEW})
+    others_of = {m: others for m, others in enumerate(_cameras(earlier)) if others.start < others.stop}
+    for q, own in enumerate(_cameras(later)):
+        found = dict[int, Proposals]()
+        for m, others in others_of.items() if own.start < own.stop else ():
+            one = proposed_in(later[own], earlier[others], state, pipeline if q == m else alone, execution)
+            found[m] = replace(one, query=one.query + np.int32(own.start), match=one.match + np.int32(others.start))
+        same += [found.pop(q)] if q in found else []
+        crossed += best_together(found, pipeline.propose.per_query).values() if found else []
+    return joined(same), joined(crossed)
+
+
+def joined(parts: Sequence[Proposals]) -> Proposals:
+    """All candidates, one part after the other."""
+    names = [one.name for one in fields(Proposals)]
+    return Proposals(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
 def proposed_in(
     later: Sequence[Any], earlier: Sequence[Any], state: PlaceState, pipeline: Pipeline, execution: Execution
 ) -> Proposals:
@@ -58,10 +99,7 @@ def with_proposals(known: Candidates, number: int, more: Proposals, pipeline: Pi
     drive does not grow with the map. Ties go to the drive of lower number, in whatever order they are searched.
     """
     drive = np.concatenate([known.drive, np.full(len(more.query), number, np.int32)])
-    every = Proposals(**{
-        one.name: np.concatenate([getattr(known.proposals, one.name), getattr(more, one.name)])
-        for one in fields(Proposals)
-    })  # fmt: skip
+    every = joined([known.proposals, more])
     order = np.lexsort((every.rank, drive, -every.score, every.query))
     every, drive = every.rows(order), drive[order]
     starts = np.searchsorted(every.query, every.query)
@@ -85,7 +123,8 @@ def candidates_among(
     drive to itself where there are enough of them: a drive of a few hundred views is done too soon to share.
     Progress counts the pairs of drives that were compared.
     """
-    found = dict.fromkeys(later, Candidates(np.empty(0, np.int32), propose([], ProposeSettings())))
+    none = Candidates(np.empty(0, np.int32), propose([], ProposeSettings()))
+    found, crossed = dict.fromkeys(later, none), dict.fromkeys(later, none)
     queries: dict[int, list[int]] = {}
     for one in later:
         for number in searched[one]:
@@ -93,16 +132,23 @@ def candidates_among(
     inside = Execution(-(-execution.threads // max(len(queries), 1)))
     total, done, numbers = sum(map(len, queries.values())), 0, sorted(queries)
 
-    def compare(number: int) -> list[tuple[int, Proposals]]:
+    def compare(number: int) -> list[tuple[int, tuple[Proposals, Proposals]]]:
         known = later[number] if number in later else earlier(number)
-        return [(one, proposed_in(later[one], known, state, pipeline, inside)) for one in queries[number]]
+        return [(one, proposed_by_cameras(later[one], known, state, pipeline, inside)) for one in queries[number]]
 
     for number, proposed in zip(numbers, execution.map(compare, numbers, ahead=2), strict=True):
-        for one, more in proposed:
+        for one, (more, others) in proposed:
             found[one] = with_proposals(found[one], number, more, pipeline)
+            crossed[one] = with_proposals(crossed[one], number, others, pipeline)
         done += len(proposed)
         execution.progress("compare drives", done, total)
-    return found
+    return {one: _with_crossed(found[one], crossed[one]) for one in later}
+
+
+def _with_crossed(same: Candidates, crossed: Candidates) -> Candidates:
+    drive, every = np.concatenate([same.drive, crossed.drive]), joined([same.proposals, crossed.proposals])
+    order = np.argsort(every.query, kind="stable")
+    return Candidates(drive[order], every.rows(order))
 
 
 def likely_drives(candidates: Candidates, settings: JoinSettings) -> list[int]:
@@ -178,6 +224,53 @@ def closures_between(
             others[best] = False
             verify_rows(np.flatnonzero(others))
     return merged([ledger for _, ledger in verified], [rows for rows, _ in verified])
+
+
+class CameraDrive(NamedTuple):
+    """The pictures of one camera of a drive, as closures are verified."""
+
+    row: Ints
+    """(V,) keyframe of each."""
+    drive: Drive
+    fetch: Callable[[Int32s | Ints], None] = lambda _: None
+    """Gets the pictures before they are verified."""
+
+
+def closures_by_cameras(
+    pair: DrivePair, later: Sequence[CameraDrive], earlier: Sequence[CameraDrive], settings: JoinSettings,
+    share: Callable[[int, int], float], execution: Execution,
+) -> Closures:  # fmt: skip
+    """The ledger of the keyframes of two drives, with the references that explain both places: `closures_between` of
+    any two cameras with candidates, each pair of keyframes once."""
+    (query_camera, query), (match_camera, match) = (
+        _pictures(rows, cameras)
+        for rows, cameras in ((pair.proposals.query, later), (pair.proposals.match, earlier))
+    )  # fmt: skip
+    ledgers, keyframes = [no_closures()], [drives[0].drive.keyframes for drives in (later, earlier)]
+    for q, m in np.unique(np.stack([query_camera, match_camera], 1), axis=0).tolist():
+        rows = np.flatnonzero((query_camera == q) & (match_camera == m))
+        proposals = replace(pair.proposals, query=query, match=match).rows(rows)
+        queries, matches = later[q], earlier[m]
+        fetch = partial(_fetch, queries, matches)
+        ledger = closures_between(proposals, queries.drive, matches.drive, settings, share(q, m), execution, fetch)
+        known, chosen = pair.shared, rows.tolist()
+        shared = SharedReferences([known.references[row] for row in chosen], [known.overlap[row] for row in chosen])
+        ledger = with_shared(ledger, proposals, shared)
+        pictures = [CameraPictures(one.row, one.drive.keyframes) for one in (queries, matches)]
+        ledgers.append(of_keyframes(ledger, pictures, (q, m), keyframes) if q or m else ledger)
+    return once(ledgers)
+
+
+def _fetch(later: CameraDrive, earlier: CameraDrive, queries: Int32s, matches: Int32s) -> None:
+    later.fetch(queries)
+    earlier.fetch(matches)
+
+
+def _pictures(rows: Int32s, cameras: Sequence[CameraDrive]) -> tuple[Ints, Int32s]:
+    """The cameras of rows in `PlacesByCamera`, and the rows among their pictures."""
+    first = np.cumsum([0, *(len(one.row) for one in cameras)])
+    camera = np.searchsorted(first, rows, side="right") - 1
+    return camera, (rows - first[camera]).astype(np.int32)
 
 
 def with_shared(ledger: Closures, proposals: Proposals, shared: SharedReferences) -> Closures:

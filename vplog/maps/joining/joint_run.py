@@ -17,7 +17,13 @@ from vplog.execution.execution import Execution
 from vplog.execution.timing import StageTimer
 from vplog.geometry import tum
 from vplog.loops.verify import Drive, calibration_share, drive_of, no_closures
-from vplog.maps.joining.inter_session import candidates_among, closures_between, likely_pairs, with_shared
+from vplog.maps.joining.inter_session import (
+    CameraDrive,
+    PlacesByCamera,
+    candidates_among,
+    closures_by_cameras,
+    likely_pairs,
+)
 from vplog.maps.joining.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
 from vplog.pipeline import Pipeline, Run
 from vplog.pipeline import run as run_alone
@@ -27,6 +33,7 @@ from vplog.run import provenance
 from vplog.run.odometry import check_metric
 from vplog.run.reference_library import check_library, library_of_logs
 from vplog.run.run_folder import CacheOptions, staged_run
+from vplog.run.verification import for_verification
 from vplog.storage.folders import numbered
 
 if TYPE_CHECKING:
@@ -118,8 +125,16 @@ def _drive_run(name: str, run: Run, pipeline: Pipeline) -> DriveRun:
 
 def _ledgers(drives: Sequence[DriveRun], state: PlaceState, pipeline: Pipeline, execution: Execution) -> Ledgers:
     """The ledger of every pair of drives; empty where too few candidates are proposed."""
-    places = [drive_run.run.places for drive_run in drives]
-    share = [calibration_share(one.drive, execution) if one.drive.camera.matrix is not None else 0.0 for one in drives]
+    views = [drive_run.run.views for drive_run in drives]
+    places = [PlacesByCamera([view.places for view in own]) for own in views]
+    cameras = [
+        [CameraDrive(view.row, drive if n == 0 else for_verification(view.pictures)) for n, view in enumerate(own)]
+        for drive, own in zip([one.drive for one in drives], views, strict=True)
+    ]
+    shares = [
+        [calibration_share(one.drive, execution) if one.drive.camera.matrix is not None else 0.0 for one in own]
+        for own in cameras
+    ]
     later = {number: places[number] for number in range(1, len(drives))}
     searched = {number: range(number) for number in later}
     found = candidates_among(later, places.__getitem__, searched, state, pipeline, execution)
@@ -129,11 +144,11 @@ def _ledgers(drives: Sequence[DriveRun], state: PlaceState, pipeline: Pipeline, 
         pair = likely.get((later, earlier))
         if pair is None:
             return no_closures()
-        ledger = closures_between(
-            pair.proposals, drives[later].drive, drives[earlier].drive, pipeline.join,
-            max(share[later], share[earlier]), execution.within(f"{drives[later].name} in {drives[earlier].name}"),
+        return closures_by_cameras(
+            pair, cameras[later], cameras[earlier], pipeline.join,
+            lambda query, match: max(shares[later][query], shares[earlier][match]),
+            execution.within(f"{drives[later].name} in {drives[earlier].name}"),
         )  # fmt: skip
-        return with_shared(ledger, pair.proposals, pair.shared)
 
     return {(number, earlier): verified(number, earlier) for number in later for earlier in range(number)}
 

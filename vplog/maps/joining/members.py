@@ -20,6 +20,7 @@ from vplog.loops.verify import VerifySettings, calibration_share, drive_of
 from vplog.maps.storage.layout import described_with, folder_name
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables
+from vplog.results.camera_pictures import CameraPictures, camera_pictures, camera_topics
 from vplog.results.camera_record import camera_from
 from vplog.results.feature_table import FeatureTable, write_features
 from vplog.run.feature_extraction import Extracted, stored_features
@@ -57,6 +58,30 @@ class Member:
     pipeline: Pipeline
     key: str
     """sha256 over all that its keyframes, features and places depend on."""
+    cameras: tuple[str, ...] = ("",)
+    """Topics of its cameras, the first one's first."""
+    camera: int = 0
+    """Number of the camera that topics and features are of."""
+
+    def of_camera(self, number: int) -> Member:
+        """The drive with a further camera as the one in use."""
+        if number == 0:
+            return self
+        return replace(
+            self, camera=number, topics=self.topics.of_camera(self.cameras[number]), key=key_of([self.key, number]),
+            features=self.features.with_name(f"features-{number}.parquet"),
+        )  # fmt: skip
+
+    @property
+    def each_camera(self) -> list[Member]:
+        """The drive with each of its cameras in turn as the one in use."""
+        return [self.of_camera(number) for number in range(len(self.cameras))]
+
+    @property
+    def pictures(self) -> CameraPictures:
+        """The pictures of the camera in use. Raises ResultError."""
+        row, keyframes = camera_pictures(self.keyframes.parent, self.camera)
+        return CameraPictures(row, replace(keyframes, drive=self.drive))
 
 
 def member_of(store: Store, about: dict[str, Any]) -> Member:
@@ -65,7 +90,11 @@ def member_of(store: Store, about: dict[str, Any]) -> Member:
     file, record = store.file(drive, "keyframes.parquet"), store.file(drive, "run.json")
     settings = tables.read_table_metadata(file).settings
     pipeline = Pipeline.read(settings, str(file))
-    topics = run_record.read_run_json(record).get("topics")
+    account = run_record.read_run_json(record)
+    topics, cameras = account.get("topics"), tuple(camera_topics(account))
+    if len(cameras) > 1:
+        described = store.run(drive, ["descriptors.parquet", "trajectory.parquet"]) / "descriptors.parquet"
+        cameras = cameras[: int(tables.read_pictures(described)[1].max(initial=0)) + 1]  # an older run has the first
     made_from = {
         "inputs": about["inputs"],
         "library": described_with(about),
@@ -78,7 +107,7 @@ def member_of(store: Store, about: dict[str, Any]) -> Member:
         drive, file, store.root / ".cache" / folder_name(drive),
         store.root / "joins" / folder_name(drive) / "features.parquet", about["log"], about["inputs"],
         logs.TopicChoice.read(topics if isinstance(topics, dict) else {}, str(record)), pipeline,
-        key_of(made_from),
+        key_of(made_from), cameras,
     )  # fmt: skip
 
 
@@ -102,6 +131,24 @@ class CameraTrust:
     """Plain values."""
     rotation_share: float
     """Share of a rotation by which camera and odometry disagree; 0 without calibration."""
+    further: tuple[CameraTrust, ...] = ()
+    """The same of each further camera."""
+
+    @property
+    def each(self) -> tuple[CameraTrust, ...]:
+        """That of every camera, the first one's first."""
+        return self, *self.further
+
+    def record(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        more = {"further": [one.record() for one in self.further]} if self.further else {}
+        return {"camera": self.camera, "rotation_share": self.rotation_share, **more}
+
+    @classmethod
+    def of(cls, record: dict[str, Any]) -> CameraTrust:
+        """Those of a record. Raises LookupError, TypeError or ValueError where it is damaged."""
+        further = tuple(cls.of(dict(one)) for one in record.get("further", ()))
+        return cls(dict(record["camera"]), float(record["rotation_share"]), further)
 
 
 def camera_trust(member: Member, verify: VerifySettings, execution: Execution) -> CameraTrust:
@@ -133,7 +180,7 @@ def _stored(member: Member, verify: VerifySettings) -> FeatureTable | None:
         stored = FeatureTable(member.features, member.key, verify.matching.features)
     except ResultError:
         return None
-    if len(stored) == len(tables.read_keyframes(member.keyframes)[0].stamp_ns):
+    if len(stored) == len(member.pictures.row):
         return stored
     stored.close()
     return None
@@ -141,9 +188,8 @@ def _stored(member: Member, verify: VerifySettings) -> FeatureTable | None:
 
 def _from_run(member: Member) -> Extracted | None:
     """All features of the drive in the cache of its run; None where they are not there or of other keyframes."""
-    found = stored_features(member.cache)
-    keyframes, _ = tables.read_keyframes(member.keyframes)
-    return found if found is not None and np.array_equal(found.stamp_ns, keyframes.stamp_ns) else None
+    found, stamp_ns = stored_features(member.cache, member.camera), member.pictures.keyframes.stamp_ns
+    return found if found is not None and np.array_equal(found.stamp_ns, stamp_ns) else None
 
 
 @contextmanager
@@ -155,8 +201,7 @@ def opened_drive(
     Features are those that the map stores, or in the cache of its run, or extracted again from its log. Raises LogError
     where that is gone or another one.
     """
-    keyframes, _ = tables.read_keyframes(member.keyframes)
-    keyframes, camera = replace(keyframes, drive=member.drive), camera_from(known.camera, "Run `vplog map join` again.")
+    keyframes, camera = member.pictures.keyframes, camera_from(known.camera, "Run `vplog map join` again.")
 
     with ExitStack() as stack:
         features: Any = _stored(member, verify)

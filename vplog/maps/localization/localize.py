@@ -196,15 +196,15 @@ def _answer(places: Places, one: Picture, likely: list[tuple[int, int]], name: s
     known, pose, where = places.drives[drive], found.world_from_camera, None
     if pose is not None and (earth := known.loaded.earth) is not None:
         where = tuple(on_earth(earth, pose[None])[0].tolist())
-    sentence = _sentence(found, known.name, row)
-    return LocalizedPicture(name, one.stamp_ns, one.camera, found, sentence, known.name, row, known.frame, where)
+    keyframe = int(known.loaded.keyframe[row])
+    sentence = _sentence(found, known.name, keyframe)
+    return LocalizedPicture(name, one.stamp_ns, one.camera, found, sentence, known.name, keyframe, known.frame, where)
 
 
 def _with_neighbours(places: Places, likely: list[tuple[int, int]]) -> list[tuple[int, int]]:
     first, found = dict(reversed(likely)), list(likely)
     for drive, row in first.items():
-        count = len(places.drives[drive].loaded.world_from_body)
-        found += [(drive, other) for other in range(max(row - _AROUND, 0), min(row + _AROUND + 1, count))]
+        found += [(drive, other) for other in places.drives[drive].loaded.around(row, _AROUND)]
     return list(dict.fromkeys(found))
 
 

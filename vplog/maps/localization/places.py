@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vplog.data import Floats
+from vplog.data import Floats, Int32s, Ints
 from vplog.errors import ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
@@ -22,7 +22,7 @@ from vplog.maps.joining.drive_pairs import known_camera
 from vplog.maps.joining.joint_record import Component, joint_components, keyframe_poses
 from vplog.maps.joining.members import CameraTrust, member_of, opened_drive, opened_log
 from vplog.maps.search.exact import NO_SCORE, best_places
-from vplog.maps.search.index import SegmentView, place_keyframes, update_index
+from vplog.maps.search.index import SegmentView, pictures_of, update_index
 from vplog.maps.search.query import open_map
 from vplog.maps.search.sequences import LineSearch, best_lines
 from vplog.maps.storage import map_store
@@ -31,8 +31,9 @@ from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.layout import PICTURES
 from vplog.pipeline import recorded_pipeline
 from vplog.results import run_record, tables
+from vplog.results.camera_pictures import camera_pictures
 from vplog.results.landmark_table import LandmarkTable
-from vplog.run.landmarks import LANDMARKS, landmark_key, run_drive, write_drive_landmarks
+from vplog.run.landmarks import landmark_key, landmarks_file, run_drive, write_drive_landmarks
 from vplog.run.provenance import library_at
 from vplog.stages import CodedState, PlaceState
 from vplog.storage.json_records import plain
@@ -47,24 +48,40 @@ if TYPE_CHECKING:
     from vplog.results.geo import Earth
 
     Search = Callable[[Sequence[Any], int], list[list[tuple[int, int]]]]
-    """Drive and keyframe of the likeliest places of each of some descriptors, best first."""
+    """Drive and row in `Landmarked` of the likeliest places of each of some descriptors, best first."""
 
 
 class Landmarked(NamedTuple):
-    """The keyframes of one drive, with their landmarks."""
+    """The pictures of one drive, with their landmarks: of the first camera at each of N keyframes, then of each further
+    one those with a descriptor."""
 
+    keyframe: Ints
+    """(P,)."""
+    camera: Ints
+    """(P,) numbers."""
     world_from_body: Floats
-    """(N, 4, 4)."""
+    """(P, 4, 4) at the stamps of the pictures."""
     earth: Earth | None
     """Pose of that frame on earth."""
-    table: LandmarkTable
+    tables: Mapping[int, LandmarkTable]
+    """By camera."""
 
     def landmarks(self, row: int, settings: VerifySettings) -> KeyframeLandmarks:
-        """The landmarks of a keyframe. Raises ResultError where their file is damaged."""
-        (features, sigma), camera = self.table[row], self.table.camera
-        measured, pixel_sigma = self.table.scale != "odometry", settings.landmarks.pixel_sigma
+        """The landmarks of a picture. Raises ResultError where their file is damaged."""
+        table = self.tables[int(self.camera[row])]
+        (features, sigma), camera = table[row - self._of_its_camera(row).start], table.camera
+        measured, pixel_sigma = table.scale != "odometry", settings.landmarks.pixel_sigma
         world_from_camera = self.world_from_body[row] @ camera.body_from_camera
         return KeyframeLandmarks(world_from_camera, features, sigma, camera, pixel_sigma, measured)
+
+    def around(self, row: int, count: int) -> range:
+        """Up to so many pictures of the same camera before and after one, and itself."""
+        own = self._of_its_camera(row)
+        return range(max(row - count, own.start), min(row + count + 1, own.stop))
+
+    def _of_its_camera(self, row: int) -> range:
+        ends = (np.searchsorted(self.camera, self.camera[row], side) for side in ("left", "right"))
+        return range(*map(int, ends))
 
 
 @dataclass(eq=False)
@@ -108,21 +125,24 @@ def _of_run(folder: Path, execution: Execution) -> Iterator[Places]:
     with library_at(folder, record) as library:
         state = pipeline.places.load(library, Execution(execution.threads))
     column, _ = tables.read_descriptors(folder / "descriptors.parquet")
-    keyframe_of = tables.read_place_keyframes(folder / "descriptors.parquet")
+    pictures = tables.read_pictures(folder / "descriptors.parquet")
     index = state.index(state.from_arrow(column))
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
+    row_of = _landmark_rows(pictures, len(world_from_body))
 
     def search(descriptors: Sequence[Any], top: int) -> list[list[tuple[int, int]]]:
         found = execution.map(lambda one: index.query(one, top).rows, descriptors)
-        return [[(0, row) for row in keyframe_of[rows].tolist()] for rows in found]
+        return [[(0, row) for row in row_of[rows].tolist()] for rows in found]
 
-    key = landmark_key(folder, record, pipeline)
     with ExitStack() as stack:
 
+        def table(camera: int) -> LandmarkTable:
+            key = landmark_key(folder, record, pipeline, camera)
+            drive = partial(run_drive, folder, record, pipeline, camera, execution)
+            return _stored_or_made(folder / landmarks_file(camera), key, drive, stack, execution)
+
         def load() -> Landmarked:
-            drive = partial(run_drive, folder, record, pipeline, execution)
-            table = _stored_or_made(folder / LANDMARKS, key, drive, stack, execution)
-            return Landmarked(world_from_body, earth_of_run(folder), table)
+            return _landmarked(folder, world_from_body, earth_of_run(folder), pictures, table)
 
         own = PlacesOfDrive(keyframes.drive, keyframes.drive, load)
         yield Places(str(folder), state, pipeline, [own], search, [])
@@ -135,9 +155,10 @@ def _of_map(root: Path, execution: Execution) -> Iterator[Places]:
         joint = joint_components(store)
 
         def load(name: str, first: str) -> Landmarked:
+            earth, pictures = _map_earth(store, joint, first), pictures_of(store, name)
+            table = partial(_map_landmarks, store, known[name], pipeline, stack, execution)
             with reading_drive(name):
-                table = _map_landmarks(store, known[name], pipeline, stack, execution)
-            return Landmarked(keyframe_poses(store, joint, name), _map_earth(store, joint, first), table)
+                return _landmarked(store.run(name), keyframe_poses(store, joint, name), earth, pictures, table)
 
         first = {name: joint[name].drives[0] if name in joint else name for name in known}
         drives = [PlacesOfDrive(name, first[name], partial(load, name, first[name])) for name in known]
@@ -184,7 +205,9 @@ def _map_search(
                 found = best_lines(store, there, state, descriptors, top, LineSearch(), execution)
             for at in np.unique(found.drive[found.score > NO_SCORE]).tolist():
                 own = (found.drive == at) & (found.score > NO_SCORE)
-                found.keyframe[own] = place_keyframes(store, drives[at].name)[found.keyframe[own]]
+                name = drives[at].name
+                row_of = _landmark_rows(pictures_of(store, name), store.rows("keyframes", name))
+                found.keyframe[own] = row_of[found.keyframe[own]]
             rows = zip(found.drive.tolist(), found.keyframe.tolist(), found.count.tolist(), strict=True)
             likely = [list(zip(drive[:count], row[:count], strict=True)) for drive, row, count in rows]
             for at in sorted({drive for one in likely for drive, _ in one}):
@@ -198,23 +221,46 @@ def _map_search(
     return search
 
 
+def _landmark_rows(pictures: tuple[Int32s, Int32s], keyframes: int) -> Ints:
+    """(D,) rows in `Landmarked` of the pictures with a descriptor, of a drive with so many keyframes."""
+    keyframe, camera = pictures
+    further = np.cumsum(camera > 0) - 1
+    return np.where(camera == 0, keyframe, keyframes + further)
+
+
+def _landmarked(
+    folder: Path, world_from_body: Floats, earth: Earth | None, pictures: tuple[Int32s, Int32s],
+    table: Callable[[int], LandmarkTable],
+) -> Landmarked:  # fmt: skip
+    """The pictures of a drive whose tables are in a folder, with the landmarks of each camera by `table`; the poses
+    (N, 4, 4) are those of its keyframes."""
+    cameras = [0, *np.unique(pictures[1][pictures[1] > 0]).tolist()]
+    known = [camera_pictures(folder, camera) for camera in cameras]
+    odometry = known[0].keyframes.odom_from_body
+    poses = [world_from_body[row] @ se3.between(odometry[row], own.odom_from_body) for row, own in known]
+    row = np.concatenate([own.row for own in known])
+    camera = np.repeat(cameras, [len(own.row) for own in known])
+    return Landmarked(row, camera, np.concatenate(poses), earth, {camera: table(camera) for camera in cameras})
+
+
 def _map_landmarks(
-    store: Store, about: dict[str, Any], pipeline: Pipeline, stack: ExitStack, execution: Execution
+    store: Store, about: dict[str, Any], pipeline: Pipeline, stack: ExitStack, execution: Execution, camera: int
 ) -> LandmarkTable:
-    """The landmarks of a drive of a map, beside its features for joins."""
-    member = member_of(store, about)
+    """The landmarks of a camera of a drive of a map, beside its features for joins."""
+    member = member_of(store, about).of_camera(camera)
     folder = store.run(about["drive"])
-    key = landmark_key(folder, run_record.read_run_json(folder / "run.json"), member.pipeline)
+    key = landmark_key(folder, run_record.read_run_json(folder / "run.json"), member.pipeline, camera)
 
     @contextmanager
     def drive() -> Iterator[Drive]:
-        camera = known_camera(store, member, pipeline)
-        camera = camera or CameraTrust(plain(dict(vars(opened_log(member).camera()))), 0.0)
-        with opened_drive(member, camera, member.pipeline.verify, execution) as (found, fetch):
+        trust = known_camera(store, member_of(store, about), pipeline)
+        known = None if trust is None else trust.each[camera]
+        known = known or CameraTrust(plain(dict(vars(opened_log(member).camera()))), 0.0)
+        with opened_drive(member, known, member.pipeline.verify, execution) as (found, fetch):
             fetch(np.arange(len(found.keyframes.stamp_ns)))
             yield found
 
-    return _stored_or_made(member.features.with_name(LANDMARKS), key, drive, stack, execution)
+    return _stored_or_made(member.features.with_name(landmarks_file(camera)), key, drive, stack, execution)
 
 
 def _stored_or_made(
@@ -225,7 +271,7 @@ def _stored_or_made(
         return stack.enter_context(closing(LandmarkTable(path, key)))
     above = next(folder for folder in path.parents if folder.is_dir())
     if not os.access(above, os.W_OK):
-        path = stack.enter_context(scratch("landmarks")) / LANDMARKS
+        path = stack.enter_context(scratch("landmarks")) / path.name
     with drive() as found:
         write_drive_landmarks(path, found, key, execution)
     return stack.enter_context(closing(LandmarkTable(path, key)))

@@ -221,15 +221,20 @@ def read_column(store: Store, drive: str, state: PlaceState) -> pa.Array:
         ) from None
 
 
-def place_keyframes(store: Store, drive: str) -> Int32s:
-    """(P,) keyframes of the places of a drive: all of them, unless the map was condensed. Raises DamagedDriveError."""
+def pictures_of(store: Store, drive: str) -> tuple[Int32s, Int32s]:
+    """(P,) keyframes and (P,) cameras of the places of a drive: all of them, unless the map was condensed. Raises
+    DamagedDriveError."""
     with reading_drive(drive):
-        return tables.read_place_keyframes(store.file(drive, "descriptors.parquet"))
+        return tables.read_pictures(store.file(drive, "descriptors.parquet"))
 
 
-def rows_on_keyframes(store: Store, drive: str) -> Ints | None:
-    """(N,) row of the place nearest to each keyframe; None where each has its own. Raises DamagedDriveError."""
-    return tables.on_keyframes(place_keyframes(store, drive))
+def rows_on_keyframes(store: Store, drive: str) -> dict[int, tuple[slice, Ints | None]]:
+    """By camera, the rows of its places and, counted from their first, (N,) the one nearest to each keyframe; None
+    where each has its own. Raises DamagedDriveError."""
+    pictures = pictures_of(store, drive)
+    return {
+        camera: (rows, tables.on_keyframes(pictures[0][rows])) for camera, rows in tables.pictures_by_camera(pictures)
+    }
 
 
 def _remove(paths: Sequence[Path], store: Store) -> None:

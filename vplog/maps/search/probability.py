@@ -14,7 +14,7 @@ import numpy as np
 from vplog.data import Floats
 from vplog.execution.execution import Execution
 from vplog.loops.match_probability import LookAlikes, probabilities
-from vplog.maps.search.sequences import drive_index
+from vplog.maps.search.sequences import drive_indexes
 from vplog.places.sequence import SequenceSettings
 from vplog.storage.scratch import scratch
 
@@ -38,7 +38,7 @@ def answer_probabilities(
         look_alikes, numbers = LookAlikes.of(len(descriptors)), np.unique(answers.drive[answered, 0])
         for number in numbers.tolist():
             views = np.flatnonzero(answered & (answers.drive[:, 0] == number))
-            index, _ = drive_index(store, drives[number], state, SequenceSettings(length=1))
+            [(_, index, _)] = drive_indexes(store, drives[number], state, SequenceSettings(length=1))
             with scratch("scores") as folder:
                 shape = len(views), len(index)
                 scores = np.lib.format.open_memmap(folder / "scores.npy", "w+", np.dtype("<f4"), shape)

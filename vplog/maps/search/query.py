@@ -19,7 +19,7 @@ from vplog.features.extraction import extract_frames
 from vplog.loops.match_probability import LookAlikes
 from vplog.maps.geo_bounds import DriveBounds, box_of_fixes
 from vplog.maps.search.exact import RankedPlaces, best_places
-from vplog.maps.search.index import SegmentView, place_keyframes, read_column, update_index
+from vplog.maps.search.index import SegmentView, pictures_of, read_column, update_index
 from vplog.maps.search.probability import answer_probabilities
 from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, LineSearch, best_lines, drives_by_credit
 from vplog.maps.storage import map_store
@@ -310,20 +310,22 @@ def _table(store: Store, drives: Sequence[str], answers: RankedPlaces, stamps: I
     there = np.arange(answers.score.shape[1]) < answers.count[:, None]
     query, rank = np.nonzero(there)
     number, keyframe = answers.drive[there], answers.keyframe[there]
-    stamp = np.empty(len(query), np.int64)
+    stamp, camera = np.empty(len(query), np.int64), np.empty(len(query), np.int32)
     numbers: list[int] = number.tolist()
     for one in set(numbers):
         path = store.file(drives[one], "descriptors.parquet")
         with reading_drive(drives[one]):
-            known, keyframe_of = tables.read_stamps(path), place_keyframes(store, drives[one])
+            known, (keyframe_of, camera_of) = tables.read_stamps(path), pictures_of(store, drives[one])
         rows = keyframe[number == one]
         if rows.max() >= len(known):
             raise ResultError(f"{path} was replaced while the map was searched. Run the query again.")
-        stamp[number == one], keyframe[number == one] = known[rows], keyframe_of[rows]
+        stamp[number == one], keyframe[number == one], camera[number == one] = (
+            values[rows] for values in (known, keyframe_of, camera_of)
+        )
     names = [drives[one] for one in numbers]
     return tables.placed_table(
         [
             query.astype(np.int32), stamps[query], rank.astype(np.int32), names, keyframe, stamp,
-            answers.score[there], answers.support[there], np.where(rank == 0, p_match[query], np.nan),
+            answers.score[there], answers.support[there], np.where(rank == 0, p_match[query], np.nan), camera,
         ]
     )  # fmt: skip

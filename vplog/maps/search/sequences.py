@@ -9,7 +9,7 @@ views.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -60,8 +60,12 @@ def best_lines(
     """
     settings, look_alikes = search.settings, search.look_alikes
     best = no_answers(len(descriptors), top)
-    for number, drive in execution.counted("search", drives.items(), len(drives)):
-        index, nearest = drive_index(store, drive, state, settings)
+    parts = (
+        (number, part)
+        for number, drive in execution.counted("search", drives.items(), len(drives))
+        for part in drive_indexes(store, drive, state, settings)
+    )
+    for number, (begin, index, nearest) in parts:
         stops = np.full(len(descriptors), len(index), np.int64)
         most = top if nearest is None else top * -(-len(nearest) // (int(nearest[-1]) + 1))
         found = no_answers(len(descriptors), top)
@@ -79,25 +83,28 @@ def best_lines(
                     first = np.sort(np.unique(rows, return_index=True)[1])
                 first = first[:top]
                 count = len(first)
-                found.keyframe[view, :count], found.score[view, :count] = rows[first], ranking.score[first]
+                found.keyframe[view, :count], found.score[view, :count] = begin + rows[first], ranking.score[first]
                 found.support[view, :count] = support[first]
             best = merge([best, found], top)
-            if lines is not None and look_alikes is not None:  # in place of an earlier drive's, whose answers are worse
-                first = np.flatnonzero((best.count > 0) & (best.drive[:, 0] == number))
+            if lines is not None and look_alikes is not None:  # in place of an earlier one's, whose answers are worse
+                own = (best.drive[:, 0] == number) & (best.keyframe[:, 0] >= begin)
+                first = np.flatnonzero((best.count > 0) & own)
                 look_alikes.take(lines, first, first)
     return best
 
 
-def drive_index(
+def drive_indexes(
     store: Store, drive: str, state: PlaceState, settings: SequenceSettings
-) -> tuple[PlaceIndex, Ints | None]:
-    """The index of a drive's places. For lines it has a row for every keyframe, since these are spaced evenly, with the
-    scores of the nearest place, whose row comes along where the map was condensed."""
+) -> Iterator[tuple[int, PlaceIndex, Ints | None]]:
+    """Indexes of a drive's places, each with the row of its first. For lines there is one of each camera, with a row
+    for every keyframe, since these are spaced evenly, and the scores of the nearest place, whose row in the index comes
+    along where not every keyframe has its own."""
     column = read_column(store, drive, state)
-    nearest = rows_on_keyframes(store, drive) if settings.length > 1 else None
-    with reading_drive(drive):
-        index = index_of_part(state, state.from_arrow(column))
-    return (index, None) if nearest is None else (_OnKeyframes(index, nearest), nearest)
+    parts = rows_on_keyframes(store, drive).values() if settings.length > 1 else [(slice(0, len(column)), None)]
+    for rows, nearest in parts:
+        with reading_drive(drive):
+            index = index_of_part(state, state.from_arrow(column[rows]))
+        yield rows.start, (index if nearest is None else _OnKeyframes(index, nearest)), nearest
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from vplog.execution.execution import Execution
 from vplog.maps.geo_bounds import DriveBounds
 from vplog.maps.localization.places import opened
 from vplog.maps.search.exact import best_places
-from vplog.maps.search.index import SegmentView, place_keyframes, update_index
+from vplog.maps.search.index import SegmentView, pictures_of, update_index
 from vplog.maps.search.query import MapQuery, open_map, search
 from vplog.maps.search.sequences import LineSearch
 from vplog.maps.storage import map_store, objects
@@ -87,7 +87,7 @@ class OpenState:
         def read(drive: str) -> tuple[Int32s, Ints]:
             path = self.store.file(drive, "descriptors.parquet")
             with reading_drive(drive):
-                return place_keyframes(self.store, drive), tables.read_stamps(path)
+                return pictures_of(self.store, drive)[0], tables.read_stamps(path)
 
         return lru_cache(_DRIVES)(read)
 

@@ -216,7 +216,7 @@ def _missing(
     if (schemas := schemas or before["schemas"]) == {}:
         raise ResultError(f"{store} has no finished drive yet. Add some: vplog batch LOG... -o {store}")
     known = before["schemas"].get("descriptors", schemas["descriptors"])
-    if current and schemas["descriptors"] != known:
+    if current and not delta_log.extends(schemas["descriptors"], known):
         raise ResultError(f"Descriptors in {store} are of several types, for which Delta Lake has no table.")
     removed = {name: files[name] for name in sorted(stale)}
     commit = {

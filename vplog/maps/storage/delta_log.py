@@ -107,6 +107,12 @@ def schema_string(schema: pa.Schema) -> str:
     return json.dumps({"type": "struct", "fields": fields})
 
 
+def extends(schema: str, known: str) -> bool:
+    """Whether files of a known schema can be read by another: each column has its type, and there may be more."""
+    types, before = ({one["name"]: one["type"] for one in json.loads(text)["fields"]} for text in (schema, known))
+    return before.items() <= types.items()
+
+
 def _field(field: pa.Field, about: dict[str, str]) -> dict[str, Any]:
     return {"name": field.name, "type": _type(field.type), "nullable": True, "metadata": about}
 
