@@ -178,8 +178,8 @@ def _under_student_t(at: AtSigmas, one: Hypothesis, cost: Cost | None) -> tuple[
 def _recognised(
     claimed: Factors, one: Hypothesis, chain: OdometryChain, log_odds: Floats | None, cost: Cost | None
 ) -> bool:
-    """Whether recognition is sure of its runs of closures, less what speaks against them where odometry drifts as
-    it claims: how well it agrees with itself along a run does not tell what it gathers over the drive."""
+    """Whether recognition is sure of its runs of closures, and they are likelier true than false where odometry drifts
+    as it claims: how well it agrees with itself along a run does not tell what it gathers over the drive."""
     if log_odds is None:
         return False
     at = AtSigmas.of(claimed, Sigmas())
@@ -190,7 +190,7 @@ def _recognised(
         by_graph -= cost(at.factors, true.weight, true.poses) - cost(at.factors, none.weight, none.poses)
     accepted = np.flatnonzero(is_loop(claimed.graph) & (one.weight > 0))
     sure = -sum(float(log_odds[run].mean()) for run in runs(claimed.graph, accepted))
-    return sure + min(by_graph, 0.0) > _STRONG
+    return sure > _STRONG and sure + by_graph > 0.0
 
 
 def _least_cost(claimed: Factors, found: list[Hypothesis], cost: Cost) -> Hypothesis:

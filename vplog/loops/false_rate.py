@@ -32,6 +32,8 @@ _SURE = 1e-3
 """Least `p_false` that is believed, and most likewise: it is counted from some hundred pairs."""
 _FINER = 2.0
 """Times the least false rate that pairs can tell is below the rate that is asked for."""
+_STRONG = 0.05
+"""False rate of 1 in 20, from which on closures of one place are strong evidence by themselves."""
 MOST_APART = 8
 """Keyframes between which odometry hardly drifts, as of the pairs that calibrate the camera."""
 
@@ -46,8 +48,8 @@ class FalseRateSettings(Settings):
     """Odometry rules a pair out that it has further apart than a closure is long by so many sigmas of the
     drift model (`noise`), whatever the log claims: with 2 % of drift, 10 %."""
     null_pairs: int = Field(default=200, ge=0, le=100_000)
-    """Pairs that are no closures, at least, and as many as `rate` needs; where odometry rules out fewer, as in a room,
-    candidates with the query mirrored make up for them, which costs their verification."""
+    """Pairs that are no closures, at least, and as many as `rate` (1 in 20 without one) needs; where odometry rules out
+    fewer, as in a room, candidates with the query mirrored make up for them, which costs their verification."""
     certain_pairs: int = Field(default=200, ge=0, le=100_000)
     """Pairs of neighbouring keyframes, most, whose verified poses are held against the odometry between them: how many
     are wrong at so many inliers, with depth or stereo; 0 takes every pose of a right place for right."""
@@ -65,11 +67,10 @@ def evidence(closures: Closures) -> Ints:
 
 
 def null_pairs(found: Ints, settings: FalseRateSettings) -> int:
-    """Pairs that are no closures, enough for `rate`: by K of them the least false rate of candidates with evidence
-    (C,) is C / verified / K."""
-    if settings.rate is None:
-        return settings.null_pairs
-    return max(settings.null_pairs, math.ceil(_FINER * len(found) / max(int((found > 0).sum()), 1) / settings.rate))
+    """Pairs that are no closures, enough for `rate`, or for strong evidence of what is verified: by K of them the least
+    false rate of candidates with evidence (C,) is C / verified / K."""
+    rate = _STRONG if settings.rate is None else settings.rate
+    return max(settings.null_pairs, math.ceil(_FINER * len(found) / max(int((found > 0).sum()), 1) / rate))
 
 
 def mirrored_evidence(proposals: Proposals, later: Drive, earlier: Drive, execution: Execution) -> Ints:
