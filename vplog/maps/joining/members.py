@@ -132,7 +132,7 @@ class CameraTrust:
     rotation_share: float
     """Share of a rotation by which camera and odometry disagree; 0 without calibration."""
     further: tuple[CameraTrust, ...] = ()
-    """The same of each further camera."""
+    """Each further camera, and how far its calibration is trusted."""
 
     @property
     def each(self) -> tuple[CameraTrust, ...]:
@@ -146,7 +146,7 @@ class CameraTrust:
 
     @classmethod
     def of(cls, record: dict[str, Any]) -> CameraTrust:
-        """Those of a record. Raises LookupError, TypeError or ValueError where it is damaged."""
+        """The camera that a record names. Raises LookupError, TypeError or ValueError where it is damaged."""
         further = tuple(cls.of(dict(one)) for one in record.get("further", ()))
         return cls(dict(record["camera"]), float(record["rotation_share"]), further)
 
