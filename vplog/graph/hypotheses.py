@@ -182,15 +182,17 @@ def _recognised(
     as it claims: how well it agrees with itself along a run does not tell what it gathers over the drive."""
     if log_odds is None:
         return False
+    accepted = np.flatnonzero(is_loop(claimed.graph) & (one.weight > 0))
+    sure = -sum(float(log_odds[run].mean()) for run in runs(claimed.graph, accepted))
+    if sure <= _STRONG:
+        return False
     at = AtSigmas.of(claimed, Sigmas())
     true = at.hypothesis(one.weight, one.poses)
     none = at.hypothesis(np.where(is_loop(claimed.graph), 0.0, 1.0), chain.poses)
     by_graph = true.log_evidence - none.log_evidence
     if cost is not None:
         by_graph -= cost(at.factors, true.weight, true.poses) - cost(at.factors, none.weight, none.poses)
-    accepted = np.flatnonzero(is_loop(claimed.graph) & (one.weight > 0))
-    sure = -sum(float(log_odds[run].mean()) for run in runs(claimed.graph, accepted))
-    return sure > _STRONG and sure + by_graph > 0.0
+    return sure + by_graph > 0.0
 
 
 def _least_cost(claimed: Factors, found: list[Hypothesis], cost: Cost) -> Hypothesis:

@@ -454,10 +454,9 @@ def write_descriptors(
         each = f"{len(stamp_ns)} {'pictures' if further else 'keyframes'}; each has one"
         raise ResultError(f"{path}: {len(descriptors)} descriptors came for {each}.")
     camera = np.repeat(np.arange(len(rows)), list(map(len, rows)))
-    arrays = [pa.array(np.concatenate(rows), pa.int32()), pa.array(stamp_ns, pa.int64()), descriptors]
-    table = pa.Table.from_arrays(
-        [*arrays, pa.array(camera, pa.int32())], schema=descriptors_schema(descriptors.type)
-    )  # fmt: skip
+    keyframe, cameras = pa.array(np.concatenate(rows), pa.int32()), pa.array(camera, pa.int32())
+    columns = [keyframe, pa.array(stamp_ns, pa.int64()), descriptors, cameras]
+    table = pa.Table.from_arrays(columns, schema=descriptors_schema(descriptors.type))
     table = table if further else table.drop_columns(["camera"])
     _write(path, "descriptors", table, metadata, DESCRIPTORS_PER_GROUP)
 

@@ -61,7 +61,7 @@ def rate_closures(
 
     `views` are the pictures of each camera, the first one's at every keyframe, and `rows` the keyframes of each.
     """
-    if not len(closures):
+    if not evidence(closures).any():  # there is nothing to rate
         return closures
     reach_m, settings, noise = views[0].settings.metric.max_distance_m, rating.false_rate, rating.noise
     ruled_out = beyond_drift(closures, views[0].keyframes, odometry, noise, reach_m, settings.sigmas)

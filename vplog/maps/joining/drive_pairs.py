@@ -96,9 +96,8 @@ def compute_pair(task: PairTask) -> bytes:
         pair = DrivePair(0, 0, task.proposals, task.shared)
         ledger = closures_by_cameras(pair, later, earlier, task.pipeline.join, share, task.execution)
         header = tables.TableMetadata(depends(task.pipeline)["settings"], task.library)
-        return tables.joins_as_bytes(
-            [(later[0].drive.keyframes, earlier[0].drive.keyframes, ledger)], header, task.key
-        )  # fmt: skip
+        ends_at = later[0].drive.keyframes, earlier[0].drive.keyframes
+        return tables.joins_as_bytes([(*ends_at, ledger)], header, task.key)
 
 
 def compute_camera(member: Member, pipeline: Pipeline, execution: Execution) -> CameraTrust:

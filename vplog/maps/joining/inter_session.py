@@ -242,10 +242,8 @@ def closures_by_cameras(
 ) -> Closures:  # fmt: skip
     """The ledger of the keyframes of two drives, with the references that explain both places: `closures_between` of
     any two cameras with candidates, each pair of keyframes once."""
-    (query_camera, query), (match_camera, match) = (
-        _pictures(rows, cameras)
-        for rows, cameras in ((pair.proposals.query, later), (pair.proposals.match, earlier))
-    )  # fmt: skip
+    query_camera, query = _pictures(pair.proposals.query, later)
+    match_camera, match = _pictures(pair.proposals.match, earlier)
     ledgers, keyframes = [no_closures()], [drives[0].drive.keyframes for drives in (later, earlier)]
     for q, m in np.unique(np.stack([query_camera, match_camera], 1), axis=0).tolist():
         rows = np.flatnonzero((query_camera == q) & (match_camera == m))

@@ -247,13 +247,14 @@ def _map_landmarks(
     store: Store, about: dict[str, Any], pipeline: Pipeline, stack: ExitStack, execution: Execution, camera: int
 ) -> LandmarkTable:
     """The landmarks of a camera of a drive of a map, beside its features for joins."""
-    member = member_of(store, about).of_camera(camera)
+    of_drive = member_of(store, about)
+    member = of_drive.of_camera(camera)
     folder = store.run(about["drive"])
     key = landmark_key(folder, run_record.read_run_json(folder / "run.json"), member.pipeline, camera)
 
     @contextmanager
     def drive() -> Iterator[Drive]:
-        trust = known_camera(store, member_of(store, about), pipeline)
+        trust = known_camera(store, of_drive, pipeline)
         known = None if trust is None else trust.each[camera]
         known = known or CameraTrust(plain(dict(vars(opened_log(member).camera()))), 0.0)
         with opened_drive(member, known, member.pipeline.verify, execution) as (found, fetch):
