@@ -24,6 +24,7 @@ import pytest
 
 from tests.forked import VPLOG, Forked
 from tests.joined import rewritten
+from tests.maps.bucket import serving
 from vplog.batch import batch
 from vplog.batch.batch import run_batch
 from vplog.batch.engine import BatchOptions, LocalEngine, as_completed, open_engine
@@ -33,11 +34,12 @@ from vplog.demo.record import IMAGE
 from vplog.errors import LibraryError, LogError, ResultError, SettingsError
 from vplog.execution.process_pool import OwnProcesses, ProcessExpired
 from vplog.logs import TopicChoice
-from vplog.maps.storage import map_store
+from vplog.maps.storage import map_store, objects
 from vplog.maps.storage.layout import drive_names
 from vplog.pipeline import load_pipeline
 from vplog.results.run_record import read_run_json
 from vplog.run.reference_library import build_library
+from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -345,6 +347,24 @@ def test_a_drive_over_its_limit_ends(
     over_ray = BatchOptions(engine="ray", drive_timeout_s=1)
     with pytest.raises(SettingsError, match="for --engine local"), open_engine(over_ray, 1):
         pass
+
+
+def test_workers_send_their_drives_to_a_store(
+    whole: Path, logs: list[Path], own_processes: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The batch commits them, and no file of theirs passes through it."""
+    [library], sent, send = (whole / "libraries").iterdir(), list[str](), objects.send
+    monkeypatch.setattr(objects, "send", lambda path, source: (sent.append(str(path)), send(path, source))[1])
+    with serving():
+        root = located("s3://bucket/map")
+        told = run_batch(logs, root, load_pipeline("default", QUICK), library, options=BatchOptions(2, join=False))
+        assert [one["state"] for one in told["drives"]] == ["computed", "computed"]
+        with map_store.reading(root) as store:
+            for drive in ("drive", "drive-2"):
+                assert not store.damaged_files(drive)
+                assert tables(store.run(drive)) == tables(whole / "runs" / f"drive={drive}")
+    assert sent
+    assert not [name for name in sent if "/runs/" in name]
 
 
 def test_a_process_that_dies_takes_no_other_along(monkeypatch: pytest.MonkeyPatch, own_processes: None) -> None:

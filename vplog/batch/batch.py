@@ -98,7 +98,8 @@ def run_batch(
         execution.progress("drives", len(done), len(plan))
         keep = options.join or options.keep_cache
         like = Task("", "", store.staging, store.library(digest), pipeline, TopicChoice(), each, {}, None, keep)
-        like = replace(like, time_s=options.drive_timeout_s, memory_mb=options.drive_memory_mb)
+        remote = root.url if isinstance(root, RemotePath) else ""
+        like = replace(like, time_s=options.drive_timeout_s, memory_mb=options.drive_memory_mb, remote=remote)
         tasks = _tasks(store, wanted, like, longest_first=concurrency > 1)
         places = None
         is_alone = len(known.keys() | {one.drive for one in plan}) < 2
@@ -250,7 +251,7 @@ def _publish(store: Store, task: Task, outcome: Outcome, attempts: int) -> Drive
     drive = task.drive
     if not outcome.error:
         try:
-            drive = map_store.publish(store, drive, task.folder)
+            drive = map_store.publish(store, drive, task.folder, outcome.sent)
         except ResultError as problem:
             outcome = replace(outcome, error=str(problem), fault="io")
     if outcome.error:

@@ -81,7 +81,7 @@ def as_completed(engine: Engine, tasks: Sequence[Task], options: BatchOptions) -
         while waiting and len(running) < (jobs or 2 * engine.concurrency(waiting[0][0].threads)):
             task, attempt = waiting.popleft()
             options.on_drive(DriveState(task.drive, shown(task.log), "started", attempt))
-            running[engine.start(task)] = task, attempt, time.monotonic()
+            running[engine.start(replace(task, began=time.time()))] = task, attempt, time.monotonic()
         for future in wait(running, return_when=FIRST_COMPLETED).done:
             task, attempt, began_s = running.pop(future)
             outcome = _outcome_of(engine, task, future)

@@ -1,7 +1,8 @@
 """A Ray cluster as the engine of a batch: drives as Ray tasks, on machines that share nothing but the logs.
 
 The library goes once into Ray's object store, and from there once to each machine. A drive's run folder is made on the
-worker's own disk and comes back in pieces. This module is imported only with `--engine ray`, and by Ray's workers.
+worker's own disk; it is sent from there to a map on an object store, and comes back in pieces for one in a folder. This
+module is imported only with `--engine ray`, and by Ray's workers.
 """
 
 from __future__ import annotations
@@ -18,10 +19,8 @@ from typing import Any, cast
 from vplog.batch.ray_cluster import ClusterHead, connected, watched_head
 from vplog.batch.worker import Outcome, Task, compute_drive, made_by
 from vplog.errors import SettingsError, VplogError
-from vplog.results import run_record
 from vplog.run.feature_extraction import ExtractionPart, compute_part, missing_parts, parts_of, put_part
-from vplog.run.provenance import library_of
-from vplog.storage.remote_path import located
+from vplog.storage.remote_path import located, stands_for
 from vplog.storage.scratch import Bytes, files_in, packed, pieces, scratch, unpacked, write_pieces
 from vplog.version import __version__
 
@@ -218,7 +217,7 @@ class RemoteOutcome(Outcome):
     """Outcome of an attempt on another machine."""
 
     files: Files = ()
-    """Name of every file of the run folder, drive.json last, and its pieces in the object store."""
+    """Name of every file of the run folder, drive.json last, and its pieces in Ray's object store; none of one sent."""
     cache: Files = ()
     """Files of the stage cache, where it is wanted and the batch does not share the disk."""
 
@@ -275,15 +274,13 @@ def compute_remote_drive(
             for part, data in parts:
                 with suppress(exceptions.RayError, VplogError):  # failed, lost or damaged: it is computed here
                     put_part(cache, part, ray.get(data))
-            outcome = compute_drive(replace(task, folder=made, library=place, cache=cache))
+            with stands_for(place, task.library):  # run.json names the batch's, not this machine's copy
+                outcome = compute_drive(replace(task, folder=made, library=place, cache=cache))
             ended: dict[str, Any] = {**vars(outcome), "worker": f"{where}:{outcome.worker.rpartition(':')[2]}"}
             if outcome.error:
                 return RemoteOutcome(**ended)
-            account = run_record.read_run_json(made / "run.json")
-            account["library"]["from"] = library_of(task.library)  # not this machine's copy
-            run_record.write_run_json(made / "run.json", account)
             stages = _put_files(cache) if task.keep_cache and task.cache is None else ()
-            return RemoteOutcome(**ended, files=_put_files(made), cache=stages)
+            return RemoteOutcome(**ended, files=() if outcome.sent else _put_files(made), cache=stages)
     except VplogError as error:
         return RemoteOutcome(str(error), "input", worker=where)
     except OSError as error:

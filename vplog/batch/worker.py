@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -24,6 +24,8 @@ from vplog.logs import TopicChoice
 from vplog.maps.import_places import write_places_run
 from vplog.maps.search.query import describe_log
 from vplog.maps.storage import layout
+from vplog.maps.storage.damage import UnreachableError
+from vplog.maps.storage.upload import SentRun, send_run
 from vplog.pipeline import Pipeline
 from vplog.pipeline import run as run_alone
 from vplog.results import run_record, tables
@@ -31,7 +33,7 @@ from vplog.run import provenance
 from vplog.run.odometry import check_metric, is_metric
 from vplog.run.run_folder import CacheOptions
 from vplog.stages import Log
-from vplog.storage.remote_path import located
+from vplog.storage.remote_path import RemotePath, located
 from vplog.storage.urls import shown
 
 
@@ -60,6 +62,10 @@ class Task:
     """Largest resident memory of an attempt, in MB (10^6 bytes); None for any."""
     in_parts: bool = False
     """Whether its frames are extracted on all machines at once: it is longer than all other drives together."""
+    remote: str = ""
+    """URL of a map on an object store, to which the run folder is sent; empty for a map in a folder."""
+    began: float = 0.0
+    """Time at which the batch asks for this attempt, by its clock."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +86,8 @@ class Outcome:
     keyframes: int = 0
     accepted: int = 0
     warnings: tuple[str, ...] = ()
+    sent: SentRun | None = None
+    """The run folder, where it was sent to a store: the batch commits it."""
 
     @property
     def retryable(self) -> bool:
@@ -132,9 +140,15 @@ def compute_drive(task: Task) -> Outcome:
             if own_name != task.drive:
                 layout.set_drive_id(task.folder / "keyframes.parquet", task.drive)
             run_record.write_run_json(task.folder / "drive.json", drive)
+            if task.remote:
+                sent_after_s = time.perf_counter() - began  # other clocks than the batch's may be wrong
+                remote = cast("RemotePath", located(task.remote))
+                found["sent"] = send_run(remote, task.folder, task.began + sent_after_s)
             counts = record["counts"]
-            found = {"keyframes": counts["keyframes"], "accepted": counts["verdicts"].get("accepted", 0)}
+            found |= {"keyframes": counts["keyframes"], "accepted": counts["verdicts"].get("accepted", 0)}
             found["warnings"] = tuple(record["warnings"])
+    except UnreachableError as problem:
+        error, fault = str(problem), "network"
     except VplogError as problem:
         error, fault = str(problem), "network" if _is_of_network(task.log, problem) else "input"
     except MemoryError:
@@ -186,7 +200,7 @@ def _write_pictures(task: Task, path: Path, log: Log, execution: Execution) -> d
         "log": task.record["log"],
         "inputs": hash_inputs(path),
         "topics": task.topics.model_dump(mode="json"),
-        "library": {"hash": state.hash, "from": str(task.library)},
+        "library": {"hash": state.hash, "from": provenance.library_of(task.library)},
         "names": [names[row] for row in rows],
         "warnings": [*log.warnings, *warnings],
     }

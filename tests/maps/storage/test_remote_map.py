@@ -18,7 +18,7 @@ import pytest
 from pyarrow import fs
 
 from tests.maps.bucket import counting, serving
-from tests.maps.runs import LIBRARY, PLACES, make_map, put, seeds
+from tests.maps.runs import LIBRARY, PLACES, make_map, put, seeds, write_run
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.info import describe_map
 from vplog.maps.joining import join
@@ -26,6 +26,7 @@ from vplog.maps.storage import map_store, objects, snapshot, upload
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import UnreachableError
 from vplog.pipeline import load_pipeline
+from vplog.results import tables
 from vplog.storage.json_records import with_checksum
 from vplog.storage.remote_path import located, objects_below
 
@@ -349,6 +350,29 @@ def test_what_two_writers_do_to_one_drive(root: Any) -> None:
     assert rest_of(root)["joint.json"] == "3"
 
 
+def test_a_drive_is_sent_by_one_machine_and_committed_by_another(root: Any, tmp_path: Path) -> None:
+    """Also under another ID, where a third has put another drive of its own in."""
+    make_map(root, {"one": 1})
+    with map_store.writing(root) as a, map_store.writing(root) as b:
+        made = {seed: write_run(tmp_path / f"{seed}", "drive", seed, LIBRARY) for seed in (5, 6, 7)}
+        sent = {seed: upload.send_run(root, folder, time.time()) for seed, folder in made.items()}
+        old = upload.SentRun(sent[7].entry, time.time() - upload.VACUUM_S)
+        assert same_state(root) == {"one": {1}}
+        for folder in made.values():
+            shutil.rmtree(folder)
+        assert map_store.publish(a, "drive", made[5], sent[5]) == "drive"
+        assert map_store.publish(b, "drive", made[6], sent[6]) == "drive-2"
+        assert (seeds(a.run("drive")), seeds(b.run("drive-2"))) == ({5}, {6})
+        assert tables.read_keyframes(b.run("drive-2") / "keyframes.parquet")[0].drive == "drive-2"
+        with pytest.raises(ResultError, match="stopped for too long"):
+            map_store.publish(b, "other", made[7], old)
+        upload.vacuum(b.mirror, -1.0)  # pyrefly: ignore[bad-argument-type]
+    assert same_state(root) == {"one": {1}, "drive": {5}, "drive-2": {6}}
+    assert len({name.split("/")[2] for name in names(root) if name.startswith("runs/")}) == 3
+    with map_store.reading(root) as store:
+        assert [store.damaged_files(drive) for drive in store.drives()] == [[], [], []]
+
+
 def test_a_join_that_crosses_another_is_repeated(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the drives of the writer that was first, and what joins them."""
     make_map(root, {"one": 1})
@@ -422,9 +446,9 @@ def test_a_store_that_decides_nothing_is_only_read(root: Any, monkeypatch: pytes
 
 WRITERS = """
 import json, os, signal, sys
-import pyarrow
-from tests.maps.runs import put
-from vplog.maps.storage import map_store, objects
+import pyarrow, shutil, time
+from tests.maps.runs import LIBRARY, put, write_run
+from vplog.maps.storage import map_store, objects, upload
 from vplog.storage.remote_path import located
 pyarrow.array([])  # loads pandas, which takes half a second in each fork otherwise
 root, plans = located(sys.argv[1]), json.loads(sys.argv[2])
@@ -442,8 +466,13 @@ def write(number, dies_at):
         setattr(objects, name, counted(getattr(objects, name)))
     with map_store.writing(root) as store:
         for seed in range(2):
-            if f"drive{number}-{seed}" not in store.drives():
-                put(store, f"drive{number}-{seed}", 10 * number + seed)
+            drive = f"drive{number}-{seed}"
+            if drive not in store.drives():
+                made = write_run(store.staging / "made", drive, 10 * number + seed, LIBRARY)
+                sent = upload.send_run(root, made, time.time())
+                if seed:  # as if on another machine
+                    shutil.rmtree(made)
+                map_store.publish(store, drive, made, sent)
         if number < 3:
             put(store, "common", 99)
 

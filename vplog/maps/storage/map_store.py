@@ -19,6 +19,7 @@ their files are deleted afterwards, by the next writer where this one is killed.
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -27,9 +28,9 @@ from typing import Any, cast
 from vplog.errors import LibraryError, ResultError, SettingsError, VplogError
 from vplog.maps.storage import delta, local, upload
 from vplog.maps.storage.contents import Head, Store, common_library
-from vplog.maps.storage.damage import UnreachableError, complete_record, damaged_table
+from vplog.maps.storage.damage import UnreachableError, damaged_table
 from vplog.maps.storage.download_cache import Cache
-from vplog.maps.storage.layout import HASH, RUN_TABLES, TABLES, folder_name, free_name, renamed, set_drive_id
+from vplog.maps.storage.layout import HASH, RUN_TABLES, TABLES, folder_name
 from vplog.maps.storage.remote_map import Mirror
 from vplog.results import run_record
 from vplog.storage.folders import check_regular, regular_files
@@ -116,27 +117,20 @@ def follow_with_delta(store: Store, patience_s: float = 0.0, *, begin: bool = Fa
         return delta.update(newest, patience_s, compact=compact)
 
 
-def publish(store: Store, drive: str, made: Path) -> str:
+def publish(store: Store, drive: str, made: Path, sent: upload.SentRun | None = None) -> str:
     """Make a finished run folder, with its drive.json, the drive's, in place of the one it may have. Where it is on
-    earth is noted with it. The ID that the drive has in the map: another one where another writer has meanwhile put
-    another drive of that ID into a map on a store. Raises ResultError; then the map has the drive as before.
+    earth is noted with it. One that was `sent` to a map on a store need not be here. The ID that the drive has in the
+    map: another one where another writer has meanwhile put another drive of that ID into a map on a store. Raises
+    ResultError; then the map has the drive as before.
     """
     store.damaged.pop(drive, None)
     if store.mirror is None:
         local.publish(store, drive, made)
-        follow_with_delta(store, delta.PATIENCE_S)
-        return drive
-    complete_record(made, hashed=False)
-    try:
-        drive = upload.publish(store.mirror, drive, made)
-        follow_with_delta(store, delta.PATIENCE_S)
-        return drive
-    except upload.TakenError:
-        record = run_record.read_run_json(made / "drive.json")
-        free = free_name(drive, record["log"], store.mirror.manifest.now["drives"])
-        set_drive_id(made / "keyframes.parquet", free)
-        run_record.write_run_json(made / "drive.json", renamed(record, free))
-        return publish(store, free, made)
+    else:
+        sent = sent or upload.send_run(store.mirror.remote, made, time.time())
+        drive = upload.publish(store.mirror, drive, sent, made)
+    follow_with_delta(store, delta.PATIENCE_S)
+    return drive
 
 
 def annotate(store: Store, drive: str, about: dict[str, Any]) -> None:

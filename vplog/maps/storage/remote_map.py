@@ -321,11 +321,12 @@ class Mirror:
             return b""
 
     def adopt(self, drive: str, entry: dict[str, Any], made: Path) -> None:
-        """Move the folder of a drive that was just uploaded into the local folder."""
+        """Take a drive that was just uploaded; its folder, if it is on this machine, into the local folder."""
         folder = self.run(drive)
         shutil.rmtree(folder, ignore_errors=True)
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        made.rename(folder)
+        if made.exists():
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            made.rename(folder)
         self.drives[drive] = entry
         self.damaged.pop(drive, None)
 

@@ -8,19 +8,29 @@ import time
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.storage import objects, older_maps
-from vplog.maps.storage.damage import rows_of
-from vplog.maps.storage.layout import RUN_TABLES, TABLES, drive_record, folder_name, renamed, sha256_of
+from vplog.maps.storage.damage import complete_record, rows_of
+from vplog.maps.storage.layout import (
+    RUN_TABLES,
+    TABLES,
+    drive_record,
+    folder_name,
+    free_name,
+    renamed,
+    set_drive_id,
+    sha256_of,
+)
 from vplog.maps.storage.remote_map import Copies, Mirror, drives_in, of_order, tag_of
 from vplog.maps.storage.snapshot import LostRaceError, Snapshot, now, store_errors
 from vplog.results import run_record, tables
 from vplog.storage.remote_path import RemotePath, names_below, objects_below
-from vplog.storage.scratch import files_in
+from vplog.storage.scratch import files_in, scratch
 
 _SENT_AT_ONCE = 4
 """Files: each holds a part of some MB in memory, and more do not fill the line any better."""
@@ -73,29 +83,49 @@ def finish(mirror: Mirror) -> None:
         mirror.commit("tables copied", lambda _: None)
 
 
-def publish(mirror: Mirror, drive: str, made: Path) -> str:
-    """Send a finished run folder and then a snapshot with it; the ID under which the map has it, another one where a
-    writer put the same drive in meanwhile. Raises TakenError, and ResultError; then the map has the drive as before."""
-    record, generation, began = drive_record(made), secrets.token_hex(8), time.time()
-    place = f"runs/{folder_name(drive)}/{generation}"
+@dataclass(frozen=True)
+class SentRun:
+    """A finished run folder on an object store, which no snapshot names yet."""
+
+    entry: dict[str, Any]
+    """What the manifest is to say of it."""
+    began: float
+    """Time before which nothing of it was sent, by the clock of the writer that commits it."""
+
+    @property
+    def place(self) -> str:
+        """Name of its folder in the map's."""
+        return f"runs/{folder_name(self.entry['record']['drive'])}/{self.entry['generation']}"
+
+
+def send_run(remote: RemotePath, made: Path, began: float) -> SentRun:
+    """Send a finished run folder, from any machine, to a map that is written to. Raises ResultError."""
+    complete_record(made, hashed=False)
     rows = {f"{name}.parquet": {"rows": rows_of(made / f"{name}.parquet")} for name in TABLES}
     stamps = tables.read_keyframes(made / "keyframes.parquet")[0].stamp_ns
     run = run_record.read_run_json(made / "run.json")
-    names = [name for name in files_in(made) if name != "drive.json"]
-    sent = _send_all(names, made, mirror.remote / place)
     entry = {
-        "record": record,
-        "generation": generation,
-        "files": {name: {**about, **rows.get(name, {})} for name, about in sent.items()},
+        "record": drive_record(made),
+        "generation": secrets.token_hex(8),
+        "files": {},
         "run": {name: run[name] for name in _FIGURES if name in run},
         "stamps_ns": [int(stamps[0]), int(stamps[-1])] if len(stamps) else None,
     }
-    copies: Copies = {f"{name}/{folder_name(drive)}/{name}.parquet": f"{place}/{name}.parquet" for name in TABLES}
-    found = list[str]()
+    names = [name for name in files_in(made) if name != "drive.json"]
+    files = _send_all(names, made, remote / SentRun(entry, began).place)
+    return SentRun({**entry, "files": {name: {**about, **rows.get(name, {})} for name, about in files.items()}}, began)
+
+
+def publish(mirror: Mirror, drive: str, sent: SentRun, made: Path) -> str:
+    """Write a snapshot with a drive that was sent; the ID under which the map has it: that of the same drive where a
+    writer put that in meanwhile, a free one where another has this ID. Its run folder, if it is on this machine, is
+    kept for those who read. Raises ResultError; then the map has the drive as before."""
+    entry, found = sent.entry, list[str]()
+    copies: Copies = {f"{name}/{folder_name(drive)}/{name}.parquet": f"{sent.place}/{name}.parquet" for name in TABLES}
 
     def change(snapshot: Snapshot) -> None:
-        check_recent(began)
-        found[:] = _same_drive(mirror, snapshot["drives"], record)
+        check_recent(sent.began)
+        found[:] = _same_drive(mirror, snapshot["drives"], entry["record"])
         if not found:
             _check_untouched(mirror, snapshot, drive)
             _replace_drive(snapshot, drive)
@@ -105,20 +135,40 @@ def publish(mirror: Mirror, drive: str, made: Path) -> str:
 
     try:
         mirror.commit(f"{drive} {'replaced' if drive in mirror.drives else 'added'}", change)
-    except (TakenError, LostRaceError):
-        _remove_quietly(mirror.remote / place)
+    except TakenError:
+        shutil.rmtree(made, ignore_errors=True)
+        free = free_name(drive, entry["record"]["log"], mirror.manifest.now["drives"])
+        return publish(mirror, free, _renamed(mirror.remote, sent, free), made)
+    except LostRaceError:
+        _remove_quietly(mirror.remote / sent.place)
         raise
     if found:  # the other writer's is as good
-        _remove_quietly(mirror.remote / place)
+        _remove_quietly(mirror.remote / sent.place)
         mirror.drives[found[0]] = mirror.manifest.now["drives"][found[0]]
-        shutil.rmtree(made)
+        shutil.rmtree(made, ignore_errors=True)
         return found[0]
-    for name in sent:
+    for name in entry["files"]:
         if name not in RUN_TABLES:  # a batch would fill the disk
-            (made / name).unlink()
+            (made / name).unlink(missing_ok=True)
     mirror.adopt(drive, entry, made)
     _copy(mirror, {name: source for name, source in mirror.manifest.now["copies"].items() if name in copies})
     return drive
+
+
+def _renamed(remote: RemotePath, sent: SentRun, drive: str) -> SentRun:
+    """The same run folder under another ID, copied within the store. Raises ResultError."""
+    entry, name = sent.entry, "keyframes.parquet"
+    entry = {**entry, "record": renamed(entry["record"], drive), "generation": secrets.token_hex(8)}
+    new = SentRun(entry, sent.began)
+    with scratch("renamed") as folder, store_errors(remote):
+        for one in entry["files"].keys() - {name}:
+            objects.copy(remote / sent.place / one, remote / new.place / one)
+        objects.fetch(remote / sent.place / name, folder / name, entry["files"][name]["bytes"])
+        set_drive_id(folder / name, drive)
+        about = _send_all([name], folder, remote / new.place)[name]
+    _remove_quietly(remote / sent.place)
+    files = {**entry["files"], name: {**entry["files"][name], **about}}
+    return SentRun({**entry, "files": files}, sent.began)
 
 
 def check_recent(began: float) -> None:
