@@ -14,10 +14,12 @@ import subprocess
 import sys
 import time
 from concurrent.futures import BrokenExecutor, Executor, Future
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
+from unittest.mock import Mock
 
 import duckdb
 import pytest
@@ -375,6 +377,9 @@ def test_a_process_that_dies_takes_no_other_along(monkeypatch: pytest.MonkeyPatc
         assert living.result() != processes.submit(os.getpid).result() != os.getpid()
         outcome = computed_by(monkeypatch, processes, signal.raise_signal, signal.SIGKILL)
         assert outcome.error.startswith("Its process was killed")
+        with monkeypatch.context() as patch:
+            patch.setattr(OwnProcesses, "begin", Mock(side_effect=BrokenProcessPool()))
+            assert computed_by(monkeypatch, processes, os.getpid).error.startswith("Its process was killed")
     slept: list[Future[None]] = []
     with pytest.raises(KeyboardInterrupt), OwnProcesses(1) as processes:
         slept += [processes.submit(time.sleep, 600) for _ in range(3)]

@@ -107,7 +107,7 @@ def _outcome_of(engine: Engine, task: Task, future: Future[Outcome]) -> Outcome:
             return Outcome(f"It took more than {task.memory_mb:g} MB, the --drive-memory.", "memory limit")
         return Outcome(_KILLED, "worker")
     except BrokenExecutor as error:
-        return Outcome(str(error), "worker")
+        return Outcome(str(error) or _KILLED, "worker")
     except OSError as error:  # no process more, or no room for what a machine brings
         return Outcome(f"Cannot begin or fetch the drive: {error.strerror or error}.", "io")
     except VplogError as error:

@@ -18,7 +18,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import BrokenExecutor, Future
 from multiprocessing import forkserver, resource_tracker
 from types import ModuleType
 from typing import Any, Self, TypeVar
@@ -115,7 +115,12 @@ class OwnProcesses:
 
     def submit(self, function: Callable[..., T], *args: Any) -> Future[T]:
         """Call it in a process of its own. The future raises ProcessExpired or BrokenExecutor where that was killed."""
-        return self.begin().schedule(function, args)
+        try:
+            return self.begin().schedule(function, args)
+        except BrokenExecutor as error:  # the server was killed
+            future: Future[T] = Future()
+            future.set_exception(error)
+            return future
 
     def __enter__(self) -> Self:
         return self

@@ -346,7 +346,9 @@ def test_what_two_writers_do_to_one_drive(root: Any) -> None:
         b.flush()
         with pytest.raises(ResultError, match=r"has given .* the library a"):
             a.write_head(map_store.Head("b" * 64, {}))
+        a.write_head(map_store.Head(None, {"seed": 2}))  # as one that begins a map: another was faster
     assert same_state(root) == {"one": {2}, "new": {4}, "drive": {5}, "drive-2": {6}}
+    assert snapshot.Manifest(root).now["library"] == LIBRARY
     assert rest_of(root)["joint.json"] == "3"
 
 

@@ -233,14 +233,14 @@ def _send_all(names: Collection[str], folder: Path, place: RemotePath) -> dict[s
 
 
 def write_head(mirror: Mirror, library: str | None, settings: dict[str, Any]) -> None:
-    """Set the library, once, and the settings of the map. Raises ResultError where it has another library."""
+    """Set the settings of the map and, once, its library, if known. Raises ResultError where it has another library."""
 
     def change(snapshot: Snapshot) -> None:
-        if snapshot["library"] not in (None, library):
+        if library is not None and snapshot["library"] not in (None, library):
             raise LostRaceError(
                 f"Another writer has given {mirror.remote} the library {snapshot['library'][:12]}. Run again."
             )
-        snapshot["library"], snapshot["settings"] = library, settings
+        snapshot["library"], snapshot["settings"] = library or snapshot["library"], settings
 
     mirror.commit("settings", change)
 
