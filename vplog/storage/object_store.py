@@ -10,6 +10,7 @@ from __future__ import annotations
 import configparser
 import os
 import re
+import threading
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -56,6 +57,8 @@ _WHY = (
 )  # fmt: skip
 """Patterns of errors of obstore, whose innermost one is in their last lines, and the message; the first that matches
 counts."""
+_IMPORTING = threading.Lock()
+"""Modules of obstore import each other, of which threads that begin at the same time see parts."""
 _NO_BUCKET = re.compile("NoSuchBucket|ContainerNotFound|bucket does not exist")
 
 
@@ -70,7 +73,8 @@ def opened(scheme: str, where: str, upload: bool = False) -> ObjectStore:
 
 @lru_cache(_OPEN)
 def _opened(scheme: str, where: str, upload: bool, _: tuple[Any, ...]) -> ObjectStore:
-    from obstore.store import AzureStore, GCSStore, HTTPStore, S3Store
+    with _IMPORTING:
+        from obstore.store import AzureStore, GCSStore, HTTPStore, S3Store
 
     longest = _REQUEST_S[scheme in STORES]
     client: Any = {

@@ -323,6 +323,23 @@ def test_writers_do_not_exclude_each_other(root: Any) -> None:
         assert store.head().settings == {"seed": 1}
 
 
+def test_writers_that_begin_a_map_at_once_do_not_exclude_each_other(root: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One comes between another's look for a map and for other things; a third was killed before there was a map."""
+    (root / "snapshots" / "00000001-0.json.gz").ask("put", b"")
+    below = upload.names_below
+
+    def late(place: Any) -> dict[str, bool]:
+        monkeypatch.setattr(upload, "names_below", below)
+        make_map(root, {"one": 1})
+        return below(place)
+
+    monkeypatch.setattr(upload, "names_below", late)
+    with map_store.writing(root) as store:
+        assert store.drives().keys() == {"one"}
+        put(store, "two", 2)
+    assert same_state(root) == {"one": {1}, "two": {2}}
+
+
 def test_what_two_writers_do_to_one_drive(root: Any) -> None:
     make_map(root, {"one": 1})
     with map_store.writing(root) as a, map_store.writing(root) as b:

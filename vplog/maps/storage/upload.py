@@ -53,7 +53,11 @@ def begin(mirror: Mirror) -> None:
     store has no conditional writes."""
     remote, never = mirror.remote, {"e_tag": '"0"', "version": "1"}
     with store_errors(remote):
-        if others := [] if mirror.exists else sorted(name for name in names_below(remote) if not name.startswith(".")):
+        others = set() if mirror.exists else {name for name in names_below(remote) if not name.startswith(".")}
+        if "map.json" in others:  # another writer has just begun it
+            mirror.manifest.read()
+            mirror.refresh()
+        elif others := sorted(others - {"snapshots"}):  # one is about to, or was killed then
             raise SettingsError(f"{remote} holds other things ({others[0]}), not a map. Choose another place with -o.")
         new = objects.put_if(remote / _PROBE, b"", None) is not None
         if objects.put_if(remote / _PROBE, b"", never) or (new and objects.put_if(remote / _PROBE, b"", None)):
@@ -157,18 +161,16 @@ def publish(mirror: Mirror, drive: str, sent: SentRun, made: Path) -> str:
 
 def _renamed(remote: RemotePath, sent: SentRun, drive: str) -> SentRun:
     """The same run folder under another ID, copied within the store. Raises ResultError."""
-    entry, name = sent.entry, "keyframes.parquet"
-    entry = {**entry, "record": renamed(entry["record"], drive), "generation": secrets.token_hex(8)}
-    new = SentRun(entry, sent.began)
+    files, name, record = sent.entry["files"], "keyframes.parquet", renamed(sent.entry["record"], drive)
+    new = SentRun({**sent.entry, "record": record, "generation": secrets.token_hex(8)}, sent.began)
     with scratch("renamed") as folder, store_errors(remote):
-        for one in entry["files"].keys() - {name}:
+        for one in files.keys() - {name}:
             objects.copy(remote / sent.place / one, remote / new.place / one)
-        objects.fetch(remote / sent.place / name, folder / name, entry["files"][name]["bytes"])
+        objects.fetch(remote / sent.place / name, folder / name, files[name]["bytes"])
         set_drive_id(folder / name, drive)
-        about = _send_all([name], folder, remote / new.place)[name]
+        about = {**files[name], **_send_all([name], folder, remote / new.place)[name]}
     _remove_quietly(remote / sent.place)
-    files = {**entry["files"], name: {**entry["files"][name], **about}}
-    return SentRun({**entry, "files": files}, sent.began)
+    return SentRun({**new.entry, "files": {**files, name: about}}, sent.began)
 
 
 def check_recent(began: float) -> None:
