@@ -191,8 +191,7 @@ def _under_student_t(at: AtSigmas, one: Hypothesis, cost: Cost | None) -> tuple[
 
 
 def _recognised(claimed: Factors, one: Hypothesis, chain: OdometryChain, log_odds: Floats, cost: Cost | None) -> bool:
-    """Whether its closures are true by recognition and odometry: one of them or both together are strong evidence, and
-    both together make them likelier true than false.
+    """Whether recognition is sure of its runs of closures, and odometry leaves them likelier true than false.
 
     How well closures agree with each other along a run does not tell what odometry gathers over the drive, so each run
     counts as one measurement, and odometry may drift by any multiple of its claim.
@@ -200,6 +199,8 @@ def _recognised(claimed: Factors, one: Hypothesis, chain: OdometryChain, log_odd
     graph = claimed.graph
     accepted = np.flatnonzero(is_loop(graph) & (one.weight > 0))
     sure = -sum(float(log_odds[run].mean()) for run in runs(graph, accepted))
+    if sure <= _STRONG:
+        return False
     views, factors = Views.of(graph, accepted, chain.poses), Factors.of(Accidents(graph).one_a_run(accepted))
     if not is_loop(factors.graph).any():
         return False
@@ -215,8 +216,7 @@ def _recognised(claimed: Factors, one: Hypothesis, chain: OdometryChain, log_odd
             odds -= cost(present, true.weight, true.poses) - cost(present, none.weight, none.poses)
         prior.append(sigmas.log_prior())
         by_odometry.append(prior[-1] + odds)
-    both = sure + float(np.logaddexp.reduce(by_odometry) - np.logaddexp.reduce(prior))
-    return both > 0.0 and max(sure, both) > _STRONG
+    return sure + float(np.logaddexp.reduce(by_odometry) - np.logaddexp.reduce(prior)) > 0.0
 
 
 def _least_cost(claimed: Factors, found: list[Hypothesis], cost: Cost) -> Hypothesis:
