@@ -26,7 +26,7 @@ LAYERS = (
     {"settings", "execution", "storage"},
     {"stages", "geometry"},
     {"features", "logs", "graph", "results", "evaluate", "demo"},
-    {"places", "loops", "cache"},
+    {"places", "loops"},
     {"run", "testing"},
     {"pipeline"},
     {"maps", "benchmark", "verbs"},

@@ -9,7 +9,7 @@ import sys
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from vplog.cache import code_hash
+from vplog.run.cache import code_hash
 
 if TYPE_CHECKING:
     from pathlib import Path
