@@ -25,7 +25,7 @@ LAYERS = (
     {"errors", "data", "version"},
     {"settings", "execution", "storage"},
     {"stages", "geometry"},
-    {"features", "logs", "graph", "results", "evaluate", "demo"},
+    {"features", "logs", "graph", "results", "evaluate"},
     {"places", "loops"},
     {"run", "testing"},
     {"pipeline"},

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 QUICK = (
     "keyframes.distance_m=4", "keyframes.rotation_deg=45", "features.max_features=200", "features.max_megapixels=0.04",

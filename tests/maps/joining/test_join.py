@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 PIPELINE = load_pipeline("default", QUICK)
 HALVES = ("before", "after")

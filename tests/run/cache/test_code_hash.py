@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     import pytest
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 EXTRACTION = ("vplog.run.feature_extraction", "vplog.features.sift")
 COUNTS = ("logs/messages/h264.py", "features/sift.py", "features/stereo_depth.py", "features/__init__.py")
