@@ -13,6 +13,7 @@ from vplog.graph.evidence import runs
 from vplog.graph.factors import Factors
 from vplog.graph.gps_factors import Fixes, inlier_fixes, with_fixes, with_noise_of, world_from_enu
 from vplog.graph.least_squares import Objective, minimised
+from vplog.graph.lm import half_chi2
 from vplog.graph.marginals import SharedScale, positions_redundancy
 from vplog.graph.variance_components import Sigmas, claimed_times, estimate, extrapolated
 from vplog.settings import Settings
@@ -277,8 +278,6 @@ def _refined(
     if fixes is not None:
         world = world_from_enu(poses, fixes, np.maximum(inlier, 1e-9))
         sentences.append(f"{int(inlier.sum())} of {len(fixes)} GPS fixes were used.")
-    error = float(0.5 * (solution.weight * residual_sigma(graph, poses) ** 2).sum())
-    refined = replace(
-        solution, world_from_body=poses, error_after=error, reason=" ".join([solution.reason.strip(), *sentences])
-    )
+    error, reason = half_chi2(graph, solution.weight, poses), " ".join([solution.reason.strip(), *sentences])
+    refined = replace(solution, world_from_body=poses, error_after=error, reason=reason)
     return Refined(graph, refined, sigmas, scale.get("odometry", 1.0), fixes, inlier, world)
