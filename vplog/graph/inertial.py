@@ -32,7 +32,7 @@ _ACCEL_WALK, _GYRO_WALK = 0.003, 0.0002
 _ACCEL_BIAS, _GYRO_BIAS = 0.2, 0.02
 """Sigmas of the biases at the start: m/s^2 of a MEMS that no one calibrated; rad/s about what the images say."""
 _ACROSS = 1.0
-"""That across a break, and of the first unit in m (times three)."""
+"""Sigma of the log of the scale across a break; that of the first state is three times it."""
 _HUBER = 2.0
 """Sigmas beyond which a motion counts linearly."""
 _DISAGREES = 3.0

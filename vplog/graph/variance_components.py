@@ -53,7 +53,7 @@ class Sigmas(NamedTuple):
 
     @property
     def of_closures(self) -> float:
-        """That of closures along a mean axis."""
+        """Factor of the closures' sigma along a mean axis."""
         return math.sqrt(self.closure_rotation * self.closure_translation)
 
     def log_prior(self) -> float:

@@ -75,6 +75,12 @@ def scaled(odometry: Odometry, scale: Floats, camera: Camera) -> Odometry:
     return replace(odometry, odom_from_body=lever @ poses @ se3.inverse(lever), covariance=covariance)
 
 
+def random_walk(sigma: Floats) -> sparse.csr_array:
+    """(N, N + 1) differences of neighbours in units of their sigmas (N,): the prior of a scale that wanders."""
+    differences = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(len(sigma), len(sigma) + 1)).tocsr()
+    return sparse.diags_array(1.0 / sigma) @ differences
+
+
 def _sigma_m(gps: Gps) -> float:
     variance = np.trace(gps.covariance, axis1=1, axis2=2) / 3.0
     known = variance[np.isfinite(variance) & (variance > 0)]
@@ -110,8 +116,7 @@ def _log_scale(way: _Way, sigma_m: float) -> Floats | None:
     row = np.repeat(np.arange(len(pairs)), size)
     column = np.concatenate([np.arange(a, b) for a, b in pairs.tolist()])
     metres = np.linalg.norm(np.diff(way.enu_m, axis=0), axis=1)
-    smooth = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(count - 1, count)).tocsr()
-    smooth = sparse.diags_array(1.0 / (SCALE_WANDER * np.sqrt((metres[1:] + metres[:-1]) / 2.0))) @ smooth
+    smooth = random_walk(SCALE_WANDER * np.sqrt((metres[1:] + metres[:-1]) / 2.0))
     sigma = np.sqrt(2.0) * sigma_m / length
     for _ in range(_ROUNDS):
         moved = np.exp(x)[:, None] * steps
