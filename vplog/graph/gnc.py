@@ -2,8 +2,8 @@
 
 Yang, Antonante, Tzoumas, Carlone: Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020, with three
 additions: the initial inliers are the closures that agree with the odometry (`odometry_mixture`); each closure, and
-each group of neighbouring ones, is tested against the prediction of the rest (`outlier_test`); and what comes of
-several starts is compared (`hypotheses`).
+each group of neighbouring ones, is tested against the prediction of the rest (`outlier_test`); and the solutions from
+several starts are compared (`hypotheses`).
 """
 
 from __future__ import annotations

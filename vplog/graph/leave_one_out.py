@@ -15,7 +15,7 @@ import numpy as np
 from vplog.data import Floats, Int32s, Ints, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed, parts
-from vplog.graph.consistency import OdometryChain
+from vplog.graph.consistency import OdometryChain, residual_twists
 from vplog.graph.least_squares import Objective
 from vplog.graph.marginals import edge_covariances, joint_covariance
 from vplog.graph.sparse.cholesky import Cholesky
@@ -107,8 +107,7 @@ def _errors(graph: PoseGraph, poses: Floats, loops: Ints) -> tuple[Floats, Float
 
     The inverse of the right Jacobian of the exponential, by its series (Barfoot 2017, eq. 7.77, with the other sign).
     """
-    measured = se3.between(poses[graph.a[loops]], poses[graph.b[loops]])
-    error = se3.log(se3.between(graph.a_from_b[loops], measured))
+    error = residual_twists(graph, poses, loops)
     ad = np.zeros((len(loops), 6, 6))
     ad[:, :3, :3] = ad[:, 3:, 3:] = se3.skew(error[:, :3])
     ad[:, 3:, :3] = se3.skew(error[:, 3:])

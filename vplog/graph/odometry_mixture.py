@@ -7,9 +7,8 @@ import math
 import numpy as np
 
 from vplog.data import Bools, Floats, Ints, PoseGraph
-from vplog.geometry import se3
 from vplog.graph.build import AXES, informed
-from vplog.graph.consistency import OdometryChain
+from vplog.graph.consistency import OdometryChain, residual_twists
 from vplog.graph.evidence import log_room, runs
 from vplog.graph.variance_components import Sigmas, claimed_times
 
@@ -59,7 +58,7 @@ class _Mixture:
     def __init__(self, graph: PoseGraph, loops: Ints, chain: OdometryChain) -> None:
         axes = AXES[graph.dimension]
         a, b = graph.a[loops], graph.b[loops]
-        error = se3.log(se3.between(graph.a_from_b[loops], se3.between(chain.poses[a], chain.poses[b])))[:, axes]
+        error = residual_twists(graph, chain.poses, loops)[:, axes]
         # with both covariances diagonal, a scale costs one division: whiten by the closure's, turn to the chain's axes
         root = np.swapaxes(np.linalg.cholesky(informed(graph, loops)), 1, 2)
         spread, turn = np.linalg.eigh(root @ chain.covariance(a, b) @ np.swapaxes(root, 1, 2))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from vplog.graph.factors import Factors
 
 _WORST_SHARE = 0.5
-"""Closures that cost at least this share of the worst one's cost are rejected with it; others may suffer from it."""
+"""Closures that cost at least this share of the worst one are rejected with it; it may be swamping the others."""
 _MOST_SUSPECTS = 50
 """Groups that a round looks at, the most suspect first: some seconds on 10 000 poses; public graphs have up to 20."""
 _MOST_JOINT = 100

@@ -96,7 +96,7 @@ class _Measurements:
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """A solution with what it says of the sensors."""
+    """A solution with the noise and the scale of the sensors that it implies."""
 
     graph: PoseGraph
     """The graph as solved: metres of the odometry multiplied by `scale`, its covariance by the squares of `sigmas`."""
@@ -112,7 +112,7 @@ class Refined:
     world_from_enu: Floats | None
     """(4, 4) from the plane of the first fix, None without GPS."""
     unknown: list[SharedScale] = field(default_factory=list)
-    """Errors that are left in the metres of the odometry, and of the closures that have their own."""
+    """Remaining scale errors of the odometry, and of the closures whose metres are their own."""
 
 
 def about_odometry(refined: Refined) -> dict[str, float]:
@@ -134,7 +134,7 @@ def refine(
     sigmas: Sigmas = _AS_CLAIMED,
     scale: float = 1.0,
 ) -> Refined:
-    """Solve again with what the constraints kept say of the sensors, and with GPS where there is any.
+    """Solve again with the noise and the scale of the sensors as the inliers imply them, and with GPS if there is any.
 
     `of_odometry` (E,) marks edges whose metres are the odometry's: its own, and closures whose scale is taken from it.
     `sigmas` and `scale`, of the odometry, are those of the solution. The weights of edges stay as they are. Raises
@@ -186,7 +186,7 @@ def refine(
             break
         scales = sure
     else:
-        scales = []  # they wander
+        scales = []  # no convergence
     poses = minimised(measured.objective(scales, sigmas, poses), poses, _STEPS, 1e-6).world_from_body
     refined = _refined(rescaled(graph, scales, sigmas), solution, poses, sigmas, scales, fixes, inlier)
     return replace(refined, unknown=_unknown(of_odometry, loops, left, settings))
@@ -263,7 +263,7 @@ def _refined(
     fixes: Fixes | None,
     inlier: Floats,
 ) -> Refined:
-    """The refined solution, its reason saying what was learned."""
+    """The refined solution, with the estimates in its reason."""
     world, sentences = None, []
     if sigmas.translation != 1.0:
         sentences.append(

@@ -1,4 +1,4 @@
-"""One scale along a drive without metres: what closures say of how its unit of length wanders.
+"""One scale along a drive without metres: its scale drift, estimated from closures.
 
 As the seven degrees of freedom of Strasdat, Montiel & Davison 2010 (Scale drift-aware large scale monocular SLAM), with
 the scale solved first: two views of one place, each with landmarks in the unit of its own time, give their ratio.

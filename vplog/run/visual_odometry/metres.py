@@ -1,4 +1,4 @@
-"""Metres for odometry in units of its own, by satellite fixes: its scale as it wanders along the way."""
+"""Metres for odometry in units of its own, by GPS fixes: its scale as it drifts along the path."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class _Way(NamedTuple):
 
 
 def in_metres(odometry: Odometry, gps: Gps, camera: Camera) -> Odometry | None:
-    """Odometry with its steps multiplied by the scale that the fixes have them have; None where the body does not move
-    far enough for one. Pieces without such fixes take the scale of the others."""
+    """Odometry with its steps multiplied by the scale that the fixes imply; None where the body does not move far
+    enough for one. Pieces without such fixes take the scale of the others."""
     lever = camera.body_from_camera
     poses = se3.inverse(lever) @ odometry.odom_from_body @ lever
     breaks = odometry.breaks if odometry.breaks is not None else np.zeros(0, np.int64)

@@ -84,7 +84,7 @@ class _Start:
 
 @dataclass(eq=False)
 class _Tracker:
-    """State while the frames pass."""
+    """State of the tracking from frame to frame."""
 
     sensor: Sensor
     height_m: float | None = None
