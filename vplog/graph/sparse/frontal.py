@@ -67,14 +67,28 @@ def position(rows: Ints, low: int, high: int, row: int) -> int:
     return low
 
 
+@numba.njit(cache=True, nogil=True)
 def by_supernode(place: Ints, first: Ints, a: Int32s | Ints, b: Int32s | Ints) -> Entries:
     """The node (n,) that each column is of, and which blocks each supernode assembles.
 
     Those are `edges[begin[node]:begin[node + 1]]`, in their order.
     """
-    node = np.searchsorted(first, np.minimum(place[a], place[b]), "right") - 1
-    edges = np.argsort(node, kind="stable")
-    return np.argsort(place), np.searchsorted(node[edges], np.arange(len(first))), edges
+    of, pose = np.empty(len(place), np.int64), np.empty(len(place), np.int64)
+    for node in range(len(first) - 1):
+        of[first[node] : first[node + 1]] = node
+    for row in range(len(place)):
+        pose[place[row]] = row
+    begin = np.zeros(len(first) + 1, np.int64)
+    for edge in range(len(a)):
+        begin[of[min(place[a[edge]], place[b[edge]])] + 2] += 1
+    for node in range(len(first)):
+        begin[node + 1] += begin[node]
+    edges = np.empty(len(a), np.int64)
+    for edge in range(len(a)):
+        node = of[min(place[a[edge]], place[b[edge]])]
+        edges[begin[node + 1]] = edge
+        begin[node + 1] += 1
+    return pose, begin[:-1].copy(), edges
 
 
 @numba.njit(cache=True, nogil=True)
