@@ -50,7 +50,7 @@ class Bundle:
     """(6, 6) covariance of the last view's pose in the one before it, in the frame of the last."""
 
 
-def adjust(world_from_camera: Floats, points: Floats, observed: Observations, metric: bool = True) -> Bundle | None:
+def adjust(world_from_camera: Floats, points: Floats, observed: Observations, metric: bool) -> Bundle | None:
     """The views (W, 4, 4), the oldest fixed, and points (P, 3) that explain the observations best; None where these do
     not determine them. Without depths (not `metric`) the distance of the two oldest views, too, stays as it is."""
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()

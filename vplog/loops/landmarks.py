@@ -190,7 +190,7 @@ def _adjust(
     error, whiten = error * root[..., None], whiten * root[..., None, None]
     by_point, by_view = whiten @ by_point, whiten @ by_view
     by_view_t, by_point_t = np.swapaxes(by_view, 2, 3), np.swapaxes(by_point, 2, 3)
-    # the keyframe's own observation holds x and y; a whisper on rho keeps what no view sees invertible
+    # the keyframe's own observation constrains x and y; a weak prior on rho keeps blocks without a view invertible
     point_hessian = (by_point_t @ by_point).sum(axis=0)
     point_hessian[:, :2, :2] += information
     point_hessian[:, 2, 2] += 1e-6  # m^2, a sigma of 1000 /m: a millimetre of depth
