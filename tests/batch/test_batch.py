@@ -358,7 +358,7 @@ def test_workers_send_their_drives_to_a_store(
     [library], sent, send = (whole / "libraries").iterdir(), list[str](), objects.send
     monkeypatch.setattr(objects, "send", lambda path, source: (sent.append(str(path)), send(path, source))[1])
     with serving():
-        root = located("s3://bucket/map")
+        root = located("s3://bucket/sent")
         told = run_batch(logs, root, load_pipeline("default", QUICK), library, options=BatchOptions(2, join=False))
         assert [one["state"] for one in told["drives"]] == ["computed", "computed"]
         with map_store.reading(root) as store:
