@@ -12,7 +12,7 @@ from vplog.loops import landmarks, undistort
 from vplog.loops.landmarks import LandmarkSettings, landmarks_of
 
 if TYPE_CHECKING:
-    from vplog.data import Camera, Features
+    from vplog.data import Camera, Features, Floats
 
 EXACT = LandmarkSettings(pixel_sigma=NOISE_PX)
 
@@ -94,12 +94,18 @@ def test_derivatives_agree_with_differences() -> None:
     rng = np.random.default_rng(7)
     views = se3.exp(rng.normal(0, 0.1, (3, 6)))
     points = np.column_stack([rng.uniform(-0.5, 0.5, (4, 2)), rng.uniform(0.05, 0.5, 4)])
-    observed = np.zeros((3, 4, 2))
-    residual, by_point, by_view = landmarks._linearise(points, observed, views)
+
+    def linearised(points: Floats, views: Floats) -> tuple[Floats, Floats, Floats]:
+        error, by_point, by_view = np.zeros((3, 4, 2)), np.zeros((3, 4, 2, 3)), np.zeros((3, 4, 2, 6))
+        for v, m in np.ndindex(3, 4):
+            assert landmarks._linearise(points[m], np.zeros(2), views[v], error[v, m], by_point[v, m], by_view[v, m])
+        return error, by_point, by_view
+
+    residual, by_point, by_view = linearised(points, views)
     step = 1e-6
     for axis in range(3):
-        moved, _, _ = landmarks._linearise(points + step * np.eye(3)[axis], observed, views)
+        moved, _, _ = linearised(points + step * np.eye(3)[axis], views)
         np.testing.assert_allclose(by_point[..., axis], (moved - residual) / step, atol=1e-5)
     for axis in range(6):
-        moved, _, _ = landmarks._linearise(points, observed, views @ se3.exp(step * np.eye(6)[axis]))
+        moved, _, _ = linearised(points, views @ se3.exp(step * np.eye(6)[axis]))
         np.testing.assert_allclose(by_view[..., axis], (moved - residual) / step, atol=1e-5)

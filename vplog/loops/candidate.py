@@ -35,6 +35,9 @@ class VerifySettings(Settings):
     min_matches: int = Field(default=25, ge=0)
     """Feature matches below which a candidate is rejected before its pose is estimated. Of the 20 inliers required a
     fifth has no landmark, and two images of different places share 16 by chance, seldom 25."""
+    always: int = Field(default=3, ge=1)
+    """Best candidates of a keyframe that are verified in any case; the others are where one of these, or of those of
+    the keyframe before or after, shares enough matches. Of a drive's keyframes most return to nowhere."""
     matching: MatchSettings = MatchSettings()
     """Feature matching."""
     landmarks: LandmarkSettings = LandmarkSettings()

@@ -7,9 +7,11 @@ that measure disparity have one constant error in it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from pydantic import Field
 
@@ -17,6 +19,7 @@ from vplog.data import Camera, Features, Floats, Keyframes
 from vplog.features import matching
 from vplog.geometry import se3
 from vplog.loops import undistort
+from vplog.loops.pose_refinement import invert
 from vplog.settings import Settings
 
 FeaturesOf = Callable[[int], Features]
@@ -180,75 +183,152 @@ def _adjust(
     `own` are the keyframe's rays (M, 2) with their information (M, 2, 2), `others` those of the views
     (V, M, 2) with what whitens them (V, M, 2, 2).
     """
-    (rays, information), (observed, whiten) = own, others
-    visible = visible & np.isfinite(_errors(points, observed, views, whiten))
-    residual, by_point, by_view = _linearise(points, observed, views)
-    whiten = np.where(visible[..., None, None], whiten, 0.0)
-    # whitened, and Huber at one sigma: beyond it an error counts linearly
-    error = (whiten @ np.where(visible[..., None], residual, 0.0)[..., None])[..., 0]
-    root = 1.0 / np.sqrt(np.maximum(np.linalg.norm(error, axis=2), 1.0))
-    error, whiten = error * root[..., None], whiten * root[..., None, None]
-    by_point, by_view = whiten @ by_point, whiten @ by_view
-    by_view_t, by_point_t = np.swapaxes(by_view, 2, 3), np.swapaxes(by_point, 2, 3)
-    # the keyframe's own observation holds x and y; a whisper on rho keeps what no view sees invertible
-    point_hessian = (by_point_t @ by_point).sum(axis=0)
-    point_hessian[:, :2, :2] += information
-    point_hessian[:, 2, 2] += 1e-6  # m^2, a sigma of 1000 /m: a millimetre of depth
-    point_gradient = (by_point_t @ error[..., None])[..., 0].sum(axis=0)
-    point_gradient[:, :2] += (information @ (points[:, :2] - rays)[..., None])[..., 0]
+    hessian, gradient, *eliminated = _eliminated(points, views, *own, *others, visible)
     # to first order the prior's error moves with the view: log(start^-1 view exp(d)) = log(start^-1 view) + d
-    size = 6 * len(views)
-    view_hessian = np.zeros((size, size))
-    view_gradient = np.zeros(size)
+    drift = se3.log(se3.between(start, views))
     for v in range(len(views)):
-        block, rows = slice(6 * v, 6 * v + 6), by_view[v].reshape(-1, 6)
-        view_hessian[block, block] = rows.T @ rows + prior[v]
-        drift = se3.log(se3.between(start[v], views[v]))
-        view_gradient[block] = rows.T @ error[v].ravel() + prior[v] @ drift
-    # the landmarks are eliminated: Schur complement
-    cross = np.moveaxis(by_view_t @ by_point, 0, 1).reshape(len(points), size, 3)
-    point_covariance = np.linalg.inv(point_hessian)
-    gain = cross @ point_covariance
-    gains, crosses = (np.moveaxis(m, 1, 0).reshape(size, -1) for m in (gain, cross))
-    view_covariance = np.linalg.inv(view_hessian - gains @ crosses.T)
-    view_step = -view_covariance @ (view_gradient - gains @ point_gradient.ravel())
-    gain_t = np.swapaxes(gain, 1, 2)
-    point_step = -(point_covariance @ point_gradient[..., None])[..., 0] - gain_t @ view_step
-    covariance = point_covariance + (gain_t.reshape(-1, size) @ view_covariance).reshape(gain_t.shape) @ gain
+        block = slice(6 * v, 6 * v + 6)
+        hessian[block, block] += prior[v]
+        gradient[block] += prior[v] @ drift[v]
+    view_covariance = np.linalg.inv(hessian)
+    view_step = -view_covariance @ gradient
+    point_step, covariance = _resolved(view_step, view_covariance, *eliminated)
     return points + point_step, views @ se3.exp(view_step.reshape(-1, 6)), covariance
 
 
-def _project(points: Floats, views: Floats) -> tuple[Floats, Floats, Floats]:
-    """Landmarks as rays (M, 3), and their image (V, M, 2) and depth times rho (V, M, 1) in each view; infinite depth
-    behind it."""
-    bearing = np.column_stack([points[:, :2], np.ones(len(points))])
-    moved = bearing @ np.swapaxes(views[:, :3, :3], 1, 2) + points[:, 2, None] * views[:, None, :3, 3]
-    depth = np.where(moved[..., 2:] > 0, moved[..., 2:], np.inf)
-    return bearing, moved[..., :2] / depth, depth
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _eliminated(points, views, rays, information, observed, whiten, visible):
+    """Hessian (6 V, 6 V) and gradient (6 V,) of the views without the landmarks (the Schur complement), and of each
+    landmark its covariance (M, 3, 3), gradient (M, 3), and what a step of the views moves it by (M, 6 V, 3)."""
+    M, V = len(points), len(views)
+    hessian, gradient = np.zeros((6 * V, 6 * V)), np.zeros(6 * V)
+    covariance, own_gradient, gains = np.zeros((M, 3, 3)), np.zeros((M, 3)), np.zeros((M, 6 * V, 3))
+    cross, own, error = np.empty((6 * V, 3)), np.empty((3, 3)), np.empty(2)
+    by_point, by_view = np.empty((2, 3)), np.empty((2, 6))
+    for m in range(M):
+        cross[:] = 0.0
+        own[:] = 0.0
+        own[2, 2] = 1e-6  # m^2, a sigma of 1000 /m: a whisper, which keeps what no view sees invertible
+        for i in range(2):  # the keyframe's own observation holds x and y
+            for j in range(2):
+                own[i, j] = information[m, i, j]
+                own_gradient[m, i] += information[m, i, j] * (points[m, j] - rays[m, j])
+        for v in range(V):
+            if not visible[v, m] or not _linearise(points[m], observed[v, m], views[v], error, by_point, by_view):
+                continue
+            if not _whiten(whiten[v, m], error, by_point, by_view):
+                continue
+            first = 6 * v
+            for k in range(2):
+                for i in range(3):
+                    own_gradient[m, i] += by_point[k, i] * error[k]
+                    for j in range(3):
+                        own[i, j] += by_point[k, i] * by_point[k, j]
+                for i in range(6):
+                    gradient[first + i] += by_view[k, i] * error[k]
+                    for j in range(6):
+                        hessian[first + i, first + j] += by_view[k, i] * by_view[k, j]
+                    for j in range(3):
+                        cross[first + i, j] += by_view[k, i] * by_point[k, j]
+        invert(own, 3, covariance[m])
+        gain = gains[m]
+        for i in range(6 * V):
+            for j in range(3):
+                for k in range(3):
+                    gain[i, j] += cross[i, k] * covariance[m, k, j]
+        for i in range(6 * V):
+            a, b, c = gain[i, 0], gain[i, 1], gain[i, 2]
+            if a == b == c == 0.0:
+                continue  # this view does not show it
+            gradient[i] -= a * own_gradient[m, 0] + b * own_gradient[m, 1] + c * own_gradient[m, 2]
+            for j in range(6 * V):
+                hessian[i, j] -= a * cross[j, 0] + b * cross[j, 1] + c * cross[j, 2]
+    return hessian, gradient, covariance, own_gradient, gains
 
 
-def _linearise(points: Floats, observed: Floats, views: Floats) -> tuple[Floats, Floats, Floats]:
-    """Residuals (V, M, 2) and their derivatives by landmark (V, M, 2, 3) and by view (V, M, 2, 6).
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _whiten(whiten, error, by_point, by_view):
+    """Whiten the error and its derivatives, with Huber's weight at one sigma: beyond it an error counts linearly. False
+    where there is none."""
+    a, b = whiten[0, 0] * error[0] + whiten[0, 1] * error[1], whiten[1, 0] * error[0] + whiten[1, 1] * error[1]
+    root = 1.0 / math.sqrt(max(math.sqrt(a * a + b * b), 1.0))
+    error[0], error[1] = root * a, root * b
+    if not math.isfinite(error[0] + error[1]):
+        return False
+    for derivative in (by_point, by_view):
+        for i in range(derivative.shape[1]):
+            a, b = derivative[0, i], derivative[1, i]
+            derivative[0, i] = root * (whiten[0, 0] * a + whiten[0, 1] * b)
+            derivative[1, i] = root * (whiten[1, 0] * a + whiten[1, 1] * b)
+    return True
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _resolved(view_step, view_covariance, covariance, gradient, gains):
+    """Steps (M, 3) of the landmarks where the views make theirs (6 V,), and covariances with that of the views."""
+    M, size = len(covariance), len(view_step)
+    step, total = np.zeros((M, 3)), covariance.copy()
+    for m in range(M):
+        gain = gains[m]
+        for j in range(3):
+            for k in range(3):
+                step[m, j] -= covariance[m, j, k] * gradient[m, k]
+        for i in range(size):
+            if gain[i, 0] == gain[i, 1] == gain[i, 2] == 0.0:
+                continue
+            a = b = c = 0.0
+            for k in range(size):
+                a += view_covariance[i, k] * gain[k, 0]
+                b += view_covariance[i, k] * gain[k, 1]
+                c += view_covariance[i, k] * gain[k, 2]
+            for j in range(3):
+                step[m, j] -= gain[i, j] * view_step[i]
+                total[m, j, 0] += gain[i, j] * a
+                total[m, j, 1] += gain[i, j] * b
+                total[m, j, 2] += gain[i, j] * c
+    return step, total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _linearise(point, observed, view, error, by_point, by_view):
+    """Write the error (2,) of a landmark in a view, and its derivatives by landmark (2, 3) and by view (2, 6); False
+    behind it.
 
     A view moves as view exp(d), d in the keyframe's camera.
     """
-    rotation, translation = views[:, None, :3, :3], views[:, None, :3, 3]
-    bearing, image, depth = _project(points, views)
-    by_moved = np.zeros((*image.shape, 3))
-    by_moved[..., 0, 0] = by_moved[..., 1, 1] = 1.0 / depth[..., 0]
-    by_moved[..., :, 2] = -image / depth
-    turned = by_moved @ rotation
-    by_point = np.concatenate([turned[..., :2], by_moved @ translation[..., None]], axis=-1)
-    by_view = np.concatenate([-turned @ se3.skew(bearing), turned * points[:, 2, None, None]], axis=-1)
-    return image - observed, by_point, by_view
+    x, y, rho = point[0], point[1], point[2]
+    depth = view[2, 0] * x + view[2, 1] * y + view[2, 2] + view[2, 3] * rho
+    if not depth > 0.0:
+        return False
+    for k in range(2):
+        image = (view[k, 0] * x + view[k, 1] * y + view[k, 2] + view[k, 3] * rho) / depth
+        error[k] = image - observed[k]
+        a = (view[k, 0] - image * view[2, 0]) / depth
+        b = (view[k, 1] - image * view[2, 1]) / depth
+        c = (view[k, 2] - image * view[2, 2]) / depth
+        by_point[k, 0], by_point[k, 1], by_point[k, 2] = a, b, (view[k, 3] - image * view[2, 3]) / depth
+        # -(a, b, c) skew((x, y, 1))
+        by_view[k, 0], by_view[k, 1], by_view[k, 2] = c * y - b, a - c * x, b * x - a * y
+        by_view[k, 3], by_view[k, 4], by_view[k, 5] = a * rho, b * rho, c * rho
+    return True
 
 
-def _errors(points: Floats, observed: Floats, views: Floats, px_from_ray: Floats) -> Floats:
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _errors(points, observed, views, px_from_ray):
     """(V, M) reprojection errors in px, by `px_from_ray` (V, M, 2, 2); infinite behind a view, NaN where not
     observed."""
-    _, image, depth = _project(points, views)
-    error = (px_from_ray @ (image - observed)[..., None])[..., 0]
-    return np.where(np.isfinite(depth[..., 0]), np.linalg.norm(error, axis=2), np.inf)
+    result = np.full(observed.shape[:2], np.inf)
+    for v in range(len(views)):
+        view = views[v]
+        for m in range(len(points)):
+            x, y, rho = points[m, 0], points[m, 1], points[m, 2]
+            depth = view[2, 0] * x + view[2, 1] * y + view[2, 2] + view[2, 3] * rho
+            if depth > 0.0:
+                a = (view[0, 0] * x + view[0, 1] * y + view[0, 2] + view[0, 3] * rho) / depth - observed[v, m, 0]
+                b = (view[1, 0] * x + view[1, 1] * y + view[1, 2] + view[1, 3] * rho) / depth - observed[v, m, 1]
+                to_px = px_from_ray[v, m]
+                result[v, m] = math.hypot(to_px[0, 0] * a + to_px[0, 1] * b, to_px[1, 0] * a + to_px[1, 1] * b)
+    return result
 
 
 def _linear_inverse_depth(rays: Floats, observed: Floats, views: Floats, visible: np.ndarray) -> Floats:

@@ -149,7 +149,7 @@ def _weigh(by_point, covariance, noise, variance, size, weight):
             total[i, j] += noise[i, j]
     if size == 3:
         total[2, 2] += variance
-    _invert(total, size, weight)
+    invert(total, size, weight)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -206,7 +206,7 @@ def _predict(T, point, predicted, by_point, by_pose):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _invert(matrix, size, result):
+def invert(matrix, size, result):
     """Write the inverse of the symmetric upper left `size` x `size`, 2 or 3."""
     a, b, d = matrix[0, 0], matrix[0, 1], matrix[1, 1]
     if size == 2:
