@@ -18,8 +18,8 @@ from pydantic import Field
 from vplog.data import Camera, Features, Floats, Keyframes
 from vplog.features import matching
 from vplog.geometry import se3
+from vplog.geometry.symmetric import invert
 from vplog.loops import undistort
-from vplog.loops.pose_refinement import invert
 from vplog.settings import Settings
 
 FeaturesOf = Callable[[int], Features]
