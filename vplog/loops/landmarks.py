@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from vplog.data import Camera, Features, Floats, Keyframes
-from vplog.features import matching
+from vplog.features.matching import PairMatches
 from vplog.geometry import se3
 from vplog.geometry.symmetric import invert
 from vplog.loops import undistort
@@ -75,11 +75,13 @@ def landmarks_of(
     keyframes: Keyframes,
     camera: Camera,
     features: FeaturesOf,
-    match: matching.MatchSettings,
+    count: int,
+    matches: PairMatches,
     settings: LandmarkSettings,
 ) -> Landmarks:
-    """The landmarks of keyframe `row`: from depth where its features have any, else from motion."""
-    own = features(row).rows(slice(match.features))  # those that matching looks at
+    """The landmarks of the `count` strongest features of keyframe `row`: from depth where these have any, else from
+    motion, by their matches in the neighbouring keyframes."""
+    own = features(row).rows(slice(count))
     rays = undistort.rays(camera, own.points)
     if np.isfinite(own.depth_m).any():
         return from_depth(rays, own.depth_m.astype(np.float64), camera, settings)
@@ -87,9 +89,8 @@ def landmarks_of(
     rows = [other for other in range(first, last) if other != row]
     observed = np.full((len(rows), len(rays), 2), np.nan)
     for view, other in enumerate(rows):
-        theirs = features(other)
-        mine, found = matching.match_features(own, theirs, match)
-        observed[view, mine] = undistort.rays(camera, theirs.points[found])
+        mine, found = matches(row, other)
+        observed[view, mine] = undistort.rays(camera, features(other).points[found])
     motion = se3.between(keyframes.odom_from_body[rows], keyframes.odom_from_body[row])
     views = se3.inverse(camera.body_from_camera) @ motion @ camera.body_from_camera
     return from_motion(rays, observed, views, camera, settings)

@@ -34,7 +34,9 @@ class DriveFeatures:
 
 def for_verification(drive: DriveFeatures) -> Drive:
     """Raises LogError for a calibrated camera with an unknown distortion model."""
-    return drive_of(drive.keyframes, drive.camera, drive.features.__getitem__, drive.settings)
+    features, settings = drive.features, drive.settings
+    matches = features.matches(settings.matching)
+    return drive_of(drive.keyframes, drive.camera, features.__getitem__, settings, matches)
 
 
 @step("verify", items=lambda proposals, *_: len(proposals.query))
