@@ -18,15 +18,15 @@ from hypothesis import settings
 from tests import durations
 from tests.remembered import remember
 from vplog.cli import main, progress
-from vplog.demo import SMALL, make_drive
 from vplog.execution.execution import Execution
 from vplog.execution.process_pool import OwnProcesses
 from vplog.pipeline import load_pipeline, run
+from vplog.verbs.demo import SMALL, make_drive
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 # a check of a change must not fail by the luck of the draw: the same inputs each time, and on
 # `HYPOTHESIS_PROFILE=anew` others each time and twice as many, for those who look for what is not yet known
@@ -196,8 +196,8 @@ def made_once(shared_folder: Path) -> Callable[[str, Callable[[Path], object]], 
 @pytest.fixture(scope="session")
 def drive(made_once: Callable[..., Path]) -> Demo:
     """The small demo drive: about 45 frames, of which the last dozen pass known places."""
-    from vplog.demo.record import Demo
-    from vplog.demo.scene import make_scene
+    from vplog.verbs.demo.record import Demo
+    from vplog.verbs.demo.scene import make_scene
 
     folder = made_once("drive", lambda folder: make_drive(folder, SMALL))
     return Demo(**vars(make_scene(SMALL)), log=folder / "drive.mcap", truth=folder / "truth.tum")
@@ -218,8 +218,8 @@ def tiny_drives(made_once: Callable[..., Path]) -> list[Path]:
 @pytest.fixture(scope="session")
 def tiny(tiny_drives: list[Path]) -> Demo:
     """The first of the tiny drives, of which the last half dozen frames pass known places."""
-    from vplog.demo.record import Demo
-    from vplog.demo.scene import make_scene
+    from vplog.verbs.demo.record import Demo
+    from vplog.verbs.demo.scene import make_scene
 
     folder = tiny_drives[0]
     return Demo(**vars(make_scene(TINY)), log=folder / "drive.mcap", truth=folder / "truth.tum")

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from vplog.demo import SMALL, make_drive
 from vplog.execution.execution import Execution
 from vplog.maps.joining.joint_run import run_joint
 from vplog.pipeline import load_pipeline
+from vplog.verbs.demo import SMALL, make_drive
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from mcap.records import Message
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 QUICK = (
     "features.max_features=400", "features.max_megapixels=0.05", "library.size=12", "places.neighbours=8",

@@ -26,7 +26,7 @@ from vplog.places.bobb_paper import PaperBobbSettings
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 TINY = Pipeline(features=SiftSettings(max_features=150), places=BobbSettings(references=4, features=100))
 

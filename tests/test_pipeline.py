@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 TABLES = ("keyframes", "descriptors", "closures", "edges", "trajectory")
 FILES = (*(f"{name}.parquet" for name in TABLES), "trajectory.tum", "graph.g2o", "result.mcap")

@@ -10,8 +10,6 @@ from typing import Any
 from pydantic import model_validator
 
 from vplog import logs
-from vplog.cache.input_hashes import files_of
-from vplog.cache.steps import Steps
 from vplog.errors import ResultError, SettingsError, nearest
 from vplog.execution.execution import Execution
 from vplog.features.extractors import FeatureSettings
@@ -35,6 +33,7 @@ from vplog.results.previews import PictureSettings
 from vplog.results.run_record import CACHE
 from vplog.run import provenance
 from vplog.run.back_end import solve
+from vplog.run.cache.steps import Steps
 from vplog.run.cameras import View, describe_cameras, name_shared, read_cameras, verify_cameras
 from vplog.run.decisions import DecisionSettings, decide, read_decisions
 from vplog.run.false_rate import RatingSettings, rate_closures
@@ -48,6 +47,7 @@ from vplog.run.run_folder import CacheOptions, staged_run
 from vplog.run.scale_drift import in_one_scale, scale_ratios
 from vplog.run.verification import DriveFeatures, verify
 from vplog.settings import Settings, load_yaml, override
+from vplog.storage.input_hashes import files_of
 
 
 class Pipeline(Settings):

@@ -29,7 +29,6 @@ from vplog.batch.batch import run_batch
 from vplog.batch.engine import BatchOptions, LocalEngine, as_completed, open_engine
 from vplog.batch.plan import DriveInput, PlannedDrive, absolute_log, name_of
 from vplog.batch.worker import DriveState, Outcome, Task, compute_drive
-from vplog.demo.record import IMAGE
 from vplog.errors import LibraryError, LogError, ResultError, SettingsError
 from vplog.execution.process_pool import OwnProcesses, ProcessExpired
 from vplog.logs import TopicChoice
@@ -38,6 +37,7 @@ from vplog.maps.storage.layout import drive_names
 from vplog.pipeline import load_pipeline
 from vplog.results.run_record import read_run_json
 from vplog.run.reference_library import build_library
+from vplog.verbs.demo.record import IMAGE
 
 if TYPE_CHECKING:
     from collections.abc import Callable

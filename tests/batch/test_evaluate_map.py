@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 
 def test_drives_are_evaluated_each_and_by_tag(

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 FRAMES = 14
 QUICK = ("--set", "features.max_features=250", "--set", "features.max_megapixels=0.06", "--set", "library.size=8")

@@ -25,12 +25,12 @@ from vplog.batch.batch import run_batch
 from vplog.batch.engine import BatchOptions
 from vplog.batch.ray_cluster import ClusterHead
 from vplog.batch.ray_engine import translated
-from vplog.demo import SMALL, make_drive
 from vplog.errors import SettingsError
 from vplog.execution.execution import Execution
 from vplog.pipeline import load_pipeline
 from vplog.results.run_record import read_run_json
 from vplog.storage.scratch import scratch
+from vplog.verbs.demo import SMALL, make_drive
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

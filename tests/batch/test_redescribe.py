@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from conftest import Said
 
     from vplog.batch.plan import DriveInput
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 QUICK = (
     "features.max_features=200", "features.max_megapixels=0.05", "library.size=6", "pictures.closures=0",

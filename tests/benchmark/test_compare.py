@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 
     from vplog.benchmark.traversals import Traversal
     from vplog.data import Ints
-    from vplog.demo.record import Demo
     from vplog.evaluate.pairs import Pairs
+    from vplog.verbs.demo.record import Demo
 
     Verb = Callable[..., Said]
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from vplog import logs
 from vplog.data import Reference
-from vplog.demo import make_drive
+from vplog.verbs.demo import make_drive
 
 if TYPE_CHECKING:
     from vplog.data import Bytes

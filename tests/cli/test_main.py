@@ -19,8 +19,8 @@ from rosbags.typesys import Stores, get_typestore
 import vplog
 from tests.forked import VPLOG, Forked
 from tests.joined import rewritten
-from vplog.demo.record import GPS, IMAGE, ODOMETRY, TYPES
 from vplog.results.run_record import read_run_json
+from vplog.verbs.demo.record import GPS, IMAGE, ODOMETRY, TYPES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from conftest import Said
     from mcap.records import Message
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
     Verb = Callable[..., Said]
     Change = Callable[[str, int, bytes], bytes | None]

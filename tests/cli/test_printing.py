@@ -18,10 +18,10 @@ from tests.cli.test_main import changed, without
 from tests.logs.drives import Drive as Recorded
 from tests.logs.drives import ros_messages, write_ros2
 from vplog.cli import printing
-from vplog.demo.record import IMAGE
 from vplog.results import tables
 from vplog.results.run_record import read_run_json
 from vplog.run.outputs import _outcome
+from vplog.verbs.demo.record import IMAGE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
     Verb = Callable[..., Said]
 

@@ -25,7 +25,7 @@ from vplog.run.reference_library import build_library
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 
 @pytest.fixture(scope="module")

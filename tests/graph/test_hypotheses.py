@@ -144,15 +144,16 @@ def test_where_all_are_false_odometry_is_kept_with_every_method() -> None:
         assert sum("likelier to be all false" in solution.reason for solution in solutions) >= 5
 
 
-@pytest.mark.parametrize(("p_false", "kept"), [(0.01, 25), (0.1, 25), (0.4, 0)])
-def test_one_place_passed_again_is_believed_where_recognition_is_sure(p_false: float, kept: int) -> None:
-    """Odometry that is far better over 25 keyframes than it claims, and drifts over the drive by what it claims."""
+@pytest.mark.parametrize(("p_false", "off", "kept"), [(0.01, 0, 25), (0.1, 0, 25), (0.4, 0, 0), (0.1, 40, 0)])
+def test_one_place_passed_again_is_believed_where_recognition_is_sure(p_false: float, off: int, kept: int) -> None:
+    """Odometry that is far better over 25 keyframes than it claims, and drifts over the drive by what it claims; and a
+    place that looks like one `off` keyframes from it."""
     drive = ring(200, noise=0.05)
     query = np.arange(175, 200)
     z = se3.between(drive.true[query - 100], drive.true[query])
     measured = drive.graph.a_from_b[drive.graph.odometry] @ se3.exp(np.array([[0, 0, 7.5e-4, 0.006, 0.006, 0]]))
     covariance = np.broadcast_to(np.diag(ODOMETRY_SIGMA**2), (199, 6, 6))
-    graph, _, _ = build_graph(drive.keyframes, covariance, ledger(query, query - 100, z))
+    graph, _, _ = build_graph(drive.keyframes, covariance, ledger(query, query - 100 - off, z))
     graph = replace(graph, a_from_b=np.concatenate([measured, graph.a_from_b[199:]]))
     log_odds = np.where(graph.odometry, 0.0, math.log(p_false / (1.0 - p_false)))
     decision = decided(graph, GncSettings(), log_odds=log_odds)

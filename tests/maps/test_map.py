@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Demo
     from vplog.stages import PlaceState
+    from vplog.verbs.demo.record import Demo
 
     Verb = Callable[..., Said]
 

@@ -13,12 +13,12 @@ from mcap.writer import Writer
 
 import vplog
 from vplog import logs
-from vplog.demo import SMALL, make_drive
-from vplog.demo.record import IMAGE, REAR
 from vplog.errors import LogError, ResultError
 from vplog.geometry import se3
 from vplog.geometry.tum import read_tum
 from vplog.results import tables
+from vplog.verbs.demo import SMALL, make_drive
+from vplog.verbs.demo.record import IMAGE, REAR
 
 if TYPE_CHECKING:
     from collections.abc import Callable

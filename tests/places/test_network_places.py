@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tests.conftest import Said
-    from vplog.demo.record import Demo
     from vplog.stages import PlaceState
+    from vplog.verbs.demo.record import Demo
 
 FRAMES = 12
 

@@ -24,7 +24,7 @@ from vplog.testing.recogniser_contract import RecogniserContract
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 NAME = "mean_colours"
 SMALL = {"features": {"max_features": 100, "max_megapixels": 0.02}, "library": {"size": 4}}

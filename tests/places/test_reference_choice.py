@@ -20,7 +20,7 @@ from vplog.run.reference_library import build_library
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 COUNTS = st.integers(1, 3000)
 SIZES = st.one_of(st.none(), st.integers(1, 400))

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from vplog.data import Camera, Floats, Frame, Odometry
-from vplog.demo.scene import make_scene, take_picture
-from vplog.demo.settings import DemoSettings
 from vplog.geometry import se3
 from vplog.run.visual_odometry.ground import Below, below, by_height
 from vplog.run.visual_odometry.visual import visual_odometry
+from vplog.verbs.demo.scene import make_scene, take_picture
+from vplog.verbs.demo.settings import DemoSettings
 
 MOUNT = np.array([[0, 0, 1, 0.0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 CAMERA = Camera("camera", np.eye(3), "none", np.zeros(0), 640, 480, MOUNT)

@@ -17,8 +17,6 @@ from tests.graph.drive import ledger
 from tests.logs.drives import store
 from vplog import logs
 from vplog.data import Keyframes, Odometry, Verdict
-from vplog.demo import SMALL, make_drive
-from vplog.demo.record import IMAGE, REAR, TYPES
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.geometry.tum import read_tum
@@ -30,6 +28,8 @@ from vplog.results.camera_pictures import CameraPictures
 from vplog.results.mcap_read import read_pictures
 from vplog.results.run_record import read_run_json
 from vplog.run import cameras
+from vplog.verbs.demo import SMALL, make_drive
+from vplog.verbs.demo.record import IMAGE, REAR, TYPES
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Demo
     from vplog.run.back_end import BackEndResult
+    from vplog.verbs.demo.record import Demo
 
 HEADER = "query,match,decision,who,when,reason\n"
 KEYFRAMES = ring(40).keyframes

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from vplog import logs
 from vplog.data import Camera, Floats, Imu, Ints, Odometry
-from vplog.demo.record import IMU, make_drive
-from vplog.demo.settings import SMALL
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.graph.inertial import GRAVITY
 from vplog.logs.topic_selection import TopicChoice
 from vplog.run.visual_odometry.inertial import SURE, Inertial, with_imu
+from vplog.verbs.demo.record import IMU, make_drive
+from vplog.verbs.demo.settings import SMALL
 
 MOUNT = np.array([[0, 0, 1, 1.2], [-1, 0, 0, 0.1], [0, -1, 0, 1.4], [0, 0, 0, 1.0]])
 CAMERA = Camera("camera", np.eye(3), "none", np.zeros(0), 640, 480, MOUNT)

@@ -10,11 +10,11 @@ import pytest
 
 from tests.joined import rewritten
 from tests.logs.drives import store
-from vplog.demo import SMALL
-from vplog.demo.record import IMAGE, TYPES
 from vplog.results.run_record import read_run_json
 from vplog.results.tables import read_keyframes
 from vplog.run.feature_extraction import stored_features
+from vplog.verbs.demo import SMALL
+from vplog.verbs.demo.record import IMAGE, TYPES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mcap.records import Message
 
     from tests.conftest import Said
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 QUICK = (
     "--set", "pictures.closures=0", "--set", "pictures.megapixels=0", "--set", "features.max_features=600",

@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 
 from vplog.data import Camera, Frame, Gps, Keyframes, Odometry
-from vplog.demo.scene import make_scene, take_picture
-from vplog.demo.settings import DemoSettings
 from vplog.errors import TruthError
 from vplog.geometry import geodesy, se3
 from vplog.pipeline import load_pipeline, run
@@ -25,12 +23,14 @@ from vplog.run.visual_odometry.sensor import Sensor
 from vplog.run.visual_odometry.two_views import UNIT_DEPTH, rho_of, rho_variance, two_views
 from vplog.run.visual_odometry.visual import visual_odometry
 from vplog.testing import pictures
+from vplog.verbs.demo.scene import make_scene, take_picture
+from vplog.verbs.demo.settings import DemoSettings
 from vplog.verbs.evaluate_run import TruthOptions, evaluate
 
 if TYPE_CHECKING:
     from vplog.data import Floats
-    from vplog.demo.record import Demo
     from vplog.run.visual_odometry.sensor import Points
+    from vplog.verbs.demo.record import Demo
 
 SENSOR = Sensor(Camera("camera", np.array([[500, 0, 320], [0, 500, 240], [0, 0, 1.0]]), "none", np.zeros(0), 640, 480,
                        np.eye(4)), metric=False)  # fmt: skip

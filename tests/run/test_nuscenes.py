@@ -17,11 +17,11 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from vplog.data import Trajectory
-from vplog.demo import SMALL, route
-from vplog.demo.scene import FIRST_LIGHT, Light, make_scene, render
 from vplog.geometry import se3
 from vplog.geometry.tum import write_tum
 from vplog.results import tables
+from vplog.verbs.demo import SMALL, route
+from vplog.verbs.demo.scene import FIRST_LIGHT, Light, make_scene, render
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -10,13 +10,13 @@ import pytest
 
 from vplog import logs
 from vplog.data import Odometry
-from vplog.demo import SMALL, make_drive
 from vplog.errors import LogError
 from vplog.execution.execution import Execution
 from vplog.graph.noise import NoiseSettings, broken_edges, edge_covariance
 from vplog.pipeline import load_pipeline, run
 from vplog.run.odometry import check_metric, source_of
 from vplog.testing import pictures
+from vplog.verbs.demo import SMALL, make_drive
 from vplog.verbs.evaluate_run import evaluate
 from vplog.verbs.info import preflight, preflight_lines
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vplog.data import Camera
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 QUICK = (
     "features.max_features=200", "features.max_megapixels=0.03", "features.min_features=0", "library.size=6",

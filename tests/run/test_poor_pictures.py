@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.demo import SMALL, make_drive
 from vplog.execution.execution import Execution
 from vplog.pipeline import load_pipeline, run
+from vplog.verbs.demo import SMALL, make_drive
 from vplog.verbs.evaluate_run import evaluate
 
 if TYPE_CHECKING:

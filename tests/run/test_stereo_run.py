@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from vplog.data import Verdict
-from vplog.demo import SMALL, make_drive
 from vplog.execution.execution import Execution
 from vplog.pipeline import load_pipeline, run
 from vplog.results.run_record import read_run_json
+from vplog.verbs.demo import SMALL, make_drive
 from vplog.verbs.evaluate_run import evaluate
 
 if TYPE_CHECKING:

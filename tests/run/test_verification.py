@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from tests.results.example import make_run
-from vplog.cache.codecs import closures_codec
-from vplog.cache.stage_cache import digest_of
 from vplog.data import Closures
 from vplog.run import verification
+from vplog.run.cache.codecs import closures_codec
+from vplog.run.cache.stage_cache import digest_of
 
 
 @pytest.mark.parametrize("size", [1, 3, 100])

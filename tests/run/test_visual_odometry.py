@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from vplog.data import EdgeKind, Frame, Odometry, PoseGraph, Solution, Trajectory
-from vplog.demo.scene import Scene, make_scene, take_picture
-from vplog.demo.settings import DemoSettings
 from vplog.geometry import se3
 from vplog.graph.refine import Refined
 from vplog.graph.variance_components import Sigmas, claimed_times
 from vplog.run.back_end import BackEndResult, keyframe_covariances
 from vplog.run.visual_odometry.sensor import disparities, follow
 from vplog.run.visual_odometry.visual import visual_odometry
+from vplog.verbs.demo.scene import Scene, make_scene, take_picture
+from vplog.verbs.demo.settings import DemoSettings
 
 FRAMES = 20
 BASELINE_M = 0.3

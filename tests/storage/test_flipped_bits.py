@@ -18,8 +18,6 @@ from tests.benchmarks.scale import made_up_library, write_drive
 from tests.benchmarks.search import make_places
 from tests.results.example import COUNT, METADATA, make_run
 from tests.results.test_tables import write_all
-from vplog.cache.codecs import closures_codec
-from vplog.cache.stage_cache import DamagedError, content_of, digest_of, sealed
 from vplog.data import Features, Gps, Reference
 from vplog.errors import ResultError, VplogError
 from vplog.maps.search.index import update_index
@@ -31,6 +29,8 @@ from vplog.results import feature_table, geo, mcap_read, places_map, tables
 from vplog.results.geo import Earth
 from vplog.results.landmark_table import LandmarkTable, write_landmarks
 from vplog.results.mcap import McapExtras, write_mcap
+from vplog.run.cache.codecs import closures_codec
+from vplog.run.cache.stage_cache import DamagedError, content_of, digest_of, sealed
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -14,18 +14,18 @@ import pytest
 
 import vplog
 from tests.maps.runs import LIBRARY, make_map
-from vplog.cache.input_hashes import hash_inputs
 from vplog.errors import LogError, ResultError
 from vplog.maps.storage.layout import folder_name
 from vplog.results import run_record
 from vplog.storage.folders import check_regular, regular_files
+from vplog.storage.input_hashes import hash_inputs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from conftest import Said
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
     Verb = Callable[..., Said]
 
@@ -235,10 +235,10 @@ def test_files_are_listed_in_order_and_what_goes_away_is_left_out(
 
 
 ALLOWED = {
-    "cache/input_hashes.py": "logs are the user's own",
+    "storage/input_hashes.py": "logs are the user's own",
     "logs/masks.py": "masks are the user's own",
     "storage/remote_path.py": "own scratch folders, and objects of a store",
-    "cache/user_cache.py": "the user's own cache", "run/run_folder.py": "names of cache files alone",
+    "storage/user_cache.py": "the user's own cache", "run/run_folder.py": "names of cache files alone",
 }  # fmt: skip
 
 

@@ -14,8 +14,8 @@ import pytest
 
 from tests.forked import VPLOG, Forked
 from tests.storage.test_remote_path import QUICK, RangeHandler
-from vplog.cache.input_hashes import hash_inputs, stat_signature
 from vplog.errors import SettingsError
+from vplog.storage.input_hashes import hash_inputs, stat_signature
 from vplog.storage.remote_path import RemotePath, located, reason
 from vplog.storage.urls import shown, without_secrets
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
     Verb = Callable[..., Said]
 

@@ -18,11 +18,11 @@ from tests.logs.test_rectification import BASELINE_M, PINHOLES, RIGHT_FROM_LEFT
 from tests.logs.test_rectification import drive as write_pair
 from vplog import logs
 from vplog.cli import main, parser
-from vplog.demo.scene import make_scene, take_picture
-from vplog.demo.settings import DemoSettings
 from vplog.logs import TopicChoice
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.storage.json_records import plain
+from vplog.verbs.demo.scene import make_scene, take_picture
+from vplog.verbs.demo.settings import DemoSettings
 from vplog.verbs.info import command, page, preflight, preflight_lines
 
 if TYPE_CHECKING:

@@ -23,11 +23,6 @@ from tests.logs import drives
 from tests.logs.drives import ros_messages, write_raw, write_ros2
 from tests.logs.messages.test_video import messages, packets
 from vplog import logs
-from vplog.cache import feature_shards
-from vplog.cache.codecs import closures_codec, columns_codec, images_codec
-from vplog.cache.feature_shards import Extracted
-from vplog.cache.stage_cache import CONTENT_AT, DamagedError, StageCache, inputs_of, sealed
-from vplog.cache.steps import Steps
 from vplog.data import Keyframes
 from vplog.errors import LogError, ResultError
 from vplog.execution.execution import Execution
@@ -36,6 +31,11 @@ from vplog.loops.propose import Proposals
 from vplog.pipeline import Pipeline, load_pipeline, run
 from vplog.results.run_record import read_run_json
 from vplog.run import feature_extraction
+from vplog.run.cache import feature_shards
+from vplog.run.cache.codecs import closures_codec, columns_codec, images_codec
+from vplog.run.cache.feature_shards import Extracted
+from vplog.run.cache.stage_cache import CONTENT_AT, DamagedError, StageCache, inputs_of, sealed
+from vplog.run.cache.steps import Steps
 from vplog.run.feature_extraction import (
     compute_part,
     extract,
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 QUICK = (
     "keyframes.distance_m=4", "keyframes.rotation_deg=45", "features.max_features=200", "features.max_megapixels=0.04",

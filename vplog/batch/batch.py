@@ -18,7 +18,6 @@ from vplog.batch.log_hashes import NAME, known_hashes
 from vplog.batch.map_library import map_library
 from vplog.batch.plan import DriveInput, PlannedDrive, common_record, plan_drives, with_topics
 from vplog.batch.worker import DriveState, Outcome, Task, made_by
-from vplog.cache.input_hashes import bytes_of
 from vplog.errors import ResultError, SettingsError, VplogError
 from vplog.execution.execution import Execution
 from vplog.logs import TopicChoice
@@ -30,6 +29,7 @@ from vplog.maps.storage.contents import damage_warnings
 from vplog.maps.storage.layout import folder_name
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline, load_pipeline, pipeline_from
+from vplog.storage.input_hashes import bytes_of
 from vplog.storage.remote_path import RemotePath, located
 
 if TYPE_CHECKING:

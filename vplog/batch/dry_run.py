@@ -12,7 +12,6 @@ from typing import Any
 from vplog import logs
 from vplog.batch.plan import DriveInput, PlannedDrive, common_record, plan_drives, with_topics
 from vplog.batch.worker import made_by
-from vplog.cache.input_hashes import bytes_of, files_of
 from vplog.errors import ResultError, VplogError
 from vplog.execution.execution import Execution
 from vplog.maps.storage import map_store
@@ -21,6 +20,7 @@ from vplog.pipeline import Pipeline
 from vplog.places.library_files import read_library_record
 from vplog.results import run_record
 from vplog.run.provenance import stat_of
+from vplog.storage.input_hashes import bytes_of, files_of
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.urls import shown
 

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from vplog import logs as all_logs
 from vplog.batch.plan import DriveInput
-from vplog.cache.input_hashes import bytes_of, changed_s, hash_inputs, stat_signature
 from vplog.errors import LogError, ResultError
 from vplog.results.run_record import read_run_json, write_run_json
+from vplog.storage.input_hashes import bytes_of, changed_s, hash_inputs, stat_signature
 from vplog.storage.remote_path import RemotePath
 
 if TYPE_CHECKING:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from vplog import logs
-from vplog.cache.input_hashes import hash_inputs
 from vplog.data import Keyframes
 from vplog.errors import VplogError, causes
 from vplog.execution.cores import limited
@@ -31,6 +30,7 @@ from vplog.run import provenance
 from vplog.run.odometry import check_metric, is_metric
 from vplog.run.run_folder import CacheOptions
 from vplog.stages import Log
+from vplog.storage.input_hashes import hash_inputs
 from vplog.storage.remote_path import located
 from vplog.storage.urls import shown
 

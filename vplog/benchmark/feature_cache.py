@@ -11,19 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from vplog.cache.code_hash import code_of
-from vplog.cache.feature_shards import Extracted, packed
-from vplog.cache.input_hashes import stat_signature
-from vplog.cache.stage_cache import file_name, key_of, sealed
-from vplog.cache.user_cache import cache_folder, max_bytes, trim
 from vplog.data import Bytes, Features, Float32s, Ints
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
 from vplog.logs import TopicChoice
 from vplog.results.previews import PictureSettings
+from vplog.run.cache.code_hash import code_of
+from vplog.run.cache.feature_shards import Extracted, packed
+from vplog.run.cache.stage_cache import file_name, key_of, sealed
 from vplog.run.feature_extraction import PART_KEYFRAMES, described, image_topics, is_whole
 from vplog.stages import Extractor, Log
+from vplog.storage.input_hashes import stat_signature
 from vplog.storage.scratch import replacing
+from vplog.storage.user_cache import cache_folder, max_bytes, trim
 
 
 @dataclass(frozen=True)

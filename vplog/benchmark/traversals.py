@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from vplog.benchmark.feature_cache import FeatureFolder
-from vplog.cache.feature_shards import Extracted
 from vplog.data import Bytes, Floats, Ints, Reference
 from vplog.errors import LogError
 from vplog.execution.execution import Execution
 from vplog.geometry.masking import masked
 from vplog.places.self_recognition import NO_IMAGE
+from vplog.run.cache.feature_shards import Extracted
 from vplog.stages import Extractor, Log
 
 

@@ -287,8 +287,8 @@ def _folder(path: Path) -> None:
 
 def demo(arguments: argparse.Namespace) -> None:
     """Render a small drive, run on it and evaluate the result."""
-    from vplog.demo import DemoSettings, make_drive
     from vplog.pipeline import STAGES
+    from vplog.verbs.demo import DemoSettings, make_drive
     from vplog.verbs.report import report as write_report
 
     pipeline = parser.pipeline_of(arguments)

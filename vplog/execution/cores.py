@@ -1,4 +1,8 @@
-"""Number of threads: the cores that this process may use, or fewer by the user's limit."""
+"""Number of threads: the cores that this process may use, or fewer by the user's limit.
+
+The limit is a context variable, as an optimiser takes nothing but a graph, and a log nothing but a path: 85 functions
+of `graph/` lie between who knows the limit and the linear algebra that starts threads.
+"""
 
 from __future__ import annotations
 

@@ -10,12 +10,13 @@ so is a family of runs.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from vplog.geometry import se3
-from vplog.graph.build import AXES, informed, parts
+from vplog.graph.build import AXES, informed, parts, subgraph
 from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, residual_sigma
 from vplog.graph.least_squares import GAUGE_SIGMA, Objective
 from vplog.graph.leave_one_out import tension
@@ -87,12 +88,44 @@ class _Run(NamedTuple):
     """(d, d) in the frame of b."""
 
 
+class Views(NamedTuple):
+    """How two keyframes that see the same stand to each other."""
+
+    covariance: Floats
+    """(d, d) of their relative pose."""
+    gap: int
+    """Least number of keyframes from one to the other."""
+
+    @classmethod
+    def of(cls, graph: PoseGraph, loops: Ints, places: Floats) -> Views:
+        """By the edges `loops` (K,), for poses (N, 4, 4)."""
+        axes, relative = np.array(AXES[graph.dimension]), forward(graph, loops)[2]
+        covariance = np.linalg.inv(informed(graph, loops)).mean(0) + np.diag(_of_a_view(places)[axes] ** 2)
+        if len(loops) > 1:
+            covariance = covariance + np.cov(se3.log(relative)[:, axes].T)
+        return cls(covariance, int(np.abs(graph.a[loops].astype(np.int64) - graph.b[loops]).min()))
+
+    def log_room(self, chain: OdometryChain) -> float:
+        """As `log_room`, where odometry drifts as the `chain` does: a false closure is as dense as views are on average
+        over all pairs of poses, so what drift cannot tell from a pair that sees the same is no surprise."""
+        stride = -(-len(chain.poses) // _SAMPLE)
+        one, two = np.triu_indices(-(-len(chain.poses) // stride), max(self.gap // stride, 1))
+        known = chain.part[stride * one] == chain.part[stride * two]
+        a, b = stride * one[known], stride * two[known]
+        error = se3.log(se3.between(chain.poses[a], chain.poses[b]))[:, chain.axes]
+        covariance = chain.covariance(a, b) + self.covariance
+        log_volume = np.linalg.slogdet(covariance)[1] + len(chain.axes) * _LOG_2PI
+        log_density = -0.5 * (se3.mahalanobis2(error, covariance) + log_volume)
+        return math.log(max(len(a), 1)) - float(np.logaddexp.reduce(log_density, initial=-math.inf))
+
+
 class Accidents:
     """Runs of closures of a graph as accidents: what a run comes to is the same in all sets that it is false in."""
 
-    def __init__(self, graph: PoseGraph) -> None:
+    def __init__(self, graph: PoseGraph, views: Views | None = None) -> None:
+        """`views` are of all closures where those of the graph are too few to tell."""
         self.graph, self.chain = graph, OdometryChain.of(graph)
-        self.room = log_room(graph, self.chain.poses)
+        self.room = log_room(graph, self.chain.poses) if views is None else views.log_room(self.chain)
         self._parted: dict[bytes, list[Ints]] = {}
         self._measured: dict[bytes, tuple[float, _Run | None]] = {}
         self._joint: dict[tuple[int, ...], float] = {}
@@ -115,6 +148,22 @@ class Accidents:
         if key not in self._measured:
             self._measured[key] = _as_one(self.graph, run, self.chain)
         return self._measured[key]
+
+    def one_a_run(self, loops: Ints) -> PoseGraph:
+        """The graph with one edge for each run of the edges `loops` (K,), and no others but odometry: what neighbouring
+        keyframes see is one witness of where the drive has gone. Runs that disagree with themselves are in none."""
+        graph, axes = self.graph, AXES[self.graph.dimension]
+        found = {int(run[len(run) // 2]): self.as_one(run)[1] for run in self.among(loops)}
+        a, b, measured = graph.a.copy(), graph.b.copy(), graph.a_from_b.copy()
+        information = graph.information.copy()
+        for edge, one in found.items():
+            if one is not None:
+                a[edge], b[edge], measured[edge] = one.a, one.b, one.a_from_b
+                information[edge][np.ix_(axes, axes)] = np.linalg.inv(one.covariance)
+        used = [edge for edge, one in found.items() if one is not None]
+        whole = replace(graph, a=a, b=b, a_from_b=measured, information=information)
+        rows = np.sort(np.concatenate([np.flatnonzero(~is_loop(graph)), np.array(used, np.int64)]))
+        return subgraph(whole, np.arange(len(graph.world_from_body)), rows)
 
     def families(self, together: list[_Run]) -> tuple[list[Ints], float]:
         """See `families`; of sets that differ in a few runs, most families are the same."""
@@ -222,11 +271,9 @@ def log_room(graph: PoseGraph, places: Floats) -> float:
     axes = np.array(AXES[graph.dimension])
     if len(loops) <= 2 * len(axes):
         return box
-    spread = np.cov(se3.log(forward(graph, loops)[2])[:, axes].T) + np.linalg.inv(informed(graph, loops)).mean(0)
-    spread += np.diag(_of_a_view(places)[axes] ** 2)
+    spread, gap = Views.of(graph, loops, places)
     of_views = 0.5 * (len(axes) * (_LOG_2PI + 1.0) + float(np.linalg.slogdet(spread)[1]))  # entropy of a Gaussian
     variance = np.array([np.diag(spread)[axes < 3].mean(), np.diag(spread)[axes >= 3].mean()])
-    gap = int(np.abs(graph.a[loops].astype(np.int64) - graph.b[loops]).min())
     pairs = len(places) ** 2 / 2.0
     return min(box, math.log(pairs / max(len(loops), pairs * _share_near(places, variance, gap))) + of_views)
 

@@ -16,7 +16,18 @@ import numpy as np
 from vplog.errors import GraphError
 from vplog.graph.build import informed
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, is_loop, residual_sigma
-from vplog.graph.evidence import TAIL, Accidents, StudentT, agreeing, log_evidence, log_room, log_tails, runs, student_t
+from vplog.graph.evidence import (
+    TAIL,
+    Accidents,
+    StudentT,
+    Views,
+    agreeing,
+    log_evidence,
+    log_room,
+    log_tails,
+    runs,
+    student_t,
+)
 from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
 from vplog.graph.least_squares import Objective, descend
@@ -54,6 +65,8 @@ of them is used where the odds are even."""
 _STRONG = 3.0
 """Likewise, where recognition tells the closures of this drive from its pairs that are none: there, 20 to 1 is strong
 evidence, and more cannot be counted from some hundred pairs."""
+_MULTIPLES = (2.0 ** np.arange(-3.0, 5.0)).tolist()
+"""Noise of odometry as multiples of its claim, over which its drift is integrated."""
 _FLIPS, _MOST_FLIPS = 4, 10
 """Runs of either kind that are tried at once, and turns."""
 _COMPARED = 4
@@ -107,9 +120,11 @@ def best_hypothesis(
     best = _likeliest(found)[0] if cost is None else _least_cost(claimed, found, cost)
     if best.weight[loops].any():
         others = attempted(lambda: _readmitted(claimed, best, optimiser, cost))
-    else:
+    elif log_odds is not None:
         some = _likeliest([one for one in found if one.weight[loops].any()])
         others = attempted(lambda: [one for one in some if _recognised(claimed, one, chain, log_odds, cost)])
+    else:
+        others = []
     return next(iter(others), best)
 
 
@@ -175,24 +190,33 @@ def _under_student_t(at: AtSigmas, one: Hypothesis, cost: Cost | None) -> tuple[
     return found - (0.0 if cost is None else cost(at.factors, one.weight, poses)), residuals
 
 
-def _recognised(
-    claimed: Factors, one: Hypothesis, chain: OdometryChain, log_odds: Floats | None, cost: Cost | None
-) -> bool:
-    """Whether recognition is sure of its runs of closures, and they are likelier true than false where odometry drifts
-    as it claims: how well it agrees with itself along a run does not tell what it gathers over the drive."""
-    if log_odds is None:
-        return False
-    accepted = np.flatnonzero(is_loop(claimed.graph) & (one.weight > 0))
-    sure = -sum(float(log_odds[run].mean()) for run in runs(claimed.graph, accepted))
+def _recognised(claimed: Factors, one: Hypothesis, chain: OdometryChain, log_odds: Floats, cost: Cost | None) -> bool:
+    """Whether recognition is sure of its runs of closures, and odometry leaves them likelier true than false.
+
+    How well closures agree with each other along a run does not tell what odometry gathers over the drive, so each run
+    counts as one measurement, and odometry may drift by any multiple of its claim.
+    """
+    graph = claimed.graph
+    accepted = np.flatnonzero(is_loop(graph) & (one.weight > 0))
+    sure = -sum(float(log_odds[run].mean()) for run in runs(graph, accepted))
     if sure <= _STRONG:
         return False
-    at = AtSigmas.of(claimed, Sigmas())
-    true = at.hypothesis(one.weight, one.poses)
-    none = at.hypothesis(np.where(is_loop(claimed.graph), 0.0, 1.0), chain.poses)
-    by_graph = true.log_evidence - none.log_evidence
-    if cost is not None:
-        by_graph -= cost(at.factors, true.weight, true.poses) - cost(at.factors, none.weight, none.poses)
-    return sure + by_graph > 0.0
+    views, factors = Views.of(graph, accepted, chain.poses), Factors.of(Accidents(graph).one_a_run(accepted))
+    if not is_loop(factors.graph).any():
+        return False
+    prior, by_odometry = [], []
+    for multiple in _MULTIPLES:
+        sigmas = Sigmas(multiple, multiple)
+        present = _times(factors, sigmas)
+        at = AtSigmas(sigmas, present, Accidents(present.graph, views))
+        true = at.hypothesis(np.ones(len(present.graph.a)), one.poses)
+        none = at.hypothesis(np.where(is_loop(present.graph), 0.0, 1.0), chain.poses)
+        odds = true.log_evidence - none.log_evidence
+        if cost is not None:
+            odds -= cost(present, true.weight, true.poses) - cost(present, none.weight, none.poses)
+        prior.append(sigmas.log_prior())
+        by_odometry.append(prior[-1] + odds)
+    return sure + float(np.logaddexp.reduce(by_odometry) - np.logaddexp.reduce(prior)) > 0.0
 
 
 def _least_cost(claimed: Factors, found: list[Hypothesis], cost: Cost) -> Hypothesis:

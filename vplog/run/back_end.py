@@ -11,7 +11,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vplog.cache.steps import step
 from vplog.data import (
     Closures,
     EdgeKind,
@@ -40,6 +39,7 @@ from vplog.graph.refine import Refined, RefineSettings, Scale, refine, rescaled
 from vplog.graph.solve import Decision, OptimiserSettings, decided
 from vplog.graph.variance_components import Sigmas, claimed_times
 from vplog.loops.false_rate import log_odds_false
+from vplog.run.cache.steps import step
 
 _log = logging.getLogger(__name__)
 _CONFIRMED = 0.99

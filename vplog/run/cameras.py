@@ -15,9 +15,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from vplog import logs
-from vplog.cache.codecs import closures_codec
-from vplog.cache.input_hashes import files_of
-from vplog.cache.steps import Steps, step
 from vplog.data import Bytes, Camera, Closures, Ints, Keyframes, Odometry, Reference
 from vplog.errors import LogError
 from vplog.geometry import se3
@@ -26,10 +23,13 @@ from vplog.loops.verify import VerifySettings, verify_between
 from vplog.loops.verify_rig import Rig, verify_together
 from vplog.places.sequence import SequenceSettings, rank_places
 from vplog.results.camera_pictures import CameraPictures
+from vplog.run.cache.codecs import closures_codec
+from vplog.run.cache.steps import Steps, step
 from vplog.run.feature_extraction import Extraction, decoded, extract
 from vplog.run.place_recognition import describe, shared_of
 from vplog.run.reference_library import own_images, own_references
 from vplog.run.verification import DriveFeatures, calibrated, for_verification, merged
+from vplog.storage.input_hashes import files_of
 
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution

@@ -12,8 +12,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vplog.cache.codecs import closures_codec
-from vplog.cache.steps import Steps, step
 from vplog.data import Closures, Keyframes, Verdict
 from vplog.errors import SettingsError
 from vplog.evaluate.truth_tables import read_lines
@@ -21,6 +19,8 @@ from vplog.execution.execution import Execution
 from vplog.loops.candidate import lenient
 from vplog.loops.propose import Proposals
 from vplog.loops.verify import verify_between
+from vplog.run.cache.codecs import closures_codec
+from vplog.run.cache.steps import Steps, step
 from vplog.run.keyframes import row_of
 from vplog.run.verification import DriveFeatures, calibrated, for_verification, merged
 from vplog.settings import FileName, Settings

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vplog.cache.codecs import closures_codec
-from vplog.cache.steps import step
 from vplog.data import Bools, Closures, Ints, Keyframes, Odometry, Verdict
 from vplog.evaluate.body_truth import TruthAt
 from vplog.evaluate.closure_pose import pose_bounds, pose_errors
@@ -31,6 +29,8 @@ from vplog.loops.false_rate import (
 )
 from vplog.loops.propose import Proposals, ProposeSettings, candidate_stops
 from vplog.loops.verify import verify_between
+from vplog.run.cache.codecs import closures_codec
+from vplog.run.cache.steps import step
 from vplog.run.verification import DriveFeatures, for_verification
 
 _log = logging.getLogger(__name__)

@@ -21,10 +21,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from vplog import logs
-from vplog.cache.code_hash import code_of
-from vplog.cache.feature_shards import Extracted, packed
-from vplog.cache.input_hashes import files_of, hash_inputs
-from vplog.cache.stage_cache import (
+from vplog.data import Features, Frame, Keyframes
+from vplog.errors import LogError, ResultError
+from vplog.execution.execution import Execution
+from vplog.features.extraction import extract_frames
+from vplog.results.previews import PictureSettings, preview
+from vplog.run.cache.code_hash import code_of
+from vplog.run.cache.feature_shards import Extracted, packed
+from vplog.run.cache.stage_cache import (
     AbsentError,
     DamagedError,
     Inputs,
@@ -36,13 +40,9 @@ from vplog.cache.stage_cache import (
     key_of,
     sealed,
 )
-from vplog.cache.steps import Steps, step
-from vplog.data import Features, Frame, Keyframes
-from vplog.errors import LogError, ResultError
-from vplog.execution.execution import Execution
-from vplog.features.extraction import extract_frames
-from vplog.results.previews import PictureSettings, preview
+from vplog.run.cache.steps import Steps, step
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
+from vplog.storage.input_hashes import files_of, hash_inputs
 from vplog.storage.remote_path import address, located
 from vplog.storage.scratch import replacing
 from vplog.storage.urls import shown

@@ -11,7 +11,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from vplog import logs
-from vplog.cache.code_hash import code_of
 from vplog.data import Features, Floats
 from vplog.errors import ResultError
 from vplog.execution.execution import Execution
@@ -22,6 +21,7 @@ from vplog.loops.verify import VerifySettings, drive_of
 from vplog.results.camera_pictures import camera_pictures, camera_topics
 from vplog.results.landmark_table import write_landmarks
 from vplog.results.run_record import CACHE
+from vplog.run.cache.code_hash import code_of
 from vplog.run.feature_extraction import Extraction, stored_features
 from vplog.run.provenance import reopened
 from vplog.run.reextraction import ReextractedFeatures

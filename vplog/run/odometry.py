@@ -10,9 +10,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vplog.cache.codecs import json_codec
-from vplog.cache.stage_cache import Inputs
-from vplog.cache.steps import Steps, step
 from vplog.data import Camera, Frame, Imu, Keyframes, Odometry
 from vplog.errors import LogError, plural
 from vplog.execution.execution import Execution
@@ -20,6 +17,9 @@ from vplog.geometry.masking import masked
 from vplog.logs import TopicChoice
 from vplog.logs.image_folder import PERIOD_NS
 from vplog.loops import undistort
+from vplog.run.cache.codecs import json_codec
+from vplog.run.cache.stage_cache import Inputs
+from vplog.run.cache.steps import Steps, step
 from vplog.run.feature_extraction import image_topics
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.run.lidar_odometry import lidar_odometry, range_of

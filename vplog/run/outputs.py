@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vplog.cache.steps import Steps, step
 from vplog.data import (
     Camera,
     Closures,
@@ -31,6 +30,7 @@ from vplog.results.previews import thumbnail
 from vplog.results.report.page import Pictures, ReportContent
 from vplog.run import provenance
 from vplog.run.back_end import BackEndResult, about_gps, keyframe_covariances
+from vplog.run.cache.steps import Steps, step
 from vplog.run.figures.run_figures import (
     ClosureInputs,
     camera_thumbnails,
@@ -46,13 +46,13 @@ from vplog.storage.image_file import decode_image
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from vplog.cache.feature_shards import Extracted
     from vplog.data import Floats
     from vplog.execution.execution import Execution
     from vplog.loops.verify import VerifySettings
     from vplog.places.coverage import Coverage
     from vplog.results.mcap import McapExtras
     from vplog.results.previews import PictureSettings
+    from vplog.run.cache.feature_shards import Extracted
     from vplog.run.cameras import View
     from vplog.stages import Log, PlaceState
 

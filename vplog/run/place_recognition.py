@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from vplog.cache.codecs import columns_codec, descriptors_codec
-from vplog.cache.feature_shards import Extracted
-from vplog.cache.steps import step
 from vplog.data import Int32s, Keyframes, SharedReferences
 from vplog.execution.execution import Execution
 from vplog.loops.propose import Proposals, ProposeSettings, candidate_stops, propose
 from vplog.places.sequence import SequenceSettings, rank_places
 from vplog.places.views import views_of
+from vplog.run.cache.codecs import columns_codec, descriptors_codec
+from vplog.run.cache.feature_shards import Extracted
+from vplog.run.cache.steps import step
 from vplog.stages import BoxState, Log, PlaceState
 
 

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from vplog import logs
-from vplog.cache.code_hash import version
-from vplog.cache.input_hashes import bytes_of, files_of, stat_signature
 from vplog.errors import LogError, ResultError
 from vplog.results import run_record
+from vplog.run.cache.code_hash import version
 from vplog.settings import Settings
 from vplog.stages import Log
+from vplog.storage.input_hashes import bytes_of, files_of, stat_signature
 from vplog.storage.json_records import key_of
 from vplog.storage.remote_path import local_copy, located, original, reason
 from vplog.version import __version__

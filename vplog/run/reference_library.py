@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from vplog import logs
-from vplog.cache.codecs import images_codec, json_codec
-from vplog.cache.steps import step
 from vplog.data import Bytes, Ints, Keyframes, Reference
 from vplog.errors import LibraryError, SettingsError
 from vplog.execution.execution import Execution
@@ -33,12 +31,14 @@ from vplog.places.plugin import PluginSettings
 from vplog.places.reference_choice import FRAMES_A_REFERENCE, PAPER_SIZE, LibrarySettings, choose, evenly
 from vplog.places.self_recognition import MOST, NO_IMAGE, add_until_enough, further, lacking
 from vplog.results.staging import check_contents, recover, staged
+from vplog.run.cache.codecs import images_codec, json_codec
+from vplog.run.cache.steps import step
 from vplog.storage.folders import check_regular
 
 if TYPE_CHECKING:
-    from vplog.cache.feature_shards import Extracted
     from vplog.features.extractors import FeatureSettings
     from vplog.places import PlaceSettings
+    from vplog.run.cache.feature_shards import Extracted
     from vplog.stages import Log, PlaceState
 
 

@@ -10,15 +10,15 @@ from glob import escape
 from pathlib import Path, PurePath
 from typing import Any
 
-from vplog.cache.input_hashes import bytes_of, hash_inputs
-from vplog.cache.stage_cache import CACHE_FILES, ENDING
 from vplog.errors import ResultError, SettingsError, was_interrupted
 from vplog.logs import TopicChoice
 from vplog.results import run_record
 from vplog.results.run_record import CACHE, REQUEST
 from vplog.results.staging import check_contents, staged
 from vplog.run import provenance
+from vplog.run.cache.stage_cache import CACHE_FILES, ENDING
 from vplog.storage.folders import check_no_picture, check_regular, check_replaceable
+from vplog.storage.input_hashes import bytes_of, hash_inputs
 from vplog.storage.remote_path import located, stands_for
 
 _RUN_FILES = (

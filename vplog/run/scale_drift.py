@@ -11,13 +11,13 @@ from dataclasses import replace
 import numpy as np
 from scipy import sparse
 
-from vplog.cache.codecs import json_codec
-from vplog.cache.steps import step
 from vplog.data import SCALE_WANDER, Camera, Floats, Ints, Keyframes, Odometry
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.loops.candidate import Drive, Row, check_queries
 from vplog.loops.propose import Proposals
+from vplog.run.cache.codecs import json_codec
+from vplog.run.cache.steps import step
 from vplog.run.verification import DriveFeatures, for_verification
 from vplog.run.visual_odometry.metres import scaled
 

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from vplog.cache.codecs import closures_codec, json_codec
-from vplog.cache.feature_shards import Extracted
-from vplog.cache.steps import Steps, step
 from vplog.data import Camera, Closures, Ints, Keyframes, Verdict
 from vplog.execution.execution import Execution
 from vplog.loops.candidate import Drive
 from vplog.loops.propose import Proposals
 from vplog.loops.verify import VerifySettings, calibration_share, drive_of, no_closures, verify_between
+from vplog.run.cache.codecs import closures_codec, json_codec
+from vplog.run.cache.feature_shards import Extracted
+from vplog.run.cache.steps import Steps, step
 
 _PART_CANDIDATES = 1000
 """Candidates of a part: 5 to 10 s of one core, as a part of the keyframes."""

@@ -1,1 +1,1 @@
-"""Files, links and buckets."""
+"""Files, folders and buckets: how they are read, written, hashed, and kept in the user's cache."""

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from vplog import logs
-from vplog.cache.stage_cache import inputs_of, key_of
 from vplog.errors import LogError, ResultError, SettingsError
 from vplog.pipeline import Pipeline
 from vplog.results import run_record
 from vplog.results.run_record import CACHE, REQUEST, recorded
 from vplog.results.staging import recover
+from vplog.run.cache.stage_cache import inputs_of, key_of
 from vplog.run.provenance import OWN_LIBRARY, stat_of, stored_log
 from vplog.storage.folders import check_regular
 from vplog.storage.remote_path import located

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from tests.logs.drives import HEIGHT, WIDTH, D, Drive, K, foxglove_messages, png, write_raw
 from vplog import logs
 from vplog.logs.formats.container import Channel
+from vplog.logs.messages import flatbuffers as parser
 from vplog.logs.messages.decode import decode
 from vplog.logs.messages.records import BadMessageError
 
@@ -124,8 +126,35 @@ def test_a_vector_longer_than_the_message_is_an_error() -> None:
     at = data.index(b"0123456789")
     assert data[at - 4 : at] == (10).to_bytes(4, "little")
     data[at - 4 : at] = (len(data)).to_bytes(4, "little")
-    with pytest.raises(BadMessageError, match="a vector of it points outside"):
+    with pytest.raises(BadMessageError, match="buffer is smaller than requested size"):
         decode(Channel("/t", "foxglove.CompressedImage", "flatbuffer"), bytes(data))
+
+
+def test_entries_that_share_their_bytes_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One transform with a long name, a thousand times over."""
+    from foxglove_schemas_flatbuffer import FrameTransform, FrameTransforms
+
+    monkeypatch.setattr(parser, "_MOST_BYTES", 2**23)
+    builder = flatbuffers.Builder(2**17)
+    name = builder.CreateString("x" * 2**16)
+    FrameTransform.Start(builder)
+    FrameTransform.AddParentFrameId(builder, name)
+    one = FrameTransform.End(builder)
+    for count, few in ((100, True), (1000, False)):
+        FrameTransforms.StartTransformsVector(builder, count)
+        for _ in range(count):
+            builder.PrependUOffsetTRelative(one)
+        entries = builder.EndVector()
+        FrameTransforms.Start(builder)
+        FrameTransforms.AddTransforms(builder, entries)
+        found = FrameTransforms.End(builder)
+        builder.Finish(found)
+        data, builder.finished = bytes(builder.Output()), False
+        channel = Channel("/t", "foxglove.FrameTransforms", "flatbuffer")
+        with nullcontext() if few else pytest.raises(BadMessageError, match="its transforms take more than 8 MB"):
+            poses = decode(channel, data)
+            assert isinstance(poses, list)
+            assert len(poses) == count
 
 
 @given(st.binary(max_size=120), st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), max_size=4))

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from tests.joined import LOGS, QUICK
-from vplog.cache.input_hashes import hash_inputs
 from vplog.data import Ranking
 from vplog.errors import ResultError
 from vplog.evaluate.truth import read_truth
@@ -34,6 +33,7 @@ from vplog.pipeline import load_pipeline
 from vplog.results import run_record, tables
 from vplog.results.run_record import read_run_json
 from vplog.storage.compressed_json import read_compressed
+from vplog.storage.input_hashes import hash_inputs
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 PIPELINE = load_pipeline("default", QUICK)
 HALVES = ("before", "after")

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 
 def test_the_halves_of_a_drive_are_put_together_and_a_drive_from_elsewhere_is_not(joint: Path, drive: Demo) -> None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from tests.conftest import Said
     from vplog.data import Camera, Floats
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 Verb = Any
 

@@ -25,15 +25,15 @@ from vplog.benchmark.study.example_figures import PICTURES
 from vplog.benchmark.study.experiments import NUMBERS, StudyOptions
 from vplog.benchmark.study.score_charts import CHARTS
 from vplog.benchmark.traversals import candidate_stops
-from vplog.cache.code_hash import code_of
-from vplog.cache.input_hashes import hash_inputs
 from vplog.errors import ResultError, SettingsError, TruthError, nearest
 from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, open_truth
 from vplog.execution.execution import Execution, logged_warnings
 from vplog.pipeline import Pipeline
 from vplog.results.run_record import is_ours, read_run_json, write_run_json
 from vplog.results.staging import check_contents, staged
+from vplog.run.cache.code_hash import code_of
 from vplog.storage.folders import check_regular
+from vplog.storage.input_hashes import hash_inputs
 from vplog.storage.json_records import key_of, plain
 from vplog.storage.urls import shown
 from vplog.version import __version__

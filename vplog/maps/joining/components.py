@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 
-from vplog.cache.code_hash import code_of
 from vplog.data import Closures
 from vplog.errors import NewerError, ResultError, VplogError
 from vplog.execution.execution import Execution
@@ -47,6 +46,7 @@ from vplog.maps.storage.layout import folder_name
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline
 from vplog.results import g2o, run_record, tables
+from vplog.run.cache.code_hash import code_of
 from vplog.storage.json_records import key_of
 from vplog.storage.scratch import put_in_place
 

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vplog.cache.code_hash import code_of
 from vplog.data import SharedReferences
 from vplog.errors import ResultError
 from vplog.maps.joining.inter_session import CameraDrive, DrivePair, closures_by_cameras
@@ -25,6 +24,7 @@ from vplog.maps.joining.members import CameraTrust, Member, camera_trust, keep_f
 from vplog.maps.storage.damage import damaged_table
 from vplog.maps.storage.layout import folder_name, quoted
 from vplog.results import run_record, tables
+from vplog.run.cache.code_hash import code_of
 from vplog.storage.json_records import key_of
 from vplog.storage.scratch import replacing
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog import logs
-from vplog.cache.input_hashes import hash_inputs
 from vplog.data import Int32s, Ints
 from vplog.errors import LogError, ResultError
 from vplog.features.store import FeatureStore
@@ -26,6 +25,7 @@ from vplog.results.feature_table import FeatureTable, write_features
 from vplog.run.feature_extraction import Extracted, stored_features
 from vplog.run.provenance import stored_log
 from vplog.run.reextraction import ReextractedFeatures
+from vplog.storage.input_hashes import hash_inputs
 from vplog.storage.json_records import key_of, plain
 from vplog.storage.scratch import scratch
 

@@ -18,9 +18,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from vplog.cache.user_cache import cache_folder, max_bytes, trim
 from vplog.maps.storage.layout import link, sha256_of
 from vplog.storage.remote_path import RemotePath, s3_place
+from vplog.storage.user_cache import cache_folder, max_bytes, trim
 
 
 @dataclass(frozen=True)

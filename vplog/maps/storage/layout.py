@@ -12,9 +12,9 @@ from pathlib import Path, PurePath
 from typing import Any
 from urllib.parse import quote
 
-from vplog.cache.code_hash import code_of
 from vplog.errors import NewerError, ResultError
 from vplog.results import run_record, tables
+from vplog.run.cache.code_hash import code_of
 from vplog.storage.folders import numbered
 from vplog.storage.json_records import CHECKSUM, canonical_json, key_of, plain
 

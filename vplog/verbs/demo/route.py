@@ -11,9 +11,9 @@ from itertools import accumulate
 import numpy as np
 
 from vplog.data import Floats, Ints
-from vplog.demo.settings import DemoSettings
 from vplog.geometry.geodesy import geodetic
 from vplog.geometry.se3 import between, exp, log, pose, so3_exp
+from vplog.verbs.demo.settings import DemoSettings
 
 START_NS = 1_700_000_000_000_000_000
 """Stamp of the first odometry sample; any date serves."""

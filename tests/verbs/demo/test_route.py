@@ -9,8 +9,8 @@ from hypothesis import settings as limit
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from vplog.demo import SMALL, DemoSettings, route
 from vplog.geometry.se3 import between, log, transform, umeyama
+from vplog.verbs.demo import SMALL, DemoSettings, route
 
 blocks = st.builds(
     DemoSettings,

@@ -13,10 +13,10 @@ import numpy as np
 from numba import njit
 
 from vplog.data import Bytes, Camera, Float32s, Floats, Int32s, Ints
-from vplog.demo import route
-from vplog.demo.settings import DemoSettings
-from vplog.demo.world import Quads, World, build_world, traffic
 from vplog.geometry.se3 import inverse, pose, so3_exp, transform
+from vplog.verbs.demo import route
+from vplog.verbs.demo.settings import DemoSettings
+from vplog.verbs.demo.world import Quads, World, build_world, traffic
 
 CAMERA_FRAME = "camera_optical"
 REAR_FRAME = "rear_optical"

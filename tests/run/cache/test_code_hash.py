@@ -9,14 +9,14 @@ import sys
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from vplog.cache import code_hash
+from vplog.run.cache import code_hash
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     import pytest
 
-    from vplog.demo.record import Demo
+    from vplog.verbs.demo.record import Demo
 
 EXTRACTION = ("vplog.run.feature_extraction", "vplog.features.sift")
 COUNTS = ("logs/messages/h264.py", "features/sift.py", "features/stereo_depth.py", "features/__init__.py")

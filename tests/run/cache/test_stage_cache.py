@@ -6,7 +6,7 @@ import os
 import random
 from typing import TYPE_CHECKING
 
-from vplog.cache.stage_cache import StageCache, inputs_of, key_of
+from vplog.run.cache.stage_cache import StageCache, inputs_of, key_of
 
 if TYPE_CHECKING:
     from pathlib import Path

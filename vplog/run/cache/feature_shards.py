@@ -8,11 +8,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from vplog.cache.stage_cache import CONTENT_AT, AbsentError, DamagedError
 from vplog.data import Features
 from vplog.errors import ResultError
 from vplog.features.matching import MatchSettings, PairMatches
 from vplog.features.store import SIFT_BYTES, features_from, features_to, size_of
+from vplog.run.cache.stage_cache import CONTENT_AT, AbsentError, DamagedError
 
 _LENGTH = struct.Struct("<I")
 """Bytes of the JSON head of a part, which comes before its features and pictures."""

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from vplog.demo import DemoSettings, route
-from vplog.demo.scene import FIRST_LIGHT, LATER_LIGHT, Scene, make_scene, render, take_picture
-from vplog.demo.world import traffic
 from vplog.geometry.se3 import angle, between, inverse, pose, so3_exp, transform
+from vplog.verbs.demo import DemoSettings, route
+from vplog.verbs.demo.scene import FIRST_LIGHT, LATER_LIGHT, Scene, make_scene, render, take_picture
+from vplog.verbs.demo.world import traffic
 
 if TYPE_CHECKING:
     from vplog.data import Bytes, Floats

@@ -5,7 +5,7 @@ It needs no download, so `vplog demo` and the tests run on it. The same settings
 
 from __future__ import annotations
 
-from vplog.demo.record import Demo, make_drive
-from vplog.demo.settings import SMALL, DemoSettings
+from vplog.verbs.demo.record import Demo, make_drive
+from vplog.verbs.demo.settings import SMALL, DemoSettings
 
 __all__ = ["SMALL", "Demo", "DemoSettings", "make_drive"]

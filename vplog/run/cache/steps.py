@@ -19,16 +19,16 @@ from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, Self, TypeVar
 
-from vplog.cache.code_hash import code_of
-from vplog.cache.stage_cache import AbsentError, StageCache, digest_of
 from vplog.execution.cores import limited
 from vplog.execution.execution import Execution, logged_warnings
 from vplog.execution.timing import StageTimer
+from vplog.run.cache.code_hash import code_of
+from vplog.run.cache.stage_cache import AbsentError, StageCache, digest_of
 from vplog.settings import Settings
 from vplog.storage.json_records import key_of
 
 if TYPE_CHECKING:
-    from vplog.cache.codecs import Codec
+    from vplog.run.cache.codecs import Codec
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -151,5 +151,5 @@ def _key(one: Step[Any], inputs: Sequence[Any]) -> str:
     methods = {
         type(value).__module__ for value in values if isinstance(value, Settings) or hasattr(value, "arrow_type")
     }
-    code = code_of("vplog.cache.codecs", one.function.__module__, *sorted(methods))
+    code = code_of("vplog.run.cache.codecs", one.function.__module__, *sorted(methods))
     return key_of({"step": one.name, "inputs": [digest_of(value) for value in values], **code})

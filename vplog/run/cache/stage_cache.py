@@ -20,15 +20,15 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Self, TypeVar
 
 import numpy as np
 
-from vplog.cache.input_hashes import hash_inputs, stat_signature
 from vplog.errors import ResultError
 from vplog.results.run_record import read_run_json, write_run_json
 from vplog.settings import Settings
+from vplog.storage.input_hashes import hash_inputs, stat_signature
 from vplog.storage.json_records import canonical_json, key_of
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
-    from vplog.cache.codecs import Codec
+    from vplog.run.cache.codecs import Codec
 
 T = TypeVar("T")
 

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 
 from vplog.data import Bytes, Float32s, Floats, Int32s, Ints
-from vplog.demo.route import axis_point, lap_length
-from vplog.demo.settings import DemoSettings
+from vplog.verbs.demo.route import axis_point, lap_length
+from vplog.verbs.demo.settings import DemoSettings
 
 PX_PER_M = 48
 """Scale of walls and objects: at the default 640 px and 80 degrees a wall 8 m away is seen at this scale."""

@@ -10,8 +10,11 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from vplog.demo import SMALL, make_drive, route
-from vplog.demo.record import (
+from vplog.errors import ResultError
+from vplog.execution.execution import Execution
+from vplog.geometry.se3 import rotation
+from vplog.verbs.demo import SMALL, make_drive, route
+from vplog.verbs.demo.record import (
     CAMERA_INFO,
     DEPTH,
     DEPTH_INFO,
@@ -22,10 +25,7 @@ from vplog.demo.record import (
     TYPES,
     Demo,
 )
-from vplog.demo.scene import make_scene, take_picture
-from vplog.errors import ResultError
-from vplog.execution.execution import Execution
-from vplog.geometry.se3 import rotation
+from vplog.verbs.demo.scene import make_scene, take_picture
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -14,7 +14,7 @@ from importlib import metadata
 from itertools import accumulate
 from pathlib import Path
 
-_PACKAGE = Path(__file__).parents[1]
+_PACKAGE = Path(__file__).parents[2]
 _PUBLISHED_AS = {"cv2": "opencv-python-headless", "faiss": "faiss-cpu", "yaml": "PyYAML", "google": "protobuf"}
 """Packages whose name on PyPI is not the one they are imported by; a search for others takes half a second."""
 _TYPE_CHECKING = re.compile(r"^( *)if TYPE_CHECKING:\n(?:\1 +.*\n|\n)*", re.MULTILINE)

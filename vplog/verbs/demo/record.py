@@ -15,14 +15,14 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from vplog.data import Bytes, Camera, Float32s, Floats, Trajectory
-from vplog.demo import route
-from vplog.demo.scene import BODY_FRAME, CAMERA_FRAME, REAR_FRAME, Scene, make_scene, rear_mount, take_picture
-from vplog.demo.settings import DemoSettings
 from vplog.errors import ResultError
 from vplog.execution.cores import allowed
 from vplog.execution.execution import Execution
 from vplog.geometry.se3 import quaternion
 from vplog.geometry.tum import write_tum
+from vplog.verbs.demo import route
+from vplog.verbs.demo.scene import BODY_FRAME, CAMERA_FRAME, REAR_FRAME, Scene, make_scene, rear_mount, take_picture
+from vplog.verbs.demo.settings import DemoSettings
 
 IMAGE = "/camera/image_raw/compressed"
 CAMERA_INFO = "/camera/camera_info"

@@ -1,0 +1,1 @@
+"""Results of steps on disk, found again by what they were made from."""
