@@ -15,7 +15,7 @@ import scipy
 
 from vplog.data import Floats, Ints
 from vplog.geometry import se3
-from vplog.geometry.symmetric import invert
+from vplog.geometry.small_matrices import add_inner, add_moved, invert, product, subtract_moved, subtract_outer
 
 _HUBER = 1.5
 """Sigmas beyond which an error counts linearly, as in the refinement of a single pose."""
@@ -66,7 +66,7 @@ class Bundle:
 def adjust(world_from_camera: Floats, points: Floats, observed: Observations, metric: bool = True) -> Bundle | None:
     """The views (W, 4, 4), the oldest fixed, and points (P, 3) that explain the observations best; None where these do
     not determine them. Without depths (not `metric`) the distance of the two oldest views, too, stays as it is."""
-    apart = None if metric else float(np.linalg.norm(world_from_camera[1][:3, 3] - world_from_camera[0][:3, 3]))
+    apart = 0.0 if metric else float(np.linalg.norm(world_from_camera[1][:3, 3] - world_from_camera[0][:3, 3]))
     window = _Window.of(observed, len(points), apart)
     poses, cost, damping = np.asarray(world_from_camera, np.float64), math.inf, _DAMPING
     points = np.asarray(points, np.float64)
@@ -131,11 +131,11 @@ class _Window:
     """(O, 3, 3), 0 for rho where it was not measured."""
     first: Ints
     """(P + 1,) first observation of each landmark."""
-    apart: float | None
-    """Distance of the two oldest views where it is to stay."""
+    apart: float
+    """Distance of the two oldest views where it is to stay, else 0."""
 
     @classmethod
-    def of(cls, observed: Observations, count: int, apart: float | None) -> _Window:
+    def of(cls, observed: Observations, count: int, apart: float) -> _Window:
         order = np.lexsort([observed.view, observed.landmark])
         first = np.searchsorted(observed.landmark[order], np.arange(count + 1))
         xyrho, variance = observed.xyrho[order], observed.variance[order]
@@ -151,7 +151,7 @@ class _Window:
         hessian, gradient, cost, gains, own = _normal_equations(
             poses, points, self.view, self.xyrho, self.information, self.first, damping
         )
-        if self.apart is not None:
+        if self.apart:
             error, along = self._stretched(poses)
             hessian[6:12, 6:12] += np.outer(along, along)
             gradient[6:12] += along * error
@@ -160,12 +160,11 @@ class _Window:
 
     def cost(self, poses: Floats, points: Floats) -> float:
         """Half the sum of the robust squared errors."""
-        stretched = 0.0 if self.apart is None else self._stretched(poses)[0] ** 2 / 2.0
+        stretched = self._stretched(poses)[0] ** 2 / 2.0 if self.apart else 0.0
         return _cost(poses, points, self.view, self.xyrho, self.information, self.first) + stretched
 
     def _stretched(self, poses: Floats) -> tuple[float, Floats]:
         """Error of the distance of the two oldest views in sigmas, and its derivative (6,) by the second."""
-        assert self.apart is not None
         moved = poses[1][:3, 3] - poses[0][:3, 3]
         length, sigma = float(np.linalg.norm(moved)), _FIXED * self.apart
         return (length - self.apart) / sigma, np.concatenate([np.zeros(3), moved @ poses[1][:3, :3]]) / length / sigma
@@ -173,63 +172,39 @@ class _Window:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _normal_equations(poses, points, view, xyrho, information, first, damping):
+    """Hessian (6 W, 6 W) and gradient of the views without the landmarks (the Schur complement), the robust cost, what
+    a step of an observation's view moves its landmark by (O, 6, 3), and the landmarks' own steps (P, 3)."""
     W, P = len(poses), len(points)
     hessian, gradient, cost = np.zeros((6 * W, 6 * W)), np.zeros(6 * W), 0.0
     gains, cross, own = np.zeros((len(view), 6, 3)), np.zeros((len(view), 6, 3)), np.zeros((P, 3))
     error, by_pose, by_point = np.empty(3), np.empty((3, 6)), np.empty((3, 3))
-    weighed, total, inverse, ahead = np.empty((3, 9)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-    for i in range(6 * W):
-        hessian[i, i] = damping
+    weighed, weighed_point = np.empty((3, 6)), np.empty((3, 3))
+    total, inverse, ahead = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for p in range(P):
-        total[:], ahead[:] = 0.0, 0.0
-        for i in range(3):
-            total[i, i] = damping + _WHISPER
-        for o in range(first[p], first[p + 1]):
+        total[:], ahead[:] = np.eye(3) * (damping + _WHISPER), 0.0
+        observations = range(first[p], first[p + 1])
+        for o in observations:
             at = 6 * view[o]
             squared = _predict(poses[view[o]], points[p], xyrho[o], information[o], error, by_pose, by_point)
             cost += _huber(squared)
             weight = 1.0 if squared <= _HUBER**2 else _HUBER / math.sqrt(squared)
-            for i in range(3):
-                for j in range(6):
-                    weighed[i, j] = 0.0
-                    for k in range(3):
-                        weighed[i, j] += weight * information[o, i, k] * by_pose[k, j]
-                for j in range(3):
-                    weighed[i, 6 + j] = 0.0
-                    for k in range(3):
-                        weighed[i, 6 + j] += weight * information[o, i, k] * by_point[k, j]
-            for k in range(3):
-                for i in range(6):
-                    gradient[at + i] += weighed[k, i] * error[k]
-                    for j in range(6):
-                        hessian[at + i, at + j] += by_pose[k, i] * weighed[k, j]
-                    for j in range(3):
-                        cross[o, i, j] += by_pose[k, i] * weighed[k, 6 + j]
-                for i in range(3):
-                    ahead[i] += weighed[k, 6 + i] * error[k]
-                    for j in range(3):
-                        total[i, j] += by_point[k, i] * weighed[k, 6 + j]
+            product(information[o], by_pose, weight, weighed)
+            product(information[o], by_point, weight, weighed_point)
+            add_inner(hessian, at, at, by_pose, weighed)
+            add_moved(gradient, at, weighed, error)
+            add_inner(cross[o], 0, 0, by_pose, weighed_point)
+            add_inner(total, 0, 0, by_point, weighed_point)
+            add_moved(ahead, 0, weighed_point, error)
         invert(total, 3, inverse)
-        for i in range(3):
-            for j in range(3):
-                own[p, i] -= inverse[i, j] * ahead[j]
-        for o in range(first[p], first[p + 1]):
-            at = 6 * view[o]
-            for i in range(6):
-                for j in range(3):
-                    for k in range(3):
-                        gains[o, i, j] += cross[o, i, k] * inverse[k, j]
-                    gradient[at + i] -= gains[o, i, j] * ahead[j]
+        subtract_moved(own[p], 0, inverse, ahead)
+        for o in observations:
+            product(cross[o], inverse, 1.0, gains[o])
+            subtract_moved(gradient, 6 * view[o], gains[o], ahead)
             for other in range(o, first[p + 1]):
-                there = 6 * view[other]
-                for i in range(6):
-                    a, b, c = gains[o, i, 0], gains[o, i, 1], gains[o, i, 2]
-                    for j in range(6):
-                        d, e, f = cross[other, j, 0], cross[other, j, 1], cross[other, j, 2]
-                        hessian[at + i, there + j] -= a * d + b * e + c * f
+                subtract_outer(hessian, 6 * view[o], 6 * view[other], gains[o], cross[other])
     for i in range(6 * W):
-        for j in range(i):
-            hessian[i, j] = hessian[j, i]
+        hessian[i, i] += damping
+        hessian[i, :i] = hessian[:i, i]
     return hessian, gradient, cost, gains, own
 
 

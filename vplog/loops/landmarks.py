@@ -18,7 +18,7 @@ from pydantic import Field
 from vplog.data import Camera, Features, Floats, Keyframes
 from vplog.features.matching import PairMatches
 from vplog.geometry import se3
-from vplog.geometry.symmetric import invert
+from vplog.geometry.small_matrices import add_inner, add_moved, invert, product, subtract_moved, subtract_outer
 from vplog.loops import undistort
 from vplog.settings import Settings
 
@@ -207,43 +207,24 @@ def _eliminated(points, views, rays, information, observed, whiten, visible):
     cross, own, error = np.empty((6 * V, 3)), np.empty((3, 3)), np.empty(2)
     by_point, by_view = np.empty((2, 3)), np.empty((2, 6))
     for m in range(M):
-        cross[:] = 0.0
-        own[:] = 0.0
+        cross[:], own[:] = 0.0, 0.0
+        own[:2, :2] = information[m]  # the keyframe's own observation holds x and y
         own[2, 2] = 1e-6  # m^2, a sigma of 1000 /m: a whisper, which keeps what no view sees invertible
-        for i in range(2):  # the keyframe's own observation holds x and y
-            for j in range(2):
-                own[i, j] = information[m, i, j]
-                own_gradient[m, i] += information[m, i, j] * (points[m, j] - rays[m, j])
+        add_moved(own_gradient[m], 0, information[m], points[m, :2] - rays[m])
         for v in range(V):
             if not visible[v, m] or not _linearise(points[m], observed[v, m], views[v], error, by_point, by_view):
                 continue
             if not _whiten(whiten[v, m], error, by_point, by_view):
                 continue
-            first = 6 * v
-            for k in range(2):
-                for i in range(3):
-                    own_gradient[m, i] += by_point[k, i] * error[k]
-                    for j in range(3):
-                        own[i, j] += by_point[k, i] * by_point[k, j]
-                for i in range(6):
-                    gradient[first + i] += by_view[k, i] * error[k]
-                    for j in range(6):
-                        hessian[first + i, first + j] += by_view[k, i] * by_view[k, j]
-                    for j in range(3):
-                        cross[first + i, j] += by_view[k, i] * by_point[k, j]
+            add_inner(own, 0, 0, by_point, by_point)
+            add_moved(own_gradient[m], 0, by_point, error)
+            add_inner(hessian, 6 * v, 6 * v, by_view, by_view)
+            add_moved(gradient, 6 * v, by_view, error)
+            add_inner(cross, 6 * v, 0, by_view, by_point)
         invert(own, 3, covariance[m])
-        gain = gains[m]
-        for i in range(6 * V):
-            for j in range(3):
-                for k in range(3):
-                    gain[i, j] += cross[i, k] * covariance[m, k, j]
-        for i in range(6 * V):
-            a, b, c = gain[i, 0], gain[i, 1], gain[i, 2]
-            if a == b == c == 0.0:
-                continue  # this view does not show it
-            gradient[i] -= a * own_gradient[m, 0] + b * own_gradient[m, 1] + c * own_gradient[m, 2]
-            for j in range(6 * V):
-                hessian[i, j] -= a * cross[j, 0] + b * cross[j, 1] + c * cross[j, 2]
+        product(cross, covariance[m], 1.0, gains[m])
+        subtract_moved(gradient, 0, gains[m], own_gradient[m])
+        subtract_outer(hessian, 0, 0, gains[m], cross)
     return hessian, gradient, covariance, own_gradient, gains
 
 

@@ -16,7 +16,7 @@ import scipy
 
 from vplog.data import Bools, Floats
 from vplog.geometry import se3
-from vplog.geometry.symmetric import invert
+from vplog.geometry.small_matrices import invert
 
 _HUBER = 1.5
 """Sigmas beyond which an error counts linearly: 96 % as efficient as least squares on Gaussian errors (Huber 1981)."""
