@@ -95,9 +95,9 @@ def test_a_false_place_is_suspected() -> None:
     factors = Factors.of(bent)
     poses, whole = solved(bent, weight)
     pull = tension(factors, weight, poses, loops)
-    places = groups(bent, loops)
+    places = groups(bent, loops, OdometryChain.of(bent))
     assert sorted(np.concatenate(places).tolist()) == list(range(len(loops)))
-    suspicion = group_costs(bent, poses, loops, pull, places)
+    suspicion = group_costs(bent, poses, loops, pull, places, OdometryChain.of(bent))
     worst = places[int(np.argmax(suspicion))]
     assert set(loops[worst]) >= set(range(len(bent.a) - 9, len(bent.a) - 1))
     _, left = solved(bent, np.where(np.isin(np.arange(len(bent.a)), loops[worst]), 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""Ground truth of a drive: a file of poses, or its satellite fixes, which are positions only."""
+"""Ground truth of a drive: a file of poses, or its GPS fixes, which are positions only."""
 
 from __future__ import annotations
 

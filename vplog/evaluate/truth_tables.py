@@ -77,13 +77,6 @@ def read_lines(
         raise error(f"{path} is not text, and so not a CSV file. {form}") from None
 
 
-def _check_size(path: Path) -> None:
-    if path.stat().st_size > _FILE_BYTES:
-        raise TruthError(
-            f"{path} is larger than {_FILE_BYTES // 2**20} MB, so it is no table of true pairs. Give one `query,match`."
-        )
-
-
 def listed_rows(rows: Sequence[tuple[str, str, str]], query: Log, other: Log) -> Ints:
     """(P, 2) rows of the pairs of a table `query,match`; a line with no match names a query that has none.
 
@@ -139,7 +132,8 @@ def read_array(path: Path, queries: int, matches: int) -> Ints:
     Nothing that a pickle names is imported or called. Raises TruthError.
     """
     try:
-        _check_size(path)
+        if path.stat().st_size > _FILE_BYTES:
+            raise ValueError(f"it is larger than {_FILE_BYTES // 2**20} MB")
         with path.open("rb") as stream:
             values = _array(stream)
     except OSError as error:

@@ -14,8 +14,8 @@ AXES = {2: [2, 3, 4], 3: [0, 1, 2, 3, 4, 5]}
 """Rows and columns of (6, 6) matrices that a graph of this dimension uses."""
 _FURTHEST_M = 1e8
 """m; frames of drives (UTM, ECEF) stay below 1e7, and from 1e8 on the last bit of a double is coarser than 10 nm."""
-_SUREST = 1e30
-"""Most information, of m or rad: a millionth of a nanometre. Beyond it, squares and determinants leave a double."""
+_MOST_INFORMATION = 1e30
+"""Most information, of m or rad: a millionth of a nanometre. Beyond it, squares and determinants overflow a double."""
 _LEAST_SHARE = 1e-10
 """Least eigenvalue of an information matrix as a share of its largest: GTSAM factorises them, so none may be zero."""
 _CLEARLY = 0.01
@@ -116,11 +116,11 @@ def checked(graph: PoseGraph) -> tuple[PoseGraph, list[str]]:
     if not poor.any():
         return graph, []
     negative, rows = np.flatnonzero(values[:, 0] < -_NOISE * values[:, -1]), unsure[poor]
-    values, vectors = np.linalg.eigh(_possible(likes[rows]))
+    values, vectors = np.linalg.eigh(_without_impossible_correlations(likes[rows]))
     open_ = values[:, 0] < _LEAST_SHARE * values[:, -1]
     values = np.maximum(values, 2.0 * _LEAST_SHARE * values[:, -1:])
     mended = (vectors * values[:, None, :]) @ np.swapaxes(vectors, 1, 2) * scale[rows]
-    mended[open_] += _least_known(graph)
+    mended[open_] += _weakest_information(graph)
     axes = np.array(AXES[graph.dimension])
     repaired = graph.information.copy()
     repaired[rows[:, None, None], axes[:, None], axes] = mended
@@ -135,7 +135,7 @@ def checked(graph: PoseGraph) -> tuple[PoseGraph, list[str]]:
     return replace(graph, information=repaired), warnings
 
 
-def _least_known(graph: PoseGraph) -> Floats:
+def _weakest_information(graph: PoseGraph) -> Floats:
     """(d, d) information of what is known of any edge: it turns by no half circle, and is no longer than all together.
 
     Else axes of which an edge says nothing would be as uncertain as no false closure is.
@@ -145,7 +145,7 @@ def _least_known(graph: PoseGraph) -> Floats:
     return np.diag(sigma**-2.0)
 
 
-def _possible(likes: Floats) -> Floats:
+def _without_impossible_correlations(likes: Floats) -> Floats:
     """The matrices (K, d, d) without entries beyond the geometric mean of their diagonal's: correlations beyond 1."""
     diagonal = np.diagonal(likes, axis1=1, axis2=2)
     most = np.sqrt(diagonal[:, :, None] * diagonal[:, None, :]) * (1.0 + _NOISE)
@@ -188,7 +188,7 @@ def _check_matrices(matrices: Floats, name: str, a: Int32s | Ints, b: Int32s | I
     finite: Bools = np.asarray(np.isfinite(matrices).all((1, 2)))
     diagonal = np.diagonal(np.where(finite[:, None, None], matrices, 0.0), axis1=1, axis2=2)
     least: Bools = np.asarray((diagonal < 0).any(1) | (diagonal <= 0).all(1))
-    most: Bools = np.asarray((diagonal > _SUREST).any(1))
+    most: Bools = np.asarray((diagonal > _MOST_INFORMATION).any(1))
     bad = np.flatnonzero(~finite | least | most)
     if len(bad):
         edge = bad[0]
@@ -197,7 +197,7 @@ def _check_matrices(matrices: Floats, name: str, a: Int32s | Ints, b: Int32s | I
         value = value if finite[edge] else matrices[edge][~np.isfinite(matrices[edge])][0]
         raise GraphError(
             f"The {name} of edge {edge} ({a[edge]} to {b[edge]}) holds {value:.6g}; "
-            f"it must be finite with a positive diagonal of at most {_SUREST:g}."
+            f"it must be finite with a positive diagonal of at most {_MOST_INFORMATION:g}."
         )
 
 

@@ -86,7 +86,7 @@ class Certificate:
         return {**asdict(replace(self, better=None)), "noise": noise}
 
 
-_UNSAID = "It does not say whether the closures kept are true."
+_CAVEAT = "It does not say whether the closures kept are true."
 
 
 def certify(graph: PoseGraph, weight: Floats, poses: Floats, search: bool = False) -> Certificate:
@@ -129,7 +129,7 @@ def _sentence(found: Certificate, search: bool) -> str:
         return (
             f"Certified: with the noise of each edge taken as isotropic, no poses have a lower chi-square of the edges "
             f"kept than {found.chi2:.6g}, the minimum that the solution leads to, {found.moved_m:.3g} m away at most. "
-            f"{_UNSAID}"
+            f"{_CAVEAT}"
         )
     text = f"Not certified as the optimum: the certificate's least eigenvalue is {found.smallest_eigenvalue:.3g}"
     if found.lower_chi2 is not None:
@@ -137,7 +137,7 @@ def _sentence(found: Certificate, search: bool) -> str:
     else:
         text += f", so others may be up to {found.gap:.2%} better in chi-square"
         text += "; none were found" if search else "; look for them with vplog optimize --certify"
-    return f"{text}. {_UNSAID}"
+    return f"{text}. {_CAVEAT}"
 
 
 def solve_certified(graph: PoseGraph, solution: Solution) -> tuple[Solution, Certificate]:

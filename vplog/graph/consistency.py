@@ -23,6 +23,12 @@ def residual_sigma(graph: PoseGraph, world_from_body: Floats, edges: Ints | None
     return np.sqrt(np.maximum(2.0 * edge_costs(graph, np.ones(len(graph.a)), world_from_body, edges), 0.0))
 
 
+def residual_twists(graph: PoseGraph, world_from_body: Floats, edges: Ints) -> Floats:
+    """(K, 6) residuals of edges at poses (N, 4, 4), rotation first: those of GTSAM's BetweenFactor of Pose3."""
+    measured = se3.between(world_from_body[graph.a[edges]], world_from_body[graph.b[edges]])
+    return se3.log(se3.between(graph.a_from_b[edges], measured))
+
+
 def degrees_of_freedom(graph: PoseGraph) -> int:
     """Degrees of freedom of one edge: 6, or 3 in the plane."""
     return len(AXES[graph.dimension])
@@ -84,9 +90,7 @@ class OdometryChain:
         """(K,) sigma of the edges `loops` to the odometry, the noise of both together; NaN where it does not lead."""
         a, b = graph.a[loops], graph.b[loops]
         covariance = self.covariance(a, b) + np.linalg.inv(informed(graph, loops))
-        error = se3.log(se3.between(graph.a_from_b[loops], se3.between(self.poses[a], self.poses[b])))
-        error = error[:, self.axes]
-        chi2 = se3.mahalanobis2(error, covariance)
+        chi2 = se3.mahalanobis2(residual_twists(graph, self.poses, loops)[:, self.axes], covariance)
         return np.where(self.part[a] == self.part[b], np.sqrt(np.maximum(chi2, 0.0)), np.nan)
 
     def accumulated_noise(self, unit: Floats) -> Floats:

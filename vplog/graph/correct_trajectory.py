@@ -1,4 +1,4 @@
-"""Solved keyframes move every odometry sample."""
+"""Correction of every odometry sample by the solved keyframes."""
 
 from __future__ import annotations
 

@@ -2,8 +2,8 @@
 
 Yang, Antonante, Tzoumas, Carlone: Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020, with three
 additions: the initial inliers are the closures that agree with the odometry (`odometry_mixture`); each closure, and
-each group of neighbouring ones, is tested against the prediction of the rest (`outlier_test`); and what comes of
-several starts is compared (`hypotheses`).
+each group of neighbouring ones, is tested against the prediction of the rest (`outlier_test`); and the solutions from
+several starts are compared (`hypotheses`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.graph.least_squares import descend
 from vplog.graph.lm import solve_weighted
-from vplog.graph.odometry_mixture import agreement
+from vplog.graph.odometry_mixture import modes
 from vplog.graph.outlier_test import OutlierTest
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import truncated_weights
@@ -74,7 +74,8 @@ class GncSettings(Settings):
             start = initial_poses(factors, weight)
             return solve_weighted(factors, weight, start, self.max_iterations, self.tolerance, "")
         chain = OdometryChain.of(graph)
-        likely = agreement(graph, loops, chain) & ~far_from_odometry(graph, self.gate_probability, chain)[loops]
+        far = far_from_odometry(graph, self.gate_probability, chain)[loops]
+        likely = modes(graph, loops, chain)[0][1] & ~far
         weight, poses = self.tested(factors, *self.annealed(factors, likely))
         accepted = int(weight[loops].sum())
         found = f"{accepted} of {len(loops)} closures were kept. "
@@ -85,12 +86,12 @@ class GncSettings(Settings):
         graph = factors.graph
         loops = np.flatnonzero(is_loop(graph))
         weight = np.ones(len(graph.a))
-        weight[loops] = likely & self._join(graph, loops, OdometryChain.of(graph))
+        weight[loops] = likely & self._consistent(graph, loops, OdometryChain.of(graph))
         bound = chi2_quantile(self.inlier_probability, degrees_of_freedom(graph))
         return self._anneal(factors, weight, initial_poses(factors, weight, bound), bound)
 
     def tested(self, factors: Factors, weight: Floats, poses: Floats, strict: bool = False) -> tuple[Floats, Floats]:
-        """Weights (E,) and poses once no closure costs the others too much, and none is left out that they predict."""
+        """Weights (E,) and poses once no closure costs the others too much, and all that they predict are inliers."""
         graph, chain = factors.graph, OdometryChain.of(factors.graph)
         room = log_room(graph, chain.poses)
         loops = np.flatnonzero(is_loop(graph))
@@ -98,14 +99,14 @@ class GncSettings(Settings):
         state = test(weight, poses)
         return state.weight, state.poses
 
-    def _join(self, graph: PoseGraph, loops: Ints, chain: OdometryChain) -> Bools:
-        """False for closures (K,) between two pieces of odometry that are not of the largest set that agrees."""
+    def _consistent(self, graph: PoseGraph, loops: Ints, chain: OdometryChain) -> Bools:
+        """False for closures (K,) between two pieces of odometry that are not of the largest consistent set."""
         part = chain.part
         one, two = part[graph.a[loops]], part[graph.b[loops]]
         across = one != two
         consistency = PcmSettings(pair_probability=self.inlier_probability, clique_steps=_BRANCHES)
         good = ~across
-        # closures between other pieces say nothing about each other, so each two pieces are judged by themselves
+        # closures between other pieces do not constrain each other, so each two pieces are tested separately
         pairs = np.minimum(one, two) * (int(part.max()) + 1) + np.maximum(one, two)
         by_pair = np.flatnonzero(across)[np.argsort(pairs[across], kind="stable")]
         first = np.flatnonzero(np.diff(pairs[by_pair], prepend=-1))

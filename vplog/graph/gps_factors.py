@@ -43,7 +43,7 @@ it was claimed too small."""
 _STEADY = 0.2
 """Change of the covariance in a round, as a share, below which it is settled."""
 _UNLIKE = 0.1
-"""Autocorrelation below which errors are not alike."""
+"""Autocorrelation below which errors are taken as uncorrelated."""
 
 
 class GpsSettings(Settings):
@@ -85,7 +85,7 @@ class Fixes:
     settings: GpsSettings
     warnings: list[str]
     alike: float = 1.0
-    """Fixes that tell as much as one: the covariance is multiplied by it, since errors of satellites wander."""
+    """Correlated fixes with the information of one, by which the covariance is multiplied: GPS errors wander."""
     innovation: float = 1.0
     """Variance of an error that the error of the fix before it does not predict, as a share."""
 
@@ -275,7 +275,7 @@ def with_noise_of(fixes: Fixes, inlier: Floats, poses: Floats, checks: float) ->
     """The fixes with the covariance that residuals at the least squares `poses` imply, their inliers (F,), its factor.
 
     `checks` are the degrees of freedom with which odometry and closures check the inliers (positions_redundancy).
-    Errors of satellites wander: fixes whose errors are alike count for so much less, by the sum of the autocorrelation
+    GPS errors are correlated in time: fixes with correlated errors count for less, by the sum of the autocorrelation
     of their residuals as far as it is positive (Geyer, Practical Markov Chain Monte Carlo, 1992).
     """
     world = world_from_enu(poses, fixes, np.maximum(inlier, 1e-9))
@@ -335,7 +335,7 @@ def cost_of_fixes(factors: Factors, weight: Floats, poses: Floats, fixes: Fixes)
         return most * len(fixes)
     alone, count, alike = Objective(factors, weight), float(inlier.sum()), fixes.alike
     cost = together.cost(se3.between(fit[:1], fit)) - alone.cost(poses) + most * float((1.0 - inlier).sum())
-    # of noise that wanders, a fix tells what the one before it does not
+    # of correlated noise, a fix adds the innovation over the one before it
     innovation = _times_noisier(fixes, known) / alike * fixes.innovation
     cost += 1.5 * count * (math.log(innovation) + 1.0 - 1.0 / alike)
     return cost + 0.5 * (together.information(fit).log_determinant() - _log_determinant(alone, poses))

@@ -32,7 +32,7 @@ _ACCEL_WALK, _GYRO_WALK = 0.003, 0.0002
 _ACCEL_BIAS, _GYRO_BIAS = 0.2, 0.02
 """Sigmas of the biases at the start: m/s^2 of a MEMS that no one calibrated; rad/s about what the images say."""
 _ACROSS = 1.0
-"""That across a break, and of the first unit in m (times three)."""
+"""Sigma of the log of the scale across a break; that of the first state is three times it."""
 _HUBER = 2.0
 """Sigmas beyond which a motion counts linearly."""
 _DISAGREES = 3.0
@@ -258,7 +258,8 @@ def solved(states: States, metric: bool) -> Solved | None:
     broken = [_relative(covariance, found, k) for k in np.flatnonzero(states.broken).tolist()]
     poses = np.stack([found.atPose3(X(k)).matrix() for k in range(count)])
     scale = np.array([found.atVector(S(k))[0] for k in range(count)])
-    factor = max(1.0, 2.0 * graph.error(found) / max(_dimensions(graph) - 16 * count, 1)) ** 0.5
+    redundancy = sum(graph.at(k).dim() for k in range(graph.size())) - 16 * count
+    factor = max(1.0, 2.0 * graph.error(found) / max(redundancy, 1)) ** 0.5
     if factor > _DISAGREES and converged:
         return None
     sigma = sigma * factor if converged or metric else np.inf
@@ -295,10 +296,6 @@ def _in_world(pose: Floats, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Ba
     turned = np.zeros((6, 6))
     turned[:3, :3] = turned[3:, 3:] = pose[:3, :3].T
     return gtsam.noiseModel.Gaussian.Covariance(turned @ np.diag(noise.sigmas() ** 2) @ turned.T)
-
-
-def _dimensions(graph: gtsam.NonlinearFactorGraph) -> int:
-    return sum(graph.at(k).dim() for k in range(graph.size()))
 
 
 class _Covariance:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 _LOST_RAD = np.pi / 3.0
-"""Noise of the heading, rad, beyond which the chain's whole circles may be wrong: half a circle is three sigmas."""
+"""Sigma of the heading, rad, beyond which the chain's whole turns may be wrong: half a turn is three sigmas."""
 _HELD = 1e6
 """Information of the first pose's prior, as a multiple of the largest of any edge."""
 
@@ -44,43 +44,43 @@ def _chordal(factors: Factors, weight: Floats) -> Floats:
     """Chordal relaxation of the rotations, then positions as a linear problem: Carlone et al., ICRA 2015, III-B."""
     graph = factors.graph
     n, held = len(graph.world_from_body), np.eye(3)
-    firmness = weight * np.trace(graph.information[:, :3, :3], axis1=1, axis2=2) / 3.0
+    precision = weight * np.trace(graph.information[:, :3, :3], axis1=1, axis2=2) / 3.0
     # each row r of a rotation by itself: r_b = r_a a_from_b
-    diagonal = _ends(graph, firmness)[:, None, None] * np.eye(3)
-    diagonal[0] += firmness.max() * _HELD * held
+    diagonal = _degree(graph, precision)[:, None, None] * np.eye(3)
+    diagonal[0] += precision.max() * _HELD * held
     right = np.zeros((n, 3, 3))
-    right[0] = firmness.max() * _HELD * held
-    between = -firmness[:, None, None] * graph.a_from_b[:, :3, :3]
+    right[0] = precision.max() * _HELD * held
+    between = -precision[:, None, None] * graph.a_from_b[:, :3, :3]
     matrix = Blocks(diagonal, graph.a, graph.b, between)
     columns = Cholesky.of(factors.elimination(weight > 0), matrix).solve(right)
     left, _, turned = np.linalg.svd(np.swapaxes(columns, 1, 2))
     left[:, :, 2] *= np.linalg.det(left @ turned)[:, None]  # the nearest rotations
     rotation = left @ turned
-    firmness = weight * np.trace(graph.information[:, 3:, 3:], axis1=1, axis2=2) / 3.0
+    precision = weight * np.trace(graph.information[:, 3:, 3:], axis1=1, axis2=2) / 3.0
     shift = (rotation[graph.a] @ graph.a_from_b[:, :3, 3:])[:, :, 0]
-    return se3.pose(rotation, _potentials(factors, weight, firmness, shift))
+    return se3.pose(rotation, _solve_laplacian(factors, weight, precision, shift))
 
 
-def _potentials(factors: Factors, weight: Floats, firmness: Floats, difference: Floats) -> Floats:
+def _solve_laplacian(factors: Factors, weight: Floats, precision: Floats, difference: Floats) -> Floats:
     """Values (N, k) whose differences along the edges are nearest to `difference` (E, k), weighted; the first is 0.
 
-    The Laplacian of the graph with `firmness` (E,) as weights of the edges.
+    The Laplacian of the graph with `precision` (E,) as weights of the edges.
     """
     graph = factors.graph
-    diagonal = _ends(graph, firmness)
-    diagonal[0] += firmness.max() * _HELD
+    diagonal = _degree(graph, precision)
+    diagonal[0] += precision.max() * _HELD
     right = np.zeros((len(diagonal), difference.shape[1]))
-    np.add.at(right, graph.b, firmness[:, None] * difference)
-    np.subtract.at(right, graph.a, firmness[:, None] * difference)
+    np.add.at(right, graph.b, precision[:, None] * difference)
+    np.subtract.at(right, graph.a, precision[:, None] * difference)
     right[0] = 0.0
-    matrix = Blocks(diagonal[:, None, None], graph.a, graph.b, -firmness[:, None, None])
+    matrix = Blocks(diagonal[:, None, None], graph.a, graph.b, -precision[:, None, None])
     return Cholesky.of(factors.elimination(weight > 0), matrix).solve(right[:, None, :])[:, 0]
 
 
-def _ends(graph: PoseGraph, firmness: Floats) -> Floats:
-    """(N,) sum of the firmness of the edges at each pose."""
+def _degree(graph: PoseGraph, precision: Floats) -> Floats:
+    """(N,) weighted degree: the sum of the precision of the edges at each pose."""
     n = len(graph.world_from_body)
-    return np.asarray(np.bincount(graph.a, firmness, n) + np.bincount(graph.b, firmness, n), np.float64)
+    return np.asarray(np.bincount(graph.a, precision, n) + np.bincount(graph.b, precision, n), np.float64)
 
 
 def _lago(factors: Factors, weight: Floats, chain: Floats) -> Floats:
@@ -95,19 +95,19 @@ def _lago(factors: Factors, weight: Floats, chain: Floats) -> Floats:
     turn = np.arctan2(graph.a_from_b[:, 1, 0], graph.a_from_b[:, 0, 0])
     yaw = np.unwrap(np.arctan2(chain[:, 1, 0], chain[:, 0, 0]))
     if (1.0 / graph.information[graph.odometry, 2, 2]).sum() > _LOST_RAD**2:
-        yaw = _turned_least(graph, weight, turn, yaw)
+        yaw = _least_noise_headings(graph, weight, turn, yaw)
     turn = turn + 2.0 * np.pi * np.round((yaw[graph.b] - yaw[graph.a] - turn) / (2.0 * np.pi))
-    yaw = yaw[0] + _potentials(factors, weight, weight * graph.information[:, 2, 2], turn[:, None])[:, 0]
+    yaw = yaw[0] + _solve_laplacian(factors, weight, weight * graph.information[:, 2, 2], turn[:, None])[:, 0]
     zero = np.zeros(len(yaw))
     poses = se3.pose(se3.so3_exp(np.stack([zero, zero, yaw], axis=1)), chain[:, :3, 3])
     shift = (poses[graph.a, :2, :2] @ graph.a_from_b[:, :2, 3:])[:, :, 0]
-    firmness = np.trace(graph.information[:, 3:5, 3:5], axis1=1, axis2=2) / 2.0
-    poses[:, :2, 3] = _potentials(factors, weight, weight * firmness, shift)
+    precision = np.trace(graph.information[:, 3:5, 3:5], axis1=1, axis2=2) / 2.0
+    poses[:, :2, 3] = _solve_laplacian(factors, weight, weight * precision, shift)
     return poses
 
 
-def _turned_least(graph: PoseGraph, weight: Floats, turn: Floats, yaw: Floats) -> Floats:
-    """Headings (N,) rad along the tree of edges over which each has gathered least noise (Dijkstra 1959)."""
+def _least_noise_headings(graph: PoseGraph, weight: Floats, turn: Floats, yaw: Floats) -> Floats:
+    """Headings (N,) rad along the shortest-path tree by accumulated variance (Dijkstra 1959)."""
     n = len(yaw)
     used = np.flatnonzero(weight > 0)
     ends = np.concatenate([graph.a[used], graph.b[used]])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from pydantic import Field
@@ -186,11 +187,8 @@ def as_one(
     start_of = dict(zip(members, starts, strict=True))
     own = [drives[member].graph for member in members]
     placed = placed or _placed(drives, members, between)
-    first = sum(len(graph.a) for graph in own)
-    rows = []
-    for one in between:
-        rows.append(slice(first, first + len(one.query)))
-        first += len(one.query)
+    ends = np.cumsum([sum(len(graph.a) for graph in own), *(len(one.query) for one in between)])
+    rows = [slice(*pair) for pair in pairwise(ends.tolist())]
     graph = PoseGraph(
         world_from_body=np.concatenate(
             [placed[member] @ g.world_from_body for member, g in zip(members, own, strict=True)]

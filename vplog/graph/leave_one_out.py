@@ -15,7 +15,7 @@ import numpy as np
 from vplog.data import Floats, Int32s, Ints, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed, parts
-from vplog.graph.consistency import OdometryChain
+from vplog.graph.consistency import OdometryChain, residual_twists
 from vplog.graph.least_squares import Objective
 from vplog.graph.marginals import edge_covariances, joint_covariance
 from vplog.graph.sparse.cholesky import Cholesky
@@ -23,17 +23,17 @@ from vplog.graph.sparse.cholesky import Cholesky
 if TYPE_CHECKING:
     from vplog.graph.factors import Factors
 
-_ALONE = 1e-9
+_LEAST_REDUNDANCY = 1e-9
 """Least redundancy of a closure, so that no quotient is infinite."""
 _NEAREST = 4
-"""Places tried as a way round; the nearest in rows may not be the nearest in noise."""
-_BESIDE = 64
-"""Places on either side in order of rows among which the nearest are looked for."""
+"""Groups tried as the other half of a loop; the nearest in rows may not be the nearest in noise."""
+_WINDOW = 64
+"""Groups on either side in order of rows among which the nearest are searched."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tension:
-    """Closures in a solved graph."""
+    """Leave-one-out statistics of K closures in a solved graph."""
 
     cost: Floats
     """(K,) by how much chi-square falls without the closure, to first order."""
@@ -44,13 +44,13 @@ class Tension:
     covariance: Floats
     """(K, d, d) of the motion between the ends, the closure itself included, in the frame of b."""
     force: Floats
-    """(K, d) information times residual: how hard the closure pulls at b."""
+    """(K, d) information times residual: to first order the gradient of half the closure's chi-square by b."""
     log_spread: Floats
     """(K,) half the log determinant of the covariance of the rest's prediction and the closure's noise together."""
 
 
 def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Tension:
-    """The tension of closures `loops` (K,) of positive weight at the least squares solution `poses`.
+    """Leave-one-out statistics of closures `loops` (K,) of positive weight at the least squares solution `poses`.
 
     Raises GraphError where the poses are not determined.
     """
@@ -62,7 +62,7 @@ def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Ten
     root = np.swapaxes(np.linalg.cholesky(information), 1, 2)
     # leverage: 1 where nothing else constrains the ends of the closure
     leverage, turn = np.linalg.eigh(root @ covariance @ np.swapaxes(root, 1, 2))
-    rest = np.clip(1.0 - leverage, _ALONE, 1.0)
+    rest = np.clip(1.0 - leverage, _LEAST_REDUNDANCY, 1.0)
     whitened = (np.swapaxes(turn, 1, 2) @ (root @ error[:, axes, None]))[:, :, 0]
     return Tension(
         cost=(whitened**2 / rest).sum(1),
@@ -85,7 +85,7 @@ def cost_together(factors: Factors, weight: Floats, poses: Floats, tree: Cholesk
         whiten[row * size : (row + 1) * size, row * size : (row + 1) * size] = matrix
     leverage, turn = np.linalg.eigh(whiten @ joint_covariance(factors, tree, poses, loops) @ whiten.T)
     whitened = turn.T @ (root @ error[:, AXES[factors.graph.dimension], None]).ravel()
-    return float((whitened**2 / np.clip(1.0 - leverage, _ALONE, 1.0)).sum())
+    return float((whitened**2 / np.clip(1.0 - leverage, _LEAST_REDUNDANCY, 1.0)).sum())
 
 
 def distance(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> tuple[Floats, Floats]:
@@ -107,8 +107,7 @@ def _errors(graph: PoseGraph, poses: Floats, loops: Ints) -> tuple[Floats, Float
 
     The inverse of the right Jacobian of the exponential, by its series (Barfoot 2017, eq. 7.77, with the other sign).
     """
-    measured = se3.between(poses[graph.a[loops]], poses[graph.b[loops]])
-    error = se3.log(se3.between(graph.a_from_b[loops], measured))
+    error = residual_twists(graph, poses, loops)
     ad = np.zeros((len(loops), 6, 6))
     ad[:, :3, :3] = ad[:, 3:, 3:] = se3.skew(error[:, :3])
     ad[:, 3:, :3] = se3.skew(error[:, 3:])
@@ -118,13 +117,12 @@ def _errors(graph: PoseGraph, poses: Floats, loops: Ints) -> tuple[Floats, Float
     return error, jacobian[:, axes][:, :, axes]
 
 
-def groups(graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) -> list[Ints]:
-    """Places among `loops` (K,) of which the closures support each other, as positions within `loops`.
+def groups(graph: PoseGraph, loops: Ints, chain: OdometryChain) -> list[Ints]:
+    """Groups of neighbouring closures among `loops` (K,), which support each other, as positions within `loops`.
 
-    Two closures are of one place where the odometry between their ends adds less noise than they have themselves, and
-    so on from neighbour to neighbour. `chain` is the graph's where it is at hand.
+    Two closures are of one group where the odometry between their ends adds less noise than they have themselves, and
+    so on from neighbour to neighbour. `chain` is the graph's.
     """
-    chain = chain or OdometryChain.of(graph)
     own: Floats = np.asarray(
         np.median(np.diagonal(np.linalg.inv(informed(graph, loops)), axis1=1, axis2=2), axis=0), np.float64
     )
@@ -149,23 +147,22 @@ def group_costs(
     poses: Floats,
     loops: Ints,
     single: Tension,
-    places: list[Ints],
-    chain: OdometryChain | None = None,
+    members_of: list[Ints],
+    chain: OdometryChain,
 ) -> Floats:
-    """Approximate upper bound (G,) of how much chi-square falls without each place.
+    """Approximate upper bound (G,) of how much chi-square falls without each group.
 
-    The members act as one at their middle one, against the better of two estimates of the rest: the way round by
-    another place or by the odometry, and the graph's information on the middle one less theirs. What the members cost
-    each other is added.
+    The members act as one at their middle one, against the better of two estimates of the rest: the loop by another
+    group or by the odometry, and the graph's information on the middle one less theirs. What the members cost each
+    other is added. `chain` is the graph's.
     """
     axes = AXES[graph.dimension]
-    chain = chain or OdometryChain.of(graph)
     information = informed(graph)
-    middle = np.array([loops[place[len(place) // 2]] for place in places])
-    member = np.concatenate(places)
-    size = np.array([len(place) for place in places])
-    whose = np.repeat(np.arange(len(places)), size)
-    at_middle = se3.adjoint(se3.between(poses[graph.b[loops[member]]], poses[graph.b[middle[whose]]]))
+    at = np.array([members[len(members) // 2] for members in members_of])
+    middle, member = loops[at], np.concatenate(members_of)
+    size = np.array([len(members) for members in members_of])
+    group = np.repeat(np.arange(len(members_of)), size)
+    at_middle = se3.adjoint(se3.between(poses[graph.b[loops[member]]], poses[graph.b[middle[group]]]))
     at_middle = at_middle[:, axes][:, :, axes]
     back = np.swapaxes(at_middle, 1, 2)
     first = np.cumsum(size) - size
@@ -174,27 +171,26 @@ def group_costs(
     own = np.linalg.inv(together)
 
     a, b = graph.a[middle], graph.b[middle]
-    least = _quadratic(force, own + chain.covariance(a, b))
-    least = np.where(chain.part[a] == chain.part[b], least, np.inf)
-    for near in _nearest(a, b, min(_NEAREST, len(places) - 1)):
+    by_loop = _quadratic(force, own + chain.covariance(a, b))
+    by_loop = np.where(chain.part[a] == chain.part[b], by_loop, np.inf)
+    for near in _nearest(a, b, min(_NEAREST, len(members_of) - 1)):
         moved = se3.adjoint(se3.between(poses[b], poses[b[near]]))[:, axes][:, :, axes]
-        round_ = moved @ np.linalg.inv(information[middle[near]]) @ np.swapaxes(moved, 1, 2)
+        covariance = moved @ np.linalg.inv(information[middle[near]]) @ np.swapaxes(moved, 1, 2)
         for here, there in ((b, b[near]), (a, a[near])):
-            round_ = round_ + _leg(chain, poses, b, here, there)
+            covariance = covariance + _leg(chain, poses, b, here, there)
         joined = (chain.part[a] == chain.part[a[near]]) & (chain.part[b] == chain.part[b[near]])
-        least = np.where(joined, np.minimum(least, _quadratic(force, own + round_)), least)
-    at = np.array([place[len(place) // 2] for place in places])
+        by_loop = np.where(joined, np.minimum(by_loop, _quadratic(force, own + covariance)), by_loop)
     legs = np.linalg.inv(information[loops[member]])
-    for here, there in ((graph.b[loops[member]], b[whose]), (graph.a[loops[member]], a[whose])):
+    for here, there in ((graph.b[loops[member]], b[group]), (graph.a[loops[member]], a[group])):
         legs = legs + _leg(chain, poses, graph.b[loops[member]], here, there)
     soft = np.add.reduceat(back @ np.linalg.inv(legs) @ at_middle, first, axis=0)
     root = np.swapaxes(np.linalg.cholesky(soft), 1, 2)
     leverage, turn = np.linalg.eigh(root @ single.covariance[at] @ np.swapaxes(root, 1, 2))
     whitened = (np.swapaxes(turn, 1, 2) @ np.linalg.solve(np.swapaxes(root, 1, 2), force[:, :, None]))[:, :, 0]
-    left = (whitened**2 / np.maximum(1.0 - leverage, _ALONE)).sum(1)
+    by_graph = (whitened**2 / np.maximum(1.0 - leverage, _LEAST_REDUNDANCY)).sum(1)
     alone = _quadratic(single.force[member], np.asarray(np.linalg.inv(information[loops[member]]), np.float64))
     among = np.add.reduceat(alone, first) - _quadratic(force, own)
-    return np.minimum(least, left) + np.maximum(among, 0.0)
+    return np.minimum(by_loop, by_graph) + np.maximum(among, 0.0)
 
 
 def _leg(chain: OdometryChain, poses: Floats, end: Int32s, here: Int32s, there: Int32s) -> Floats:
@@ -211,8 +207,8 @@ def _quadratic(force: Floats, covariance: Floats) -> Floats:
 def _nearest(a: Int32s, b: Int32s, count: int) -> list[Ints]:
     """For each of G pairs of rows, near pairs of rows: `count` arrays (G,), of those next in order of a."""
     order = np.lexsort((b, a))
-    beside = np.concatenate([np.arange(-_BESIDE, 0), np.arange(1, _BESIDE + 1)])
-    other = np.arange(len(a))[:, None] + beside
+    window = np.concatenate([np.arange(-_WINDOW, 0), np.arange(1, _WINDOW + 1)])
+    other = np.arange(len(a))[:, None] + window
     inside = (other >= 0) & (other < len(a))
     other = order[np.clip(other, 0, len(a) - 1)]
     rows = np.abs(a[other].astype(np.int64) - a[order, None]) + np.abs(b[other].astype(np.int64) - b[order, None])

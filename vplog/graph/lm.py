@@ -58,4 +58,5 @@ def as_solution(graph: PoseGraph, weight: Floats, fit: Fit, found: str) -> Solut
 
 
 def half_chi2(graph: PoseGraph, weight: Floats, poses: Floats) -> float:
+    """Half the weighted chi-square of all edges at poses (N, 4, 4)."""
     return float(0.5 * (weight * residual_sigma(graph, poses) ** 2).sum())

@@ -103,7 +103,7 @@ def covariance_without_breaks(
             f"({len(stamps)} samples, {stamps[0] if len(stamps) else 0}..{stamps[-1] if len(stamps) else 0} ns)."
         )
     if not odometry.drifts and odometry.covariance is not None:
-        return _sum(odometry, keys, odometry.covariance), [], "fixes"
+        return _summed_increments(odometry, keys, odometry.covariance), [], "fixes"
     modelled = _drift_model(odometry, keys, settings)
     if settings.source == "model" or odometry.covariance is None:
         unknown = [_unknown("The odometry has no covariance", settings)]
@@ -127,8 +127,8 @@ def covariance_without_breaks(
     # an unknown axis must not leak into known ones through the adjoint: the model fills it in at the end
     logged = np.where((known[:, None] & known) & usable[:, None, None], logged, 0.0)
     logged = (logged + np.swapaxes(logged, 1, 2)) / 2
-    source = "accumulated" if _grows(variance, known) else "increments"
-    difference = _difference if source == "accumulated" else _sum
+    source = "accumulated" if _is_accumulated(variance, known) else "increments"
+    difference = _accumulated_growth if source == "accumulated" else _summed_increments
     covariance = difference(odometry, keys, logged)
     for axis in np.flatnonzero(~known):
         covariance[:, axis, :], covariance[:, :, axis] = 0.0, 0.0
@@ -151,7 +151,7 @@ def covariance_without_breaks(
     most = np.inf
     if (np.ptp(variance, axis=0) <= 1e-9 * variance.max(0)).all():
         most = settings.worst_share
-    within, share = _within(covariance, modelled, settings.best_share, most)
+    within, share = _bounded(covariance, modelled, settings.best_share, most)
     # judged by the surest and the least sure direction of an edge: a sound heading must not hide a vain position
     least, largest = np.median(share[:, 0]), np.median(share[:, -1])
     if least < settings.best_share / 2.0:  # what is raised by less than that was as good as believed
@@ -196,7 +196,7 @@ def _travelled(stamps: Ints, step: Floats, keys: Ints) -> Floats:
     return np.diff(np.interp(keys - stamps[0], since_start, np.concatenate([[0.0], np.cumsum(step)])))
 
 
-def _grows(variance: Floats, known: Bools) -> bool:
+def _is_accumulated(variance: Floats, known: Bools) -> bool:
     """Whether the trace of the rotations or that of the translations of (S, 6) variances grows over the drive, allowing
     a hiccup per hundred samples. With the lever arm of the heading the translations of a drive that comes back shrink.
     """
@@ -209,7 +209,7 @@ def _grows(variance: Floats, known: Bools) -> bool:
     return False
 
 
-def _sum(odometry: Odometry, keys: Ints, logged: Floats) -> Floats:
+def _summed_increments(odometry: Odometry, keys: Ints, logged: Floats) -> Floats:
     """Rule 3: noise of the increments summed, (N-1, 6, 6)."""
     stamps = odometry.stamp_ns
     inside = stamps[(stamps > keys[0]) & (stamps < keys[-1])]
@@ -230,7 +230,7 @@ def _sum(odometry: Odometry, keys: Ints, logged: Floats) -> Floats:
     return result
 
 
-def _difference(odometry: Odometry, keys: Ints, logged: Floats) -> Floats:
+def _accumulated_growth(odometry: Odometry, keys: Ints, logged: Floats) -> Floats:
     """Rule 2: growth of the accumulated covariance, (N-1, 6, 6)."""
     stamps = odometry.stamp_ns
     right = np.clip(np.searchsorted(stamps, keys), 1, len(stamps) - 1)
@@ -246,7 +246,7 @@ def _difference(odometry: Odometry, keys: Ints, logged: Floats) -> Floats:
     return np.where((least >= -1e-6 * most)[:, None, None], exact, plain)
 
 
-def _within(covariance: Floats, modelled: Floats, least: float, most: float) -> tuple[Floats, Floats]:
+def _bounded(covariance: Floats, modelled: Floats, least: float, most: float) -> tuple[Floats, Floats]:
     """Symmetric, with every direction between these shares of the diagonal `modelled`, in sigma; and the shares
     (N-1, 6) that were there, increasing."""
     sigma = np.sqrt(np.diagonal(modelled, axis1=1, axis2=2))

@@ -19,7 +19,7 @@ Terms = Callable[[Ints, int, int, "_Edges", Floats, "_Sums"], None]
 _LEAST_SHARE = 4096
 """Poses or edges that a thread takes at least, some milliseconds."""
 _BY_THREAD = 4
-"""Shares for each thread, so that none waits long for another that was held up."""
+"""Shares for each thread, so that a slow one delays the others little."""
 
 
 class _Edges(NamedTuple):
@@ -58,12 +58,14 @@ def normal_equations(graph: PoseGraph, weight: Floats, poses: Floats) -> tuple[B
     n, edges = len(poses), len(graph.a)
     sums = _Sums(np.zeros(edges), np.zeros((n, size, size)), np.zeros((edges, size, size)), np.zeros((n, size)))
     terms, given = _terms(graph, weight)
+
+    def add(low: int, high: int) -> None:
+        """The edges with an end among poses low:high, in their order; an edge between two ranges is in both."""
+        ends = ((low <= one) & (one < high) for one in (graph.a, graph.b))
+        terms(np.flatnonzero(np.logical_or(*ends)), low, high, given, poses, sums)
+
     with Workers() as workers:
-        # each thread adds to its own poses alone, edge by edge in their order; an edge between two threads' is for both
-        ranges = workers.ranges(0, n, _LEAST_SHARE, _BY_THREAD)
-        begin, listed = _by_range(np.array([low for low, _ in ranges] + [n]), graph.a, graph.b)
-        parts = zip(begin[:-1], begin[1:], ranges, strict=True)
-        workers.each(terms, [(listed[first:last], *part, given, poses, sums) for first, last, part in parts])
+        workers.each(add, workers.ranges(0, n, _LEAST_SHARE, _BY_THREAD))
     return Blocks(sums.diagonal, graph.a, graph.b, sums.other), sums.gradient, float(sums.cost.sum())
 
 
@@ -85,33 +87,6 @@ def _terms(graph: PoseGraph, weight: Floats) -> tuple[Terms, _Edges]:
     information = graph.information[:, 2:5, 2:5] if planar else graph.information  # yaw, x, y
     given = (np.ascontiguousarray(one, np.float64) for one in (graph.a_from_b, information, weight))
     return _planar if planar else _spatial, _Edges(graph.a, graph.b, *given)
-
-
-@numba.njit(cache=True, nogil=True)
-def _by_range(ends: Ints, a: Int32s, b: Int32s) -> tuple[Ints, Ints]:
-    """The edges that have an end in each of R ranges of poses, ends[r] to ends[r + 1], in their order.
-
-    Where each range begins (R + 1,), and edges.
-    """
-    of = np.empty(ends[-1], np.int64)
-    for part in range(len(ends) - 1):
-        of[ends[part] : ends[part + 1]] = part
-    begin = np.zeros(len(ends) + 1, np.int64)
-    for edge in range(len(a)):
-        begin[of[a[edge]] + 2] += 1
-        if of[a[edge]] != of[b[edge]]:
-            begin[of[b[edge]] + 2] += 1
-    for part in range(len(ends)):
-        begin[part + 1] += begin[part]
-    listed = np.empty(begin[-1], np.int64)
-    for edge in range(len(a)):
-        one, two = of[a[edge]], of[b[edge]]
-        listed[begin[one + 1]] = edge
-        begin[one + 1] += 1
-        if one != two:
-            listed[begin[two + 1]] = edge
-            begin[two + 1] += 1
-    return begin[:-1].copy(), listed
 
 
 @numba.njit(cache=True, nogil=True)

@@ -7,9 +7,8 @@ import math
 import numpy as np
 
 from vplog.data import Bools, Floats, Ints, PoseGraph
-from vplog.geometry import se3
 from vplog.graph.build import AXES, informed
-from vplog.graph.consistency import OdometryChain
+from vplog.graph.consistency import OdometryChain, residual_twists
 from vplog.graph.evidence import log_room, runs
 from vplog.graph.variance_components import Sigmas, claimed_times
 
@@ -22,16 +21,15 @@ _MOST = 3
 """Modes that are worth a solve."""
 
 
-def modes(graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) -> list[tuple[Sigmas, Bools]]:
+def modes(graph: PoseGraph, loops: Ints, chain: OdometryChain) -> list[tuple[Sigmas, Bools]]:
     """Sigmas at which closures `loops` (K,) are likely, most likely ones first, and which of them are true by each.
 
     A true closure is off the odometry by N(0, s^2 C + t^2 R), C what the chain of odometry from a to b adds up to, R
     its own noise; a false one is uniform over the box that the odometry spans and all rotations. The share of true ones
     is found by expectation maximisation (Lee, Fraundorfer and Pollefeys, IROS 2013) for each s and t; neighbouring
     closures, which share the drift, count by the root of their number. Closures are true where odometry does not lead
-    from one end to the other. `chain` is the graph's where it is at hand.
+    from one end to the other. `chain` is the graph's.
     """
-    chain = chain or OdometryChain.of(graph)
     known = chain.part[graph.a[loops]] == chain.part[graph.b[loops]]
     if not known.any():
         return [(Sigmas(), np.ones(len(loops), bool))]
@@ -54,16 +52,13 @@ def modes(graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) -> 
     return found
 
 
-def agreement(graph: PoseGraph, loops: Ints, chain: OdometryChain | None = None) -> Bools:
-    """(K,) bool: closures that are true by the most likely sigmas."""
-    return modes(graph, loops, chain)[0][1]
-
-
 class _Mixture:
+    """Mixture of true and false closures, whitened, as a function of the sigmas."""
+
     def __init__(self, graph: PoseGraph, loops: Ints, chain: OdometryChain) -> None:
         axes = AXES[graph.dimension]
         a, b = graph.a[loops], graph.b[loops]
-        error = se3.log(se3.between(graph.a_from_b[loops], se3.between(chain.poses[a], chain.poses[b])))[:, axes]
+        error = residual_twists(graph, chain.poses, loops)[:, axes]
         # with both covariances diagonal, a scale costs one division: whiten by the closure's, turn to the chain's axes
         root = np.swapaxes(np.linalg.cholesky(informed(graph, loops)), 1, 2)
         spread, turn = np.linalg.eigh(root @ chain.covariance(a, b) @ np.swapaxes(root, 1, 2))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from vplog.graph.factors import Factors
 
 _WORST_SHARE = 0.5
-"""Closures that cost at least this share of the worst one's cost are rejected with it; others may suffer from it."""
+"""Closures that cost at least this share of the worst one are rejected with it; it may be swamping the others."""
 _MOST_SUSPECTS = 50
 """Groups that a round looks at, the most suspect first: some seconds on 10 000 poses; public graphs have up to 20."""
 _MOST_JOINT = 100
@@ -80,7 +80,7 @@ class OutlierTest:
                 out = accepted[(cost > limit) & (cost >= _WORST_SHARE * cost[cost > limit].max())]
                 state = self.solve(_with_weight(state.weight, out, 0.0), state.poses)
                 continue
-            smaller = self.without_a_false_place(state, accepted, single, cleared)
+            smaller = self.without_false_group(state, accepted, single, cleared)
             if smaller is not None:
                 state = smaller
                 continue
@@ -92,22 +92,20 @@ class OutlierTest:
             state = self.solve(_with_weight(state.weight, back, 1.0), state.poses)
         return state
 
-    def without_a_false_place(self, state: State, accepted: Ints, single: Tension, cleared: set[bytes]) -> State | None:
+    def without_false_group(self, state: State, accepted: Ints, single: Tension, cleared: set[bytes]) -> State | None:
         """The state without the first group of neighbouring closures that costs the rest too much, or None.
 
         Groups of high first-order cost are tested jointly, then by solving without them; those that pass are `cleared`.
         """
         factors = self.factors
-        places = groups(factors.graph, accepted, self.chain)
-        suspicion = np.minimum(
-            group_costs(factors.graph, state.poses, accepted, single, places, self.chain), state.chi2
-        )
-        size = np.array([len(place) for place in places])
-        spread = np.array([single.log_spread[place].max() for place in places])
+        found = groups(factors.graph, accepted, self.chain)
+        cost = group_costs(factors.graph, state.poses, accepted, single, found, self.chain)
+        size = np.array([len(members) for members in found])
+        spread = np.array([single.log_spread[members].max() for members in found])
         limit = np.array([self.limit_of_group(*one) for one in zip(size.tolist(), spread.tolist(), strict=True)])
-        ratio = np.where(size > 1, suspicion / limit, 0.0)  # groups of one were tested already
+        ratio = np.where(size > 1, np.minimum(cost, state.chi2) / limit, 0.0)  # groups of one were tested already
         worst = [at for at in np.argsort(-ratio, kind="stable").tolist() if ratio[at] > 1.0][:_MOST_SUSPECTS]
-        suspects = [(accepted[places[at]], float(limit[at])) for at in worst]
+        suspects = [(accepted[found[at]], float(limit[at])) for at in worst]
         suspects = [(members, most) for members, most in suspects if members.tobytes() not in cleared]
         if not suspects:
             return None

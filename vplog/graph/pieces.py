@@ -8,6 +8,7 @@ import numpy as np
 
 from vplog.data import Floats, Ints, PoseGraph
 from vplog.geometry import se3
+from vplog.graph.build import subgraph
 from vplog.graph.consistency import is_loop
 from vplog.graph.joint import JoinSettings, spaced_apart
 from vplog.graph.pcm import PcmSettings
@@ -33,7 +34,8 @@ def pieces_placed(graph: PoseGraph, broken: Ints) -> PoseGraph:
 def _placed(graph: PoseGraph, edge: int, loops: Ints) -> PoseGraph:
     """All poses behind an odometry edge moved as these loops across it have it."""
     poses = graph.world_from_body.copy()
-    members, _ = PcmSettings().consistent(_without(graph, edge), loops - 1)
+    others = np.flatnonzero(np.arange(len(graph.a)) != edge)
+    members, _ = PcmSettings().consistent(subgraph(graph, np.arange(len(poses)), others), loops - 1)
     chosen = members + 1
     rule = JoinSettings()
     if (
@@ -50,14 +52,6 @@ def _placed(graph: PoseGraph, edge: int, loops: Ints) -> PoseGraph:
     information = graph.information.copy()
     information[edge] = np.diag((_TIMES * spread) ** -2.0)
     return replace(graph, world_from_body=poses, a_from_b=a_from_b, information=information)
-
-
-def _without(graph: PoseGraph, edge: int) -> PoseGraph:
-    """The graph without an edge."""
-    rest = np.flatnonzero(np.arange(len(graph.a)) != edge)
-    kind = [graph.kind[row] for row in rest.tolist()]
-    arrays = {name: getattr(graph, name)[rest] for name in ("a", "b", "a_from_b", "information")}
-    return replace(graph, kind=kind, **arrays)
 
 
 def _mean(poses: Floats) -> tuple[Floats, Floats]:

@@ -13,6 +13,7 @@ from vplog.graph.evidence import runs
 from vplog.graph.factors import Factors
 from vplog.graph.gps_factors import Fixes, inlier_fixes, with_fixes, with_noise_of, world_from_enu
 from vplog.graph.least_squares import Objective, minimised
+from vplog.graph.lm import half_chi2
 from vplog.graph.marginals import SharedScale, positions_redundancy
 from vplog.graph.variance_components import Sigmas, claimed_times, estimate, extrapolated
 from vplog.settings import Settings
@@ -95,7 +96,7 @@ class _Measurements:
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """A solution with what it says of the sensors."""
+    """A solution with the noise and the scale of the sensors that it implies."""
 
     graph: PoseGraph
     """The graph as solved: metres of the odometry multiplied by `scale`, its covariance by the squares of `sigmas`."""
@@ -111,7 +112,7 @@ class Refined:
     world_from_enu: Floats | None
     """(4, 4) from the plane of the first fix, None without GPS."""
     unknown: list[SharedScale] = field(default_factory=list)
-    """Errors that are left in the metres of the odometry, and of the closures that have their own."""
+    """Remaining scale errors of the odometry, and of the closures whose metres are their own."""
 
 
 def about_odometry(refined: Refined) -> dict[str, float]:
@@ -133,7 +134,7 @@ def refine(
     sigmas: Sigmas = _AS_CLAIMED,
     scale: float = 1.0,
 ) -> Refined:
-    """Solve again with what the constraints kept say of the sensors, and with GPS where there is any.
+    """Solve again with the noise and the scale of the sensors as the inliers imply them, and with GPS if there is any.
 
     `of_odometry` (E,) marks edges whose metres are the odometry's: its own, and closures whose scale is taken from it.
     `sigmas` and `scale`, of the odometry, are those of the solution. The weights of edges stay as they are. Raises
@@ -185,7 +186,7 @@ def refine(
             break
         scales = sure
     else:
-        scales = []  # they wander
+        scales = []  # no convergence
     poses = minimised(measured.objective(scales, sigmas, poses), poses, _STEPS, 1e-6).world_from_body
     refined = _refined(rescaled(graph, scales, sigmas), solution, poses, sigmas, scales, fixes, inlier)
     return replace(refined, unknown=_unknown(of_odometry, loops, left, settings))
@@ -262,7 +263,7 @@ def _refined(
     fixes: Fixes | None,
     inlier: Floats,
 ) -> Refined:
-    """The refined solution, its reason saying what was learned."""
+    """The refined solution, with the estimates in its reason."""
     world, sentences = None, []
     if sigmas.translation != 1.0:
         sentences.append(
@@ -277,8 +278,6 @@ def _refined(
     if fixes is not None:
         world = world_from_enu(poses, fixes, np.maximum(inlier, 1e-9))
         sentences.append(f"{int(inlier.sum())} of {len(fixes)} GPS fixes were used.")
-    error = float(0.5 * (solution.weight * residual_sigma(graph, poses) ** 2).sum())
-    refined = replace(
-        solution, world_from_body=poses, error_after=error, reason=" ".join([solution.reason.strip(), *sentences])
-    )
+    error, reason = half_chi2(graph, solution.weight, poses), " ".join([solution.reason.strip(), *sentences])
+    refined = replace(solution, world_from_body=poses, error_after=error, reason=reason)
     return Refined(graph, refined, sigmas, scale.get("odometry", 1.0), fixes, inlier, world)

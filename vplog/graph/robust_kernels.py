@@ -1,4 +1,4 @@
-"""Closures under a robust kernel: the less they fit, the less they pull, but none is thrown out."""
+"""Closures under a robust kernel (M-estimator): weights fall with the residual, and no closure is rejected."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from vplog.data import Bools, Floats, PoseGraph
 from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed
-from vplog.graph.consistency import degrees_of_freedom
+from vplog.graph.consistency import degrees_of_freedom, residual_twists
 from vplog.graph.least_squares import Objective
 from vplog.graph.marginals import edge_covariances
 
@@ -53,7 +53,7 @@ class Sigmas(NamedTuple):
 
     @property
     def of_closures(self) -> float:
-        """That of closures along a mean axis."""
+        """Factor of the closures' sigma along a mean axis."""
         return math.sqrt(self.closure_rotation * self.closure_translation)
 
     def log_prior(self) -> float:
@@ -147,7 +147,7 @@ def _of_parts(objective: Objective, poses: Floats, kinds: list[Bools]) -> list[t
     axes = np.array(AXES[graph.dimension])
     edges = np.flatnonzero(np.logical_or.reduce(kinds))
     claimed = np.linalg.inv(informed(graph, edges))
-    error = se3.log(se3.between(graph.a_from_b[edges], se3.between(poses[graph.a[edges]], poses[graph.b[edges]])))
+    error = residual_twists(graph, poses, edges)
     chi2, trusted = np.zeros((2, len(edges))), np.zeros((2, len(edges)))
     try:
         solved = edge_covariances(objective, poses, edges)

@@ -208,8 +208,8 @@ def _eliminated(points, views, rays, information, observed, whiten, visible):
     by_point, by_view = np.empty((2, 3)), np.empty((2, 6))
     for m in range(M):
         cross[:], own[:] = 0.0, 0.0
-        own[:2, :2] = information[m]  # the keyframe's own observation holds x and y
-        own[2, 2] = 1e-6  # m^2, a sigma of 1000 /m: a whisper, which keeps what no view sees invertible
+        own[:2, :2] = information[m]  # the keyframe's own observation constrains x and y
+        own[2, 2] = 1e-6  # m^2, a sigma of 1000 /m: a weak prior keeps blocks without a view invertible
         add_moved(own_gradient[m], 0, information[m], points[m, :2] - rays[m])
         for v in range(V):
             if not visible[v, m] or not _linearise(points[m], observed[v, m], views[v], error, by_point, by_view):

@@ -34,7 +34,7 @@ _PROGRESS = (
     Verdict.TOO_FEW_INLIERS, Verdict.POOR_SPREAD, Verdict.IMPLAUSIBLE_POSE, Verdict.TOO_FAR, Verdict.INCONSISTENT,
     Verdict.ACCEPTED,
 )  # fmt: skip
-"""Verdicts by how far a picture came."""
+"""Verdicts in the order of the checks: a place that fails a later one explains the picture better."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +232,7 @@ def _refined(query: _Query, fits: Sequence[_Fit], best: _Fit, places: Sequence[K
     refined = query.solve(merged, np.arange(len(chosen)), mine[chosen], start)
     if refined.match_from_query is not None and refined.covariance is not None and refined.inliers >= pose.inliers:
         pose, start, own = refined, refined.match_from_query, refined.covariance
-        used = sum(len(rows) > 0 for _, _, rows in agreeing)  # else other places drew it away
+        used = sum(len(rows) > 0 for _, _, rows in agreeing)  # else the landmarks of other places made it worse
     own = own + motion_covariance(start, query.settings.calibration.least_share)
     return Localization(Verdict.ACCEPTED, most.place, len(most.mine), pose.inliers, used, anchor @ start, own)
 

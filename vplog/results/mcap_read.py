@@ -1,4 +1,4 @@
-"""Reader of what only result.mcap holds: pictures, references, fixes."""
+"""Reader of result.mcap for what no table holds: pictures, references, fixes."""
 
 from __future__ import annotations
 

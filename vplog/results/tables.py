@@ -256,7 +256,7 @@ def write_keyframes(
 
 
 def read_keyframe_covariance(path: Path) -> Floats:
-    """(N, 6, 6) of the keyframes' optimised poses, NaN where not known, as in tables of before."""
+    """(N, 6, 6) of the keyframes' optimised poses, NaN where not known, as in tables of older versions."""
     return _matrices(_read(path, "keyframes", KEYFRAMES), "covariance")
 
 
@@ -479,7 +479,7 @@ def read_pictures(path: Path) -> tuple[Int32s, Int32s]:
     sound = all(one.type == pa.int32() and not one.null_count for one in table.columns)
     rows, *known = (one.to_numpy().astype(np.int64) for one in table.columns) if sound else [np.array([-1])]
     camera = known[0] if known else np.zeros_like(rows)
-    # a new camera begins the keyframes anew, and each camera there has a picture
+    # the keyframes increase within each camera, and each camera has a picture
     steps = np.where(np.diff(camera, prepend=0) == 0, np.diff(rows, prepend=-1), rows + 1)
     if np.any(steps <= 0) or np.any((np.diff(camera, prepend=0) < 0) | (camera < 0)):
         raise ResultError(f"{path} is damaged: its keyframes do not increase. Run `vplog run` again.")

@@ -311,7 +311,7 @@ def described(
 
 
 def _count_losses(log: Log, undecodable: Iterable[tuple[str, int]]) -> None:
-    """Losses that were found when a part was computed are those of this run too; counted twice they count once."""
+    """Add the losses of stored parts to those of this run; a loss in both counts once."""
     account = getattr(log, "account", None)
     if account is not None:
         for topic, at in undecodable:

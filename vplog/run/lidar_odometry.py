@@ -68,7 +68,7 @@ class _Residuals(NamedTuple):
 
 @dataclass(eq=False)
 class _Tracker:
-    """State while the scans pass."""
+    """State of the registration from scan to scan."""
 
     range_m: float
     stamp_ns: list[int] = field(default_factory=list)

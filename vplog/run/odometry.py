@@ -44,7 +44,7 @@ UNIT = (
     "A single camera has no metres: lengths are in a unit of its own, about a tenth of the distance of what is seen, "
     "and its scale wanders."
 )
-"""Said where the scale is unknown."""
+"""Warning where the scale is unknown."""
 _SPEED = 0.05
 """Units a second of a motion that is not known: a keyframe a second, the least spacing."""
 _SHORTEST = 1.0

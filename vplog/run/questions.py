@@ -1,4 +1,4 @@
-"""The questions of a finished run: what a person should look at first, with the rows of the ledger they are about."""
+"""The questions of a finished run to a person, with the rows of the ledger they are about."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def ask_ledger(
 ) -> list[ClosureQuestion]:
     """All questions about a ledger and the graph of its run, with the weight (E,) of its edges, most telling first.
 
-    Asked are closures with a pose, in the solution or not, without a decision in the ledger or in `answers`, by row,
-    which are not in the ledger yet. Satellite fixes are left out of account. Raises ResultError where the two do not
-    belong together, GraphError where the poses are not determined.
+    Questions are about closures with a pose, in the solution or not, without a decision in the ledger or in `answers`,
+    which are by row and not in the ledger yet. GPS fixes are ignored. Raises ResultError where ledger and graph are not
+    of one run, GraphError where the poses are not determined.
     """
     graph, rows, weight = _with_candidates(graph, weight, closures)
     decided = closures.of(Verdict.ACCEPTED_BY_DECISION, Verdict.REJECTED_BY_DECISION)

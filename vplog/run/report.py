@@ -108,7 +108,7 @@ def gather(
 
 
 def _questions(folder: Path, tracks: Tracks, closures: Closures) -> list[ClosureQuestion]:
-    """The first questions; none where the graph is damaged, too."""
+    """The most important questions; none where the table of edges is damaged."""
     try:
         graph, weight, _ = tables.read_edges(folder / "edges.parquet", tracks.world_from_body)
     except ResultError as error:
@@ -118,7 +118,7 @@ def _questions(folder: Path, tracks: Tracks, closures: Closures) -> list[Closure
 
 
 def questions_of(graph: PoseGraph, weight: Floats, closures: Closures) -> list[ClosureQuestion]:
-    """The first questions; none where the poses are not determined, or the graph is not that of the ledger."""
+    """The most important questions; none where the poses are not determined, or the graph is not that of the ledger."""
     try:
         return ask_ledger(graph, weight, closures)[:_QUESTIONS]
     except (GraphError, ResultError) as error:

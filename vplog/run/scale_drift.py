@@ -1,4 +1,4 @@
-"""One scale along a drive without metres: what closures say of how its unit of length wanders.
+"""One scale along a drive without metres: its scale drift, estimated from closures.
 
 As the seven degrees of freedom of Strasdat, Montiel & Davison 2010 (Scale drift-aware large scale monocular SLAM), with
 the scale solved first: two views of one place, each with landmarks in the unit of its own time, give their ratio.
@@ -14,19 +14,20 @@ from scipy import sparse
 from vplog.data import SCALE_WANDER, Camera, Floats, Ints, Keyframes, Odometry
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
+from vplog.graph.noise import broken_edges
 from vplog.loops.candidate import Drive, Row, check_queries
 from vplog.loops.propose import Proposals
 from vplog.run.cache.codecs import json_codec
 from vplog.run.cache.steps import step
 from vplog.run.verification import DriveFeatures, for_verification
-from vplog.run.visual_odometry.metres import scaled
+from vplog.run.visual_odometry.metres import random_walk, scaled
 
 _RANKS = 2
-"""Candidates of a keyframe that are looked at: neighbours tell the same."""
+"""Candidates of a keyframe that are measured: those of neighbouring ranks give the same ratio."""
 _LEAST = 12
 """Landmarks of both views that give a ratio."""
 _ACROSS = 1.0
-"""That across a break: a piece begins with a unit by what it sees."""
+"""Sigma of the log of the scale across a break: each piece begins with a unit of its own."""
 _BEST = 0.02
 """Least standard deviation of a ratio's log: landmarks of a view err together."""
 _TUNING = 2.0
@@ -95,11 +96,8 @@ def _log_scale(odometry: Odometry, keyframes: Keyframes, ratios: Floats) -> Floa
     """(N,) of the keyframes by least squares, of a scale that wanders slowly; its median is 0."""
     poses, count = keyframes.odom_from_body, len(keyframes.stamp_ns)
     sigma = SCALE_WANDER * np.sqrt(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) + 1e-6)
-    if odometry.breaks is not None:
-        edges = np.searchsorted(keyframes.stamp_ns, odometry.stamp_ns[odometry.breaks], "left") - 1
-        sigma[np.unique(edges[(edges >= 0) & (edges < count - 1)])] = _ACROSS
-    smooth = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(count - 1, count)).tocsr()
-    smooth = sparse.diags_array(1.0 / sigma) @ smooth
+    sigma[broken_edges(odometry, keyframes.stamp_ns)] = _ACROSS
+    smooth = random_walk(sigma)
     rows, ones = np.arange(len(ratios)), np.ones(len(ratios))
     ends = (np.concatenate([rows, rows]), ratios[:, :2].T.ravel().astype(np.int64))
     differences = sparse.csr_array((np.concatenate([ones, -ones]), ends), (len(ratios), count))

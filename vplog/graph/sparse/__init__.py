@@ -1,1 +1,1 @@
-"""Sparse linear algebra of large pose graphs; knows nothing of drives."""
+"""Sparse linear algebra of large pose graphs: multifrontal Cholesky, its solves and selected inversion."""

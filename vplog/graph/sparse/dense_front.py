@@ -1,7 +1,7 @@
 """Elimination of the first rows of one dense symmetric matrix, a front, on one thread or on several: the same bits.
 
-Without a BLAS, of which the threads would decide on the last bits: each number is worked out by the same steps in the
-same order, whoever does it.
+Without a BLAS, whose last bits depend on its threads: each entry is computed by the same operations in the same order
+whatever thread does it.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from vplog.data import Floats
 from vplog.graph.sparse.workers import Workers
 
 AT_ONCE = 8
-"""Rows that are taken away from others in one loop: as many as a processor keeps pointers to."""
+"""Rows subtracted from another in one loop: as many as a processor has registers for their pointers."""
 STRIP = 512
-"""Columns of a front that are worked on at once: eight rows of them, 32 kB, stay in the first cache."""
+"""Columns of a front per block: eight rows of them, 32 kB, stay in the L1 cache."""
 _PANEL = 8 * AT_ONCE
-"""Rows that are eliminated before the rest hears of them: a strip of them, 256 kB, stays in the second cache."""
+"""Rows eliminated before the rest is updated: a strip of them, 256 kB, stays in the L2 cache."""
 SHARED = 512
 """Rows from which on a front is worth sharing between threads: a panel then takes five milliseconds of one."""
 _LEAST_SHARE = 32
@@ -61,7 +61,7 @@ def eliminate_front(front: Floats, eliminated: int) -> bool:
 
 @numba.njit(cache=True, nogil=True)
 def _panel(front: Floats, begun: int, end: int, scale: Floats, low: int, high: int) -> bool:
-    """Rows begun:end of R in columns low:high. From `begun` on first: that tells what to multiply the rest with."""
+    """Rows begun:end of R in columns low:high. Columns from `begun` on come first: their pivots scale the rest."""
     share = np.empty(AT_ONCE)
     for left in range(low, high, STRIP):
         right = min(left + STRIP, high)

@@ -1,4 +1,4 @@
-"""Fronts of supernodes: what a matrix says about their columns, and what the supernodes below hand on to them."""
+"""Frontal matrices of supernodes: assembled from the matrix and from the update matrices of their children."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from vplog.data import Floats, Int32s, Ints
 from vplog.graph.sparse.dense_front import eliminate_front
 
-Listed = tuple[Ints, Ints, Ints]
+Entries = tuple[Ints, Ints, Ints]
 """Result of `by_supernode`."""
 
 
@@ -38,25 +38,26 @@ class Form(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
-def most_waiting(low: int, high: int, parent: Ints, children: Ints, below: Ints) -> int:
-    """Most numbers that supernodes low:high, whole subtrees, hand on and that are not taken yet at any time."""
-    waiting = np.empty(high - low + 1, np.int64)
+def largest_stack(low: int, high: int, parent: Ints, children: Ints, below: Ints) -> int:
+    """Most entries of update matrices on the stack at any time while supernodes low:high, whole subtrees, are
+    eliminated."""
+    pending = np.empty(high - low + 1, np.int64)
     count, used, most = 0, 0, 0
     for node in range(low, high):
         for _ in range(children[node]):
             count -= 1
-            used -= waiting[count]
+            used -= pending[count]
         if parent[node] >= 0:
-            waiting[count] = below[node] ** 2
-            used += waiting[count]
+            pending[count] = below[node] ** 2
+            used += pending[count]
             count += 1
             most = max(most, used)
     return most
 
 
 @numba.njit(cache=True, nogil=True)
-def found(rows: Ints, low: int, high: int, row: int) -> int:
-    """Where `row` is among rows[low:high], which increase."""
+def position(rows: Ints, low: int, high: int, row: int) -> int:
+    """Position of `row` in rows[low:high], which increase, by binary search."""
     while low < high:
         middle = (low + high) // 2
         if rows[middle] < row:
@@ -67,8 +68,8 @@ def found(rows: Ints, low: int, high: int, row: int) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
-def by_supernode(place: Ints, first: Ints, a: Int32s | Ints, b: Int32s | Ints) -> tuple[Ints, Ints, Ints]:
-    """The node (n,) that each column is of, and which edges meet the columns of each supernode first.
+def by_supernode(place: Ints, first: Ints, a: Int32s | Ints, b: Int32s | Ints) -> Entries:
+    """The node (n,) that each column is of, and which blocks each supernode assembles.
 
     Those are `edges[begin[node]:begin[node + 1]]`, in their order.
     """
@@ -91,16 +92,16 @@ def by_supernode(place: Ints, first: Ints, a: Int32s | Ints, b: Int32s | Ints) -
 
 
 @numba.njit(cache=True, nogil=True)
-def fill(node: int, front: Floats, form: Form, listed: Listed, matrix: Blocks) -> None:
-    """Put the blocks of a matrix in the columns of a supernode into the upper triangle of its front."""
+def assemble(node: int, front: Floats, form: Form, entries: Entries, matrix: Blocks) -> None:
+    """Write the blocks of a matrix in the columns of a supernode into the upper triangle of its front."""
     first, start, rows, place, _ = form
-    pose, begin, edges = listed
+    pose, begin, edges = entries
     diagonal, a, b, other = matrix
     size = diagonal.shape[1]
-    wide = first[node + 1] - first[node]
+    width = first[node + 1] - first[node]
     for i in range(len(front)):
         front[i, i:] = 0.0
-    for k in range(wide):
+    for k in range(width):
         row, at = pose[first[node] + k], k * size
         for i in range(size):
             for j in range(i, size):
@@ -111,10 +112,10 @@ def fill(node: int, front: Floats, form: Form, listed: Listed, matrix: Blocks) -
         if high < first[node + 1]:
             to = (high - first[node]) * size
         else:
-            where = found(rows, int(start[node]), int(start[node + 1]), int(high))
+            where = position(rows, int(start[node]), int(start[node + 1]), int(high))
             if where == start[node + 1] or rows[where] != high:
                 continue  # of no weight, and not in this shape
-            to = (wide + where - start[node]) * size
+            to = (width + where - start[node]) * size
         at = (low - first[node]) * size
         for i in range(size):
             for j in range(size):
@@ -122,30 +123,30 @@ def fill(node: int, front: Floats, form: Form, listed: Listed, matrix: Blocks) -
 
 
 @numba.njit(cache=True, nogil=True)
-def rows_of_child(node: int, child: int, form: Form, size: int) -> Ints:
-    """Where in the front of a supernode the rows below one of its children are."""
+def child_rows(node: int, child: int, form: Form, size: int) -> Ints:
+    """Positions in the front of a supernode of the rows below one of its children."""
     first, start, rows, _, _ = form
-    wide = first[node + 1] - first[node]
-    handed = start[child + 1] - start[child]
-    to = np.empty(handed, np.int64)
+    width = first[node + 1] - first[node]
+    count = start[child + 1] - start[child]
+    to = np.empty(count, np.int64)
     along = start[node]
-    for k in range(handed):
+    for k in range(count):
         row = rows[start[child] + k]
         if row < first[node + 1]:
             to[k] = (row - first[node]) * size
         else:
             while rows[along] != row:
                 along += 1
-            to[k] = (wide + along - start[node]) * size
+            to[k] = (width + along - start[node]) * size
     return to
 
 
 @numba.njit(cache=True, nogil=True)
-def gather(front: Floats, to: Ints, size: int, handed: Floats, skipped: int, low: int, high: int) -> None:
-    """Add rows low:high, in blocks, of what a child hands on: `handed` without its first rows and columns."""
+def extend_add(front: Floats, to: Ints, size: int, update: Floats, skipped: int, low: int, high: int) -> None:
+    """Add rows low:high, in blocks, of a child's update matrix: `update` without its first rows and columns."""
     for k in range(low, high):
         for i in range(size):
-            line = handed[skipped + k * size + i, skipped:]
+            line = update[skipped + k * size + i, skipped:]
             target = front[to[k] + i]
             for j in range(i, size):
                 target[to[k] + j] += line[k * size + j]
@@ -155,8 +156,8 @@ def gather(front: Floats, to: Ints, size: int, handed: Floats, skipped: int, low
 
 
 @numba.njit(cache=True, nogil=True)
-def keep(front: Floats, values: Floats) -> None:
-    """The first rows of a front (f, f), upper triangle, as `values` (k f,)."""
+def store_rows(front: Floats, values: Floats) -> None:
+    """Copy the first rows of a front (f, f), upper triangle, into `values` (k f,)."""
     length = len(front)
     for i in range(len(values) // length):
         values[i * length : i * length + i] = 0.0
@@ -166,11 +167,11 @@ def keep(front: Floats, values: Floats) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def eliminate_run(
-    low: int, end: int, form: Form, children: Ints, begin: Ints, values: Floats, listed: Listed, matrix: Blocks
+    low: int, end: int, form: Form, children: Ints, begin: Ints, values: Floats, entries: Entries, matrix: Blocks
 ) -> tuple[bool, Floats, Ints]:
-    """R of supernodes low:end, whole subtrees, in `values`, and what is left for others to take.
+    """Eliminate supernodes low:end, whole subtrees: their rows of R in `values`.
 
-    Whether they are positive definite; what each root of the subtrees hands on, one after the other; and these roots.
+    Returns whether they are positive definite, the update matrices of the roots, one after the other, and these roots.
     """
     first, start, _, _, parent = form
     size = matrix.diagonal.shape[1]
@@ -179,30 +180,30 @@ def eliminate_run(
         below[node] = (start[node + 1] - start[node]) * size
         most = max(most, (first[node + 1] - first[node]) * size + below[node])
     room = np.empty(most * most)
-    stack = np.empty(most_waiting(low, end, parent, children, below))
-    waiting = np.empty(end - low + 1, np.int64)
+    stack = np.empty(largest_stack(low, end, parent, children, below))
+    pending = np.empty(end - low + 1, np.int64)
     count, used = 0, 0
     for node in range(low, end):
         eliminated = (first[node + 1] - first[node]) * size
         length = eliminated + below[node]
         front = room[: length * length].reshape(length, length)
-        fill(node, front, form, listed, matrix)
+        assemble(node, front, form, entries, matrix)
         for _ in range(children[node]):
             count -= 1
-            child = waiting[count]
+            child = pending[count]
             used -= below[child] ** 2
-            handed = stack[used : used + below[child] ** 2].reshape(below[child], below[child])
-            to = rows_of_child(node, child, form, size)
-            gather(front, to, size, handed, 0, 0, len(to))
+            update = stack[used : used + below[child] ** 2].reshape(below[child], below[child])
+            to = child_rows(node, child, form, size)
+            extend_add(front, to, size, update, 0, 0, len(to))
         if not eliminate_front(front, eliminated):
-            return False, stack[:0].copy(), waiting[:0].copy()
-        keep(front, values[begin[node] : begin[node + 1]])
+            return False, stack[:0].copy(), pending[:0].copy()
+        store_rows(front, values[begin[node] : begin[node + 1]])
         if parent[node] >= 0:
-            waiting[count] = node
+            pending[count] = node
             count += 1
-            handed = stack[used : used + below[node] ** 2].reshape(below[node], below[node])
+            update = stack[used : used + below[node] ** 2].reshape(below[node], below[node])
             used += below[node] ** 2
             for i in range(below[node]):
                 for j in range(i, below[node]):
-                    handed[i, j] = front[eliminated + i, eliminated + j]
-    return True, stack[:used].copy(), waiting[:count].copy()
+                    update[i, j] = front[eliminated + i, eliminated + j]
+    return True, stack[:used].copy(), pending[:count].copy()

@@ -1,4 +1,4 @@
-"""Fronts of supernodes filled with the inverse of a matrix, from what their parents know of it."""
+"""Fronts of supernodes filled with the inverse of a matrix, from the inverse in their parents' fronts."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import numpy as np
 
 from vplog.data import Bools, Floats, Ints
 from vplog.graph.sparse.dense_front import AT_ONCE, STRIP, subtract_scaled
-from vplog.graph.sparse.frontal import Form, found, rows_of_child
+from vplog.graph.sparse.frontal import Form, child_rows, position
 from vplog.graph.sparse.workers import Workers
 
-Wanted = tuple[Ints, Ints, Ints, Floats]
-"""Which pairs each supernode has, (S + 1,), their columns (K,), (K,), and room for their blocks (3, K, d, d)."""
+Requests = tuple[Ints, Ints, Ints, Floats]
+"""Where the pairs of each supernode begin, (S + 1,), their columns (K,), (K,), and the blocks (3, K, d, d)."""
 Tree = tuple[Ints, Ints, Ints]
-"""Where the children of each supernode begin, (S + 1,), these, and how many rows each hands down, (S,)."""
+"""Where the children of each supernode begin, (S + 1,), these, and how many rows are below each, (S,)."""
 
 SHARED = 1024
 """Rows from which on a front is worth sharing between threads: eight of them then take four milliseconds of one."""
@@ -23,37 +23,37 @@ _LEAST_SHARE = 64
 
 def invert_together(front: Floats, root: Floats, workers: Workers) -> None:
     """`invert_front` by several threads where the front is large."""
-    wide, length = root.shape
+    width, length = root.shape
     if length < SHARED or workers.count == 1:
         invert_front(front, root)
         return
     gain = np.empty((AT_ONCE, length))
-    end = wide
+    end = width
     while end > 0:
         begun = max(end - AT_ONCE, 0)
-        _gained(root, begun, end, gain)
+        _gain_of_panel(root, begun, end, gain)
         parts = workers.ranges(end, length, _LEAST_SHARE)
-        workers.each(_cross_rows, [(front, begun, end, gain, left, right) for left, right in parts])
-        _within(front, root, begun, end)
+        workers.each(_off_diagonal, [(front, begun, end, gain, left, right) for left, right in parts])
+        _diagonal_block(front, root, begun, end)
         end = begun
 
 
 @numba.njit(cache=True, nogil=True)
 def invert_front(front: Floats, root: Floats) -> None:
     """The inverse (f, f) from R's rows (k, f) and from its lower right part, which is given, in place."""
-    wide, length = root.shape
+    width, length = root.shape
     gain = np.empty((AT_ONCE, length))
-    end = wide
+    end = width
     while end > 0:
         begun = max(end - AT_ONCE, 0)
-        _gained(root, begun, end, gain)
-        _cross_rows(front, begun, end, gain, end, length)
-        _within(front, root, begun, end)
+        _gain_of_panel(root, begun, end, gain)
+        _off_diagonal(front, begun, end, gain, end, length)
+        _diagonal_block(front, root, begun, end)
         end = begun
 
 
 @numba.njit(cache=True, nogil=True)
-def _cross_rows(front: Floats, begun: int, end: int, gain: Floats, low: int, high: int) -> None:
+def _off_diagonal(front: Floats, begun: int, end: int, gain: Floats, low: int, high: int) -> None:
     """Rows begun:end of the inverse in columns low:high, all after `end`, and their mirror image."""
     length = len(front)
     share = np.empty(AT_ONCE)
@@ -74,7 +74,7 @@ def _cross_rows(front: Floats, begun: int, end: int, gain: Floats, low: int, hig
 
 
 @numba.njit(cache=True, nogil=True)
-def _within(front: Floats, root: Floats, begun: int, end: int) -> None:
+def _diagonal_block(front: Floats, root: Floats, begun: int, end: int) -> None:
     """Rows and columns begun:end of the inverse, row by row."""
     length = root.shape[1]
     for k in range(end - 1, begun - 1, -1):
@@ -86,8 +86,8 @@ def _within(front: Floats, root: Floats, begun: int, end: int) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _gained(root: Floats, begun: int, end: int, gain: Floats) -> None:
-    """Rows begun:end of R by its block there, from column `end` on: their gain on all after them."""
+def _gain_of_panel(root: Floats, begun: int, end: int, gain: Floats) -> None:
+    """Rows begun:end of R from column `end` on, multiplied by the inverse of their diagonal block."""
     length = root.shape[1]
     for k in range(end - 1, begun - 1, -1):
         line = gain[k - begun]
@@ -103,17 +103,17 @@ def _gained(root: Floats, begun: int, end: int, gain: Floats) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def store_blocks(node: int, front: Floats, form: Form, size: int, wanted: Wanted) -> None:
-    """Keep the blocks that are asked of a supernode."""
+def store_blocks(node: int, front: Floats, form: Form, size: int, requests: Requests) -> None:
+    """Store the blocks that are requested of a supernode."""
     first, start, rows, _, _ = form
-    requested, low, high, result = wanted
-    wide = first[node + 1] - first[node]
+    requested, low, high, result = requests
+    width = first[node + 1] - first[node]
     for pair in range(requested[node], requested[node + 1]):
         one = (low[pair] - first[node]) * size
         if high[pair] < first[node + 1]:
             two = (high[pair] - first[node]) * size
         else:
-            two = (wide + found(rows, int(start[node]), int(start[node + 1]), int(high[pair])) - start[node]) * size
+            two = (width + position(rows, int(start[node]), int(start[node + 1]), int(high[pair])) - start[node]) * size
         for i in range(size):
             for j in range(size):
                 result[0, pair, i, j] = front[one + i, one + j]
@@ -122,19 +122,19 @@ def store_blocks(node: int, front: Floats, form: Form, size: int, wanted: Wanted
 
 
 @numba.njit(cache=True, nogil=True)
-def hand_down(front: Floats, to: Ints, size: int, handed: Floats) -> None:
-    """The inverse at these rows, in blocks, of a front."""
+def extract(front: Floats, to: Ints, size: int, part: Floats) -> None:
+    """Copy the rows and columns `to`, in blocks, of a front into `part`."""
     for k in range(len(to)):
         for i in range(size):
-            source, line = front[to[k] + i], handed[k * size + i]
+            source, line = front[to[k] + i], part[k * size + i]
             for other in range(len(to)):
                 for j in range(size):
                     line[other * size + j] = source[to[other] + j]
 
 
 @numba.njit(cache=True, nogil=True)
-def _most_waiting(low: int, end: int, given: int, needed: Bools, parent: Ints, tree: Tree) -> int:
-    """Most numbers that are handed down and not taken yet at any time, `given` of them at first."""
+def _largest_stack(low: int, end: int, given: int, needed: Bools, parent: Ints, tree: Tree) -> int:
+    """Most entries on the stack at any time, `given` of them at first."""
     child, children, below = tree
     used = most = given
     for node in range(end - 1, low - 1, -1):
@@ -150,7 +150,7 @@ def _most_waiting(low: int, end: int, given: int, needed: Bools, parent: Ints, t
 @numba.njit(cache=True, nogil=True)
 def invert_run(
     low: int, end: int, given: Floats, form: Form, size: int, begin: Ints, values: Floats, needed: Bools, tree: Tree,
-    wanted: Wanted,
+    requests: Requests,
 ) -> None:  # fmt: skip
     """Supernodes low:end that are needed, whole subtrees, from the last to the first.
 
@@ -162,25 +162,25 @@ def invert_run(
         if needed[node]:
             most = max(most, (first[node + 1] - first[node]) * size + below[node])
     room = np.empty(most * most)
-    stack = np.empty(_most_waiting(low, end, len(given), needed, parent, tree))
+    stack = np.empty(_largest_stack(low, end, len(given), needed, parent, tree))
     for i in range(len(given)):
         stack[i] = given[i]
     used = len(given)
     for node in range(end - 1, low - 1, -1):
         if not needed[node]:
             continue
-        wide, left = (first[node + 1] - first[node]) * size, below[node]
-        length = wide + left
+        width, left = (first[node + 1] - first[node]) * size, below[node]
+        length = width + left
         front = room[: length * length].reshape(length, length)
         if parent[node] >= 0:
             used -= left * left
             for i in range(left):
                 for j in range(left):
-                    front[wide + i, wide + j] = stack[used + i * left + j]
-        invert_front(front, values[begin[node] : begin[node + 1]].reshape(wide, length))
-        store_blocks(node, front, form, size, wanted)
+                    front[width + i, width + j] = stack[used + i * left + j]
+        invert_front(front, values[begin[node] : begin[node + 1]].reshape(width, length))
+        store_blocks(node, front, form, size, requests)
         for at in range(child[node], child[node + 1]):
             count = below[children[at]]
-            to = rows_of_child(node, children[at], form, size)
-            hand_down(front, to, size, stack[used : used + count * count].reshape(count, count))
+            to = child_rows(node, children[at], form, size)
+            extract(front, to, size, stack[used : used + count * count].reshape(count, count))
             used += count * count

@@ -18,14 +18,14 @@ _LEAST_RUN = 1e6
 
 @dataclass(frozen=True, eq=False)
 class Subtrees:
-    """Runs of supernodes that need nothing of each other, each one or more whole subtrees; the same for any threads."""
+    """Independent runs of supernodes, each one or more whole subtrees; the same for any number of threads."""
 
     runs: list[tuple[int, int]]
     """First supernode and the one after the last, the run of most work first."""
     roots: list[Ints]
     """Roots of the subtrees of each run."""
     after: list[Ints]
-    """Rows after each run that it contributes to."""
+    """Rows after each run that it updates."""
     top: list[int]
     """Supernodes above all runs, in order of elimination."""
     children: list[list[int]]
@@ -33,32 +33,32 @@ class Subtrees:
 
     @classmethod
     def of(cls, shape: Form) -> Subtrees:
-        parent, wide, below = shape.parent, np.diff(shape.first), np.diff(shape.start)
-        work = wide * (wide + below).astype(float) ** 2
-        total = _with_those_below(parent, work)
+        parent, width, below = shape.parent, np.diff(shape.first), np.diff(shape.start)
+        work = width * (width + below).astype(float) ** 2
+        total = _subtree_sums(parent, work)
         limit = max(float(work.sum()) / _PIECES, _LEAST_RUN)
         high = total > limit
         runs, load = _runs(parent, total, high, limit)
         runs = runs[np.argsort(-load, kind="stable")]
         ends = np.flatnonzero((parent < 0) | high[parent])  # of subtrees, and the top
         roots = [ends[np.searchsorted(ends, low) : np.searchsorted(ends, end)] for low, end in runs]
-        # what a supernode has a say in is its parent's columns, or its parent has a say in it, too
+        # the rows below a supernode are columns of its parent, or below that, too
         after = [
             np.unique(np.concatenate([shape.rows[shape.start[root] : shape.start[root + 1]] for root in own]))
             for own in roots
         ]
         top = np.flatnonzero(high)
-        handing = ends[parent[ends] >= 0]
-        handing = handing[np.argsort(parent[handing], kind="stable")]
-        begin = np.searchsorted(parent[handing], top)
-        end = np.searchsorted(parent[handing], top, "right")
-        children = [handing[one:two].tolist() for one, two in zip(begin, end, strict=True)]
+        below_top = ends[parent[ends] >= 0]
+        below_top = below_top[np.argsort(parent[below_top], kind="stable")]
+        begin = np.searchsorted(parent[below_top], top)
+        end = np.searchsorted(parent[below_top], top, "right")
+        children = [below_top[one:two].tolist() for one, two in zip(begin, end, strict=True)]
         return cls([(int(low), int(end)) for low, end in runs], roots, after, top.tolist(), children)
 
 
 @numba.njit(cache=True, nogil=True)
-def _with_those_below(parent: Ints, work: Floats) -> Floats:
-    """Work (S,) of each supernode and of all below it."""
+def _subtree_sums(parent: Ints, work: Floats) -> Floats:
+    """Sum (S,) of the work of each subtree, by its root."""
     total = work.copy()
     for node in range(len(parent)):
         if parent[node] >= 0:

@@ -33,7 +33,7 @@ class Elimination:
     first: Ints
     """(S + 1,) first column of each supernode, in order of elimination."""
     parent: Ints
-    """(S,) supernode that takes what each adds to the rest of the matrix; -1 for roots."""
+    """(S,) supernode that assembles the update matrix of each; -1 for roots."""
     start: Ints
     """(S + 1,) where the rows of each begin in `rows`."""
     rows: Ints
@@ -47,12 +47,12 @@ class Elimination:
         low, high = pairs // n, pairs % n
         low, high = low[low != high], high[low != high]
         place = dissected(n, low, high)
-        first, neighbours = _adjacent(n, place[low], place[high])
-        parent = _tree(n, first, neighbours)
+        first, neighbours = _adjacency(n, place[low], place[high])
+        parent = _elimination_tree(n, first, neighbours)
         after = _postordered(parent)
         place = after[place]
-        first, neighbours = _adjacent(n, place[low], place[high])
-        parent = _tree(n, first, neighbours)
+        first, neighbours = _adjacency(n, place[low], place[high])
+        parent = _elimination_tree(n, first, neighbours)
         count = _counts(n, first, neighbours, parent)
         columns, parents, size = _supernodes(parent, count, _RELAXED, _SMALL)
         start = np.concatenate([[0], np.cumsum(size)])
@@ -86,7 +86,7 @@ def dissected(n: int, a: Ints, b: Ints) -> Ints:
     return place
 
 
-def _adjacent(n: int, a: Ints, b: Ints) -> tuple[Ints, Ints]:
+def _adjacency(n: int, a: Ints, b: Ints) -> tuple[Ints, Ints]:
     """For each column the rows next to it, increasing: where each begins (n + 1,), and rows."""
     column, row = np.concatenate([a, b]), np.concatenate([b, a])
     order = np.lexsort((row, column))
@@ -94,7 +94,7 @@ def _adjacent(n: int, a: Ints, b: Ints) -> tuple[Ints, Ints]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _tree(n: int, first: Ints, neighbours: Ints) -> Ints:
+def _elimination_tree(n: int, first: Ints, neighbours: Ints) -> Ints:
     """Parent (n,) of each column in the elimination tree, -1 for roots: Liu 1986, with path compression."""
     parent = np.full(n, -1, np.int64)
     ancestor = np.full(n, -1, np.int64)
@@ -202,7 +202,7 @@ def _supernodes(parent: Ints, count: Ints, relaxed: float, small: int) -> tuple[
 
 @numba.njit(cache=True, nogil=True)
 def _structure(n: int, first: Ints, neighbours: Ints, columns: Ints, parents: Ints, start: Ints) -> Ints:
-    """The rows of each supernode below its columns, in no order: its own and what its children hand on."""
+    """The rows of each supernode below its columns, in no order: its own and those of its children."""
     rows = np.empty(start[-1], np.int64)
     visited = np.full(n, -1, np.int64)
     child = np.full(len(parents), -1, np.int64)
@@ -223,7 +223,7 @@ def _structure(n: int, first: Ints, neighbours: Ints, columns: Ints, parents: In
 
 @numba.njit(cache=True, nogil=True)
 def _add_rows(node: int, end: int, more: Ints, visited: Ints, rows: Ints, count: int) -> int:
-    """Put those of the rows `more` from `end` on that a supernode does not have yet behind its others in `rows`."""
+    """Append to a supernode's `rows` those of the rows `more` from `end` on that it does not have yet."""
     for row in more:
         if row >= end and visited[row] != node:
             visited[row] = node

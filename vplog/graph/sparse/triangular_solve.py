@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from vplog.data import Floats, Ints
-from vplog.graph.sparse.frontal import Form, found
+from vplog.graph.sparse.frontal import Form, position
 
 
 @numba.njit(cache=True, nogil=True)
@@ -25,21 +25,21 @@ def forward_run(
         for c in range(columns):
             whole[row, c] = right[begun * size + row, c]
     for node in range(low, end):
-        at, wide = (first[node] - begun) * size, (first[node + 1] - first[node]) * size
+        at, width = (first[node] - begun) * size, (first[node + 1] - first[node]) * size
         count = start[node + 1] - start[node]
-        length = wide + count * size
+        length = width + count * size
         to = np.empty(count, np.int64)
         for k in range(count):
             row = rows[start[node] + k]
-            to[k] = (row - begun) * size if row < after else own + found(later, 0, len(later), int(row)) * size
-        for k in range(wide):
+            to[k] = (row - begun) * size if row < after else own + position(later, 0, len(later), int(row)) * size
+        for k in range(width):
             line = values[begin[node] + k * length : begin[node] + (k + 1) * length]
             for c in range(columns):
                 whole[at + k, c] /= line[k]
                 value = whole[at + k, c]
-                for j in range(k + 1, wide):
+                for j in range(k + 1, width):
                     whole[at + j, c] -= line[j] * value
-                j = wide
+                j = width
                 for there in to:
                     for i in range(size):
                         whole[there + i, c] -= line[j] * value
@@ -65,15 +65,15 @@ def back_run(low: int, end: int, form: Form, begin: Ints, size: int, values: Flo
     first, start, rows, _, _ = form
     columns = right.shape[1]
     for node in range(end - 1, low - 1, -1):
-        at, wide = first[node] * size, (first[node + 1] - first[node]) * size
-        length = wide + (start[node + 1] - start[node]) * size
-        for k in range(wide - 1, -1, -1):
+        at, width = first[node] * size, (first[node + 1] - first[node]) * size
+        length = width + (start[node + 1] - start[node]) * size
+        for k in range(width - 1, -1, -1):
             line = values[begin[node] + k * length : begin[node] + (k + 1) * length]
             for c in range(columns):
                 value = right[at + k, c]
-                for j in range(k + 1, wide):
+                for j in range(k + 1, width):
                     value -= line[j] * right[at + j, c]
-                j = wide
+                j = width
                 for row in range(start[node], start[node + 1]):
                     for i in range(size):
                         value -= line[j] * right[rows[row] * size + i, c]

@@ -301,7 +301,7 @@ class StageCache:
                 file.unlink(missing_ok=True)
 
 
-def finished_parts(cache: Path, camera: int = 0) -> list[str]:
+def finished_parts(cache: Path, camera: int) -> list[str]:
     """Names of the files of the features of a finished run's camera, in order; none where no run was finished."""
     parts = _read_inputs(cache).get("parts")
     own = parts[camera] if isinstance(parts, list) and camera < len(parts) else []

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from vplog.data import SCALE_WANDER, Camera, Floats, Ints, Odometry
-from vplog.run.visual_odometry.metres import scaled
+from vplog.run.visual_odometry.metres import random_walk, scaled
 
 _DEPRESSION = np.sin(np.radians(4.0))
 """Sine of the angle below the horizon: what is farther is low by a small error of the pitch alone."""
@@ -30,10 +30,10 @@ _SPREAD = 0.15
 _TUNING = 3.0
 """Sigmas beyond which a landmark is none of the ground (Tukey)."""
 _FINEST = 0.01
-"""Least relative deviation that is told from zero."""
+"""Least relative deviation that is distinguished from zero."""
 _ROUNDS = 40
 _ACROSS = 1.0
-"""That across a break."""
+"""Sigma of the log of the scale across a break."""
 _HUBER = 2.0
 
 
@@ -98,10 +98,8 @@ def _smoothed(odometry: Odometry, rows: Ints, measured: Floats, spread: float) -
     if odometry.breaks is not None:
         pieces = np.searchsorted(odometry.breaks, rows, "right")
         sigma[np.diff(pieces) > 0] = _ACROSS
-    count = len(rows)
-    smooth = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(count - 1, count)).tocsr()
-    smooth = sparse.diags_array(1.0 / sigma) @ smooth
-    x, left = np.full(count, float(np.median(measured))), spread
+    smooth = random_walk(sigma)
+    x, left = np.full(len(rows), float(np.median(measured))), spread
     for _ in range(_ROUNDS):
         weight = np.sqrt(np.minimum(1.0, _HUBER * left / np.maximum(np.abs(measured - x), 1e-9))) / left
         A = sparse.vstack([sparse.diags_array(weight), smooth])

@@ -24,7 +24,7 @@ SURE = 0.1
 _LEAST_STATES = 10
 """States that determine a scale, biases and gravity: two seconds."""
 _AGREES = 0.5
-"""Share of the variance of the turns of the images that a gyroscope must explain, which else is not mounted as told."""
+"""Share of the variance of the images' turns that a gyroscope must explain, else its mount or its clock is wrong."""
 _NEAR = 3.0
 """m; sigma of the motion across a break up to which it is none."""
 

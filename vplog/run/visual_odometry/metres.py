@@ -1,4 +1,4 @@
-"""Metres for odometry in units of its own, by satellite fixes: its scale as it wanders along the way."""
+"""Metres for odometry in units of its own, by GPS fixes: its scale as it drifts along the path."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class _Way(NamedTuple):
 
 
 def in_metres(odometry: Odometry, gps: Gps, camera: Camera) -> Odometry | None:
-    """Odometry with its steps multiplied by the scale that the fixes have them have; None where the body does not move
-    far enough for one. Pieces without such fixes take the scale of the others."""
+    """Odometry with its steps multiplied by the scale that the fixes imply; None where the body does not move far
+    enough for one. Pieces without such fixes take the scale of the others."""
     lever = camera.body_from_camera
     poses = se3.inverse(lever) @ odometry.odom_from_body @ lever
     breaks = odometry.breaks if odometry.breaks is not None else np.zeros(0, np.int64)
@@ -73,6 +73,12 @@ def scaled(odometry: Odometry, scale: Floats, camera: Camera) -> Odometry:
         covariance[:, 3:] *= scale[:, None, None]
         covariance[:, :, 3:] *= scale[:, None, None]
     return replace(odometry, odom_from_body=lever @ poses @ se3.inverse(lever), covariance=covariance)
+
+
+def random_walk(sigma: Floats) -> sparse.csr_array:
+    """(N, N + 1) differences of neighbours in units of their sigmas (N,): the prior of a scale that wanders."""
+    differences = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(len(sigma), len(sigma) + 1)).tocsr()
+    return sparse.diags_array(1.0 / sigma) @ differences
 
 
 def _sigma_m(gps: Gps) -> float:
@@ -110,8 +116,7 @@ def _log_scale(way: _Way, sigma_m: float) -> Floats | None:
     row = np.repeat(np.arange(len(pairs)), size)
     column = np.concatenate([np.arange(a, b) for a, b in pairs.tolist()])
     metres = np.linalg.norm(np.diff(way.enu_m, axis=0), axis=1)
-    smooth = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(count - 1, count)).tocsr()
-    smooth = sparse.diags_array(1.0 / (SCALE_WANDER * np.sqrt((metres[1:] + metres[:-1]) / 2.0))) @ smooth
+    smooth = random_walk(SCALE_WANDER * np.sqrt((metres[1:] + metres[:-1]) / 2.0))
     sigma = np.sqrt(2.0) * sigma_m / length
     for _ in range(_ROUNDS):
         moved = np.exp(x)[:, None] * steps

@@ -28,7 +28,7 @@ _WINDOW = 8
 _SHARED = 0.75
 """A frame with less than this share of its reference's points becomes one."""
 _FLOW = 0.05
-"""So does one whose points moved by this share of the image's width: farther, and patches no longer look alike."""
+"""So does a frame whose points moved by this share of the image's width: beyond it patches no longer look alike."""
 _LEAST = 30
 """Points with depth that a first frame needs: half as many again as a pose does."""
 _LEFT = 0.4
@@ -84,7 +84,7 @@ class _Start:
 
 @dataclass(eq=False)
 class _Tracker:
-    """State while the frames pass."""
+    """State of the tracking from frame to frame."""
 
     sensor: Sensor
     height_m: float | None = None
