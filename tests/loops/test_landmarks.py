@@ -6,15 +6,21 @@ import numpy as np
 import pytest
 
 from tests.loops.scene import NOISE_PX, Scene, camera, keyframes, pose, scene, view
-from vplog.features.matching import MatchSettings
+from vplog.features.matching import MatchSettings, PairMatches
 from vplog.geometry import se3
 from vplog.loops import landmarks, undistort
 from vplog.loops.landmarks import LandmarkSettings, landmarks_of
 
 if TYPE_CHECKING:
-    from vplog.data import Camera, Features
+    from collections.abc import Callable
+
+    from vplog.data import Camera, Features, Floats
 
 EXACT = LandmarkSettings(pixel_sigma=NOISE_PX)
+
+
+def matched(features: Callable[[int], Features]) -> tuple[int, PairMatches]:
+    return MatchSettings().features, PairMatches(features, MatchSettings())
 
 
 def truth_of(place: Scene, world_from_body: np.ndarray, lens: Camera, features: Features) -> np.ndarray:
@@ -37,7 +43,7 @@ def test_triangulated_depths_are_as_good_as_they_claim(model: tuple[str, list[fl
     views = [view(place, p, lens, rng) for p in poses]
     # the odometry errs; the window's bundle adjustment has to make up for it
     noisy = [p @ se3.exp(np.concatenate([rng.normal(0, 0.003, 3), rng.normal(0, 0.01, 3)])) for p in poses]
-    found = landmarks_of(2, keyframes(noisy), lens, views.__getitem__, MatchSettings(), EXACT)
+    found = landmarks_of(2, keyframes(noisy), lens, views.__getitem__, *matched(views.__getitem__), EXACT)
     assert not found.from_depth
     assert found.known.sum() > 200
     true = truth_of(place, poses[2], lens, views[2])
@@ -54,7 +60,7 @@ def test_a_camera_that_stands_still_knows_no_depth(moved: float) -> None:
     lens, place = camera(), scene(rng)
     poses = [pose(moved * i) for i in range(5)]
     views = [view(place, p, lens, rng) for p in poses]
-    found = landmarks_of(2, keyframes(poses), lens, views.__getitem__, MatchSettings(), EXACT)
+    found = landmarks_of(2, keyframes(poses), lens, views.__getitem__, *matched(views.__getitem__), EXACT)
     assert found.tracked > 100
     assert found.known.sum() < 0.05 * found.tracked
 
@@ -65,7 +71,7 @@ def test_a_turn_on_the_spot_knows_no_depth() -> None:
     swing = se3.inverse(lens.body_from_camera)
     poses = [lens.body_from_camera @ se3.exp(np.array([0, 0.05 * i, 0, 0, 0, 0])) @ swing for i in range(5)]
     views = [view(place, p, lens, rng) for p in poses]
-    found = landmarks_of(2, keyframes(poses), lens, views.__getitem__, MatchSettings(), EXACT)
+    found = landmarks_of(2, keyframes(poses), lens, views.__getitem__, *matched(views.__getitem__), EXACT)
     assert found.tracked > 100
     assert found.known.sum() < 0.05 * found.tracked
 
@@ -74,7 +80,7 @@ def test_a_lone_keyframe_has_no_landmarks() -> None:
     rng = np.random.default_rng(6)
     lens = camera()
     seen = view(scene(rng), pose(0), lens, rng)
-    found = landmarks_of(0, keyframes([pose(0)]), lens, lambda _: seen, MatchSettings(), EXACT)
+    found = landmarks_of(0, keyframes([pose(0)]), lens, lambda _: seen, *matched(lambda _: seen), EXACT)
     assert found.tracked == 0
     assert not found.known.any()
     assert np.isnan(found.rho).all()
@@ -94,12 +100,18 @@ def test_derivatives_agree_with_differences() -> None:
     rng = np.random.default_rng(7)
     views = se3.exp(rng.normal(0, 0.1, (3, 6)))
     points = np.column_stack([rng.uniform(-0.5, 0.5, (4, 2)), rng.uniform(0.05, 0.5, 4)])
-    observed = np.zeros((3, 4, 2))
-    residual, by_point, by_view = landmarks._linearise(points, observed, views)
+
+    def linearised(points: Floats, views: Floats) -> tuple[Floats, Floats, Floats]:
+        error, by_point, by_view = np.zeros((3, 4, 2)), np.zeros((3, 4, 2, 3)), np.zeros((3, 4, 2, 6))
+        for v, m in np.ndindex(3, 4):
+            assert landmarks._linearise(points[m], np.zeros(2), views[v], error[v, m], by_point[v, m], by_view[v, m])
+        return error, by_point, by_view
+
+    residual, by_point, by_view = linearised(points, views)
     step = 1e-6
     for axis in range(3):
-        moved, _, _ = landmarks._linearise(points + step * np.eye(3)[axis], observed, views)
+        moved, _, _ = linearised(points + step * np.eye(3)[axis], views)
         np.testing.assert_allclose(by_point[..., axis], (moved - residual) / step, atol=1e-5)
     for axis in range(6):
-        moved, _, _ = landmarks._linearise(points, observed, views @ se3.exp(step * np.eye(6)[axis]))
+        moved, _, _ = linearised(points, views @ se3.exp(step * np.eye(6)[axis]))
         np.testing.assert_allclose(by_view[..., axis], (moved - residual) / step, atol=1e-5)

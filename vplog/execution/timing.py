@@ -16,18 +16,23 @@ class StageTimer:
 
     def __init__(self) -> None:
         self.stages: dict[str, dict[str, Any]] = {}
+        self._within = 0.0, 0.0
+        """Seconds and CPU seconds of stages within the one that is measured."""
 
     @contextmanager
     def stage(self, name: str, items: int | None = None) -> Iterator[None]:
-        """Measure a block; `items` frames (or candidates) are worked off in it."""
+        """Measure a block, without the stages within it; `items` frames (or candidates) are worked off in it."""
         with suppress(OSError):  # where the system is not Linux, the peak is that of the whole run so far
             Path("/proc/self/clear_refs").write_text("5")
-        began, cpu = time.perf_counter(), time.process_time()
+        before, self._within = self._within, (0.0, 0.0)
+        began, cpu_began = time.perf_counter(), time.process_time()
         yield
-        seconds = time.perf_counter() - began
+        spent, cpu_spent = time.perf_counter() - began, time.process_time() - cpu_began
+        seconds, cpu_seconds = spent - self._within[0], cpu_spent - self._within[1]
+        self._within = before[0] + spent, before[1] + cpu_spent
         entry: dict[str, Any] = {
             "seconds": round(seconds, 3),
-            "cpu_seconds": round(time.process_time() - cpu, 3),
+            "cpu_seconds": round(cpu_seconds, 3),
             "peak_memory_mb": round(peak_memory_mb(), 1),
         }
         if items is not None:

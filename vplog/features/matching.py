@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache
+
 import numpy as np
 from pydantic import Field
 
@@ -10,6 +13,10 @@ from vplog.settings import Settings
 
 _EXACT = 1 << 24
 """Integers up to 2^24 are exact in float32, so no order of summation changes a distance (IEEE 754)."""
+
+
+_REMEMBERED = 4096
+"""Pairs of images whose matches are kept, some 40 MB: those of 2000 keyframes with their neighbours."""
 
 
 class MatchSettings(Settings):
@@ -34,8 +41,12 @@ def match(a: Bytes, b: Bytes, ratio: float) -> tuple[Ints, Ints]:
     """
     if len(a) == 0 or len(b) < 2:  # no second best, no ratio test
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    distances = squared_distances(a, b)
-    rows = np.arange(len(a))
+    return _distinct(squared_distances(a, b), ratio)
+
+
+def _distinct(distances: np.ndarray, ratio: float) -> tuple[Ints, Ints]:
+    """Rows and columns of mutual nearest neighbours that pass the ratio test along their row."""
+    rows = np.arange(len(distances))
     best_b = distances.argmin(axis=1)
     best = distances[rows, best_b]
     mutual = best == distances.min(axis=0)[best_b]
@@ -55,11 +66,39 @@ def match_features(a: Features, b: Features, settings: MatchSettings) -> tuple[I
 
     SIFT gives a point one descriptor for each strong orientation; counted twice they would be two votes of one point.
     """
-    rows_a, rows_b = match(a.descriptors[: settings.features], b.descriptors[: settings.features], settings.ratio)
+    found = match(a.descriptors[: settings.features], b.descriptors[: settings.features], settings.ratio)
+    return _once(a, b, *found)
+
+
+def _once(a: Features, b: Features, rows_a: Ints, rows_b: Ints) -> tuple[Ints, Ints]:
+    """The first match of each pair of positions."""
     positions = np.concatenate([a.points[rows_a], b.points[rows_b]], axis=1) + np.float32(0)  # so that -0 is 0
     _, first = np.unique(positions.view(f"V{positions.itemsize * 4}"), return_index=True)  # faster than by axis=0
     first.sort()
     return rows_a[first], rows_b[first]
+
+
+class PairMatches:
+    """`match_features` of pairs of a drive's images, each compared once for both orders: neighbours are matched from
+    either side, and again by later steps. Safe to share between threads."""
+
+    def __init__(self, features: Callable[[int], Features], settings: MatchSettings) -> None:
+        def both(a: int, b: int) -> tuple[tuple[Ints, Ints], tuple[Ints, Ints]]:
+            one, other = features(a), features(b)
+            if min(len(one), len(other)) < 2:
+                return match_features(one, other, settings), match_features(other, one, settings)
+            distances = squared_distances(*(each.descriptors[: settings.features] for each in (one, other)))
+            turned = np.ascontiguousarray(distances.T)
+            return (
+                _once(one, other, *_distinct(distances, settings.ratio)),
+                _once(other, one, *_distinct(turned, settings.ratio)),
+            )
+
+        self._both = lru_cache(_REMEMBERED)(both)
+
+    def __call__(self, a: int, b: int) -> tuple[Ints, Ints]:
+        """Rows (K,) of the features of image `a` and of image `b` that match."""
+        return self._both(a, b)[0] if a < b else self._both(b, a)[1]
 
 
 def first_matches(a: Features, b: Features, settings: MatchSettings, needed: int) -> int | None:

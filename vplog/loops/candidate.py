@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from vplog.data import Camera, Features, Floats, Keyframes, Verdict
-from vplog.features.matching import MatchSettings, first_matches, match_features
+from vplog.features.matching import MatchSettings, PairMatches, first_matches, match_features
 from vplog.geometry import se3
 from vplog.loops import undistort, verify_epipolar, verify_metric
 from vplog.loops.calibration import CalibrationSettings, motion_covariance
@@ -35,6 +35,9 @@ class VerifySettings(Settings):
     min_matches: int = Field(default=25, ge=0)
     """Feature matches below which a candidate is rejected before its pose is estimated. Of the 20 inliers required a
     fifth has no landmark, and two images of different places share 16 by chance, seldom 25."""
+    always: int = Field(default=3, ge=1)
+    """Best candidates of a keyframe that are verified in any case; the others are where one of these, or of those of
+    the keyframe before or after, shares enough matches. Of a drive's keyframes most return to nowhere."""
     matching: MatchSettings = MatchSettings()
     """Feature matching."""
     landmarks: LandmarkSettings = LandmarkSettings()
@@ -58,12 +61,13 @@ def lenient(settings: VerifySettings) -> VerifySettings:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """Keyframes, camera, features and settings of a drive, as verification takes them."""
+    """Keyframes, camera, features, settings and matches of a drive, as verification takes them."""
 
     keyframes: Keyframes
     camera: Camera
     features: FeaturesOf
     settings: VerifySettings
+    matches: PairMatches
 
     @cached_property
     def landmarks(self) -> Callable[[int], Landmarks]:
@@ -71,7 +75,9 @@ class Drive:
 
         def make(row: int) -> Landmarks:
             s = self.settings
-            return landmarks_of(row, self.keyframes, self.camera, self.features, s.matching, s.landmarks)
+            return landmarks_of(
+                row, self.keyframes, self.camera, self.features, s.matching.features, self.matches, s.landmarks
+            )
 
         return lru_cache(_REMEMBERED)(make)
 

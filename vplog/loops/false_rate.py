@@ -16,7 +16,8 @@ import numpy as np
 import scipy
 from pydantic import Field
 
-from vplog.data import Bools, Closures, Floats, Ints, Verdict
+from vplog.data import Bools, Closures, Features, Floats, Ints, Verdict
+from vplog.features.matching import PairMatches
 from vplog.features.sift import mirrored
 from vplog.loops.candidate import Drive
 from vplog.loops.propose import Proposals
@@ -75,7 +76,11 @@ def null_pairs(found: Ints, settings: FalseRateSettings) -> int:
 
 def mirrored_evidence(proposals: Proposals, later: Drive, earlier: Drive, execution: Execution) -> Ints:
     """(R,) evidence of proposals (R,) whose query is mirrored: they are no closures, whatever it is."""
-    mirror = replace(later, features=lambda row: mirrored(later.features(row)))
+
+    def features(row: int) -> Features:
+        return mirrored(later.features(row))
+
+    mirror = replace(later, features=features, matches=PairMatches(features, later.settings.matching))
     return evidence(verify_between(proposals, mirror, earlier, execution, share=0.0))
 
 

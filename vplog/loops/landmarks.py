@@ -7,15 +7,18 @@ that measure disparity have one constant error in it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from pydantic import Field
 
 from vplog.data import Camera, Features, Floats, Keyframes
-from vplog.features import matching
+from vplog.features.matching import PairMatches
 from vplog.geometry import se3
+from vplog.geometry.small_matrices import add_inner, add_moved, invert, product, subtract_moved, subtract_outer
 from vplog.loops import undistort
 from vplog.settings import Settings
 
@@ -72,11 +75,13 @@ def landmarks_of(
     keyframes: Keyframes,
     camera: Camera,
     features: FeaturesOf,
-    match: matching.MatchSettings,
+    count: int,
+    matches: PairMatches,
     settings: LandmarkSettings,
 ) -> Landmarks:
-    """The landmarks of keyframe `row`: from depth where its features have any, else from motion."""
-    own = features(row).rows(slice(match.features))  # those that matching looks at
+    """The landmarks of the `count` strongest features of keyframe `row`: from depth where these have any, else from
+    motion, by their matches in the neighbouring keyframes."""
+    own = features(row).rows(slice(count))
     rays = undistort.rays(camera, own.points)
     if np.isfinite(own.depth_m).any():
         return from_depth(rays, own.depth_m.astype(np.float64), camera, settings)
@@ -84,9 +89,8 @@ def landmarks_of(
     rows = [other for other in range(first, last) if other != row]
     observed = np.full((len(rows), len(rays), 2), np.nan)
     for view, other in enumerate(rows):
-        theirs = features(other)
-        mine, found = matching.match_features(own, theirs, match)
-        observed[view, mine] = undistort.rays(camera, theirs.points[found])
+        mine, found = matches(row, other)
+        observed[view, mine] = undistort.rays(camera, features(other).points[found])
     motion = se3.between(keyframes.odom_from_body[rows], keyframes.odom_from_body[row])
     views = se3.inverse(camera.body_from_camera) @ motion @ camera.body_from_camera
     return from_motion(rays, observed, views, camera, settings)
@@ -180,75 +184,133 @@ def _adjust(
     `own` are the keyframe's rays (M, 2) with their information (M, 2, 2), `others` those of the views
     (V, M, 2) with what whitens them (V, M, 2, 2).
     """
-    (rays, information), (observed, whiten) = own, others
-    visible = visible & np.isfinite(_errors(points, observed, views, whiten))
-    residual, by_point, by_view = _linearise(points, observed, views)
-    whiten = np.where(visible[..., None, None], whiten, 0.0)
-    # whitened, and Huber at one sigma: beyond it an error counts linearly
-    error = (whiten @ np.where(visible[..., None], residual, 0.0)[..., None])[..., 0]
-    root = 1.0 / np.sqrt(np.maximum(np.linalg.norm(error, axis=2), 1.0))
-    error, whiten = error * root[..., None], whiten * root[..., None, None]
-    by_point, by_view = whiten @ by_point, whiten @ by_view
-    by_view_t, by_point_t = np.swapaxes(by_view, 2, 3), np.swapaxes(by_point, 2, 3)
-    # the keyframe's own observation constrains x and y; a weak prior on rho keeps blocks without a view invertible
-    point_hessian = (by_point_t @ by_point).sum(axis=0)
-    point_hessian[:, :2, :2] += information
-    point_hessian[:, 2, 2] += 1e-6  # m^2, a sigma of 1000 /m: a millimetre of depth
-    point_gradient = (by_point_t @ error[..., None])[..., 0].sum(axis=0)
-    point_gradient[:, :2] += (information @ (points[:, :2] - rays)[..., None])[..., 0]
+    hessian, gradient, *eliminated = _eliminated(points, views, *own, *others, visible)
     # to first order the prior's error moves with the view: log(start^-1 view exp(d)) = log(start^-1 view) + d
-    size = 6 * len(views)
-    view_hessian = np.zeros((size, size))
-    view_gradient = np.zeros(size)
+    drift = se3.log(se3.between(start, views))
     for v in range(len(views)):
-        block, rows = slice(6 * v, 6 * v + 6), by_view[v].reshape(-1, 6)
-        view_hessian[block, block] = rows.T @ rows + prior[v]
-        drift = se3.log(se3.between(start[v], views[v]))
-        view_gradient[block] = rows.T @ error[v].ravel() + prior[v] @ drift
-    # the landmarks are eliminated: Schur complement
-    cross = np.moveaxis(by_view_t @ by_point, 0, 1).reshape(len(points), size, 3)
-    point_covariance = np.linalg.inv(point_hessian)
-    gain = cross @ point_covariance
-    gains, crosses = (np.moveaxis(m, 1, 0).reshape(size, -1) for m in (gain, cross))
-    view_covariance = np.linalg.inv(view_hessian - gains @ crosses.T)
-    view_step = -view_covariance @ (view_gradient - gains @ point_gradient.ravel())
-    gain_t = np.swapaxes(gain, 1, 2)
-    point_step = -(point_covariance @ point_gradient[..., None])[..., 0] - gain_t @ view_step
-    covariance = point_covariance + (gain_t.reshape(-1, size) @ view_covariance).reshape(gain_t.shape) @ gain
+        block = slice(6 * v, 6 * v + 6)
+        hessian[block, block] += prior[v]
+        gradient[block] += prior[v] @ drift[v]
+    view_covariance = np.linalg.inv(hessian)
+    view_step = -view_covariance @ gradient
+    point_step, covariance = _resolved(view_step, view_covariance, *eliminated)
     return points + point_step, views @ se3.exp(view_step.reshape(-1, 6)), covariance
 
 
-def _project(points: Floats, views: Floats) -> tuple[Floats, Floats, Floats]:
-    """Landmarks as rays (M, 3), and their image (V, M, 2) and depth times rho (V, M, 1) in each view; infinite depth
-    behind it."""
-    bearing = np.column_stack([points[:, :2], np.ones(len(points))])
-    moved = bearing @ np.swapaxes(views[:, :3, :3], 1, 2) + points[:, 2, None] * views[:, None, :3, 3]
-    depth = np.where(moved[..., 2:] > 0, moved[..., 2:], np.inf)
-    return bearing, moved[..., :2] / depth, depth
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _eliminated(points, views, rays, information, observed, whiten, visible):
+    """Hessian (6 V, 6 V) and gradient (6 V,) of the views without the landmarks (the Schur complement), and of each
+    landmark its covariance (M, 3, 3), gradient (M, 3), and what a step of the views moves it by (M, 6 V, 3)."""
+    M, V = len(points), len(views)
+    hessian, gradient = np.zeros((6 * V, 6 * V)), np.zeros(6 * V)
+    covariance, own_gradient, gains = np.zeros((M, 3, 3)), np.zeros((M, 3)), np.zeros((M, 6 * V, 3))
+    cross, own, error = np.empty((6 * V, 3)), np.empty((3, 3)), np.empty(2)
+    by_point, by_view = np.empty((2, 3)), np.empty((2, 6))
+    for m in range(M):
+        cross[:], own[:] = 0.0, 0.0
+        own[:2, :2] = information[m]  # the keyframe's own observation constrains x and y
+        own[2, 2] = 1e-6  # m^2, a sigma of 1000 /m: a weak prior keeps blocks without a view invertible
+        add_moved(own_gradient[m], 0, information[m], points[m, :2] - rays[m])
+        for v in range(V):
+            if not visible[v, m] or not _linearise(points[m], observed[v, m], views[v], error, by_point, by_view):
+                continue
+            if not _whiten(whiten[v, m], error, by_point, by_view):
+                continue
+            add_inner(own, 0, 0, by_point, by_point)
+            add_moved(own_gradient[m], 0, by_point, error)
+            add_inner(hessian, 6 * v, 6 * v, by_view, by_view)
+            add_moved(gradient, 6 * v, by_view, error)
+            add_inner(cross, 6 * v, 0, by_view, by_point)
+        invert(own, 3, covariance[m])
+        product(cross, covariance[m], 1.0, gains[m])
+        subtract_moved(gradient, 0, gains[m], own_gradient[m])
+        subtract_outer(hessian, 0, 0, gains[m], cross)
+    return hessian, gradient, covariance, own_gradient, gains
 
 
-def _linearise(points: Floats, observed: Floats, views: Floats) -> tuple[Floats, Floats, Floats]:
-    """Residuals (V, M, 2) and their derivatives by landmark (V, M, 2, 3) and by view (V, M, 2, 6).
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _whiten(whiten, error, by_point, by_view):
+    """Whiten the error and its derivatives, with Huber's weight at one sigma: beyond it an error counts linearly. False
+    where there is none."""
+    a, b = whiten[0, 0] * error[0] + whiten[0, 1] * error[1], whiten[1, 0] * error[0] + whiten[1, 1] * error[1]
+    root = 1.0 / math.sqrt(max(math.sqrt(a * a + b * b), 1.0))
+    error[0], error[1] = root * a, root * b
+    if not math.isfinite(error[0] + error[1]):
+        return False
+    for derivative in (by_point, by_view):
+        for i in range(derivative.shape[1]):
+            a, b = derivative[0, i], derivative[1, i]
+            derivative[0, i] = root * (whiten[0, 0] * a + whiten[0, 1] * b)
+            derivative[1, i] = root * (whiten[1, 0] * a + whiten[1, 1] * b)
+    return True
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _resolved(view_step, view_covariance, covariance, gradient, gains):
+    """Steps (M, 3) of the landmarks where the views make theirs (6 V,), and covariances with that of the views."""
+    M, size = len(covariance), len(view_step)
+    step, total = np.zeros((M, 3)), covariance.copy()
+    for m in range(M):
+        gain = gains[m]
+        for j in range(3):
+            for k in range(3):
+                step[m, j] -= covariance[m, j, k] * gradient[m, k]
+        for i in range(size):
+            if gain[i, 0] == gain[i, 1] == gain[i, 2] == 0.0:
+                continue
+            a = b = c = 0.0
+            for k in range(size):
+                a += view_covariance[i, k] * gain[k, 0]
+                b += view_covariance[i, k] * gain[k, 1]
+                c += view_covariance[i, k] * gain[k, 2]
+            for j in range(3):
+                step[m, j] -= gain[i, j] * view_step[i]
+                total[m, j, 0] += gain[i, j] * a
+                total[m, j, 1] += gain[i, j] * b
+                total[m, j, 2] += gain[i, j] * c
+    return step, total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _linearise(point, observed, view, error, by_point, by_view):
+    """Write the error (2,) of a landmark in a view, and its derivatives by landmark (2, 3) and by view (2, 6); False
+    behind it.
 
     A view moves as view exp(d), d in the keyframe's camera.
     """
-    rotation, translation = views[:, None, :3, :3], views[:, None, :3, 3]
-    bearing, image, depth = _project(points, views)
-    by_moved = np.zeros((*image.shape, 3))
-    by_moved[..., 0, 0] = by_moved[..., 1, 1] = 1.0 / depth[..., 0]
-    by_moved[..., :, 2] = -image / depth
-    turned = by_moved @ rotation
-    by_point = np.concatenate([turned[..., :2], by_moved @ translation[..., None]], axis=-1)
-    by_view = np.concatenate([-turned @ se3.skew(bearing), turned * points[:, 2, None, None]], axis=-1)
-    return image - observed, by_point, by_view
+    x, y, rho = point[0], point[1], point[2]
+    depth = view[2, 0] * x + view[2, 1] * y + view[2, 2] + view[2, 3] * rho
+    if not depth > 0.0:
+        return False
+    for k in range(2):
+        image = (view[k, 0] * x + view[k, 1] * y + view[k, 2] + view[k, 3] * rho) / depth
+        error[k] = image - observed[k]
+        a = (view[k, 0] - image * view[2, 0]) / depth
+        b = (view[k, 1] - image * view[2, 1]) / depth
+        c = (view[k, 2] - image * view[2, 2]) / depth
+        by_point[k, 0], by_point[k, 1], by_point[k, 2] = a, b, (view[k, 3] - image * view[2, 3]) / depth
+        # -(a, b, c) skew((x, y, 1))
+        by_view[k, 0], by_view[k, 1], by_view[k, 2] = c * y - b, a - c * x, b * x - a * y
+        by_view[k, 3], by_view[k, 4], by_view[k, 5] = a * rho, b * rho, c * rho
+    return True
 
 
-def _errors(points: Floats, observed: Floats, views: Floats, px_from_ray: Floats) -> Floats:
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _errors(points, observed, views, px_from_ray):
     """(V, M) reprojection errors in px, by `px_from_ray` (V, M, 2, 2); infinite behind a view, NaN where not
     observed."""
-    _, image, depth = _project(points, views)
-    error = (px_from_ray @ (image - observed)[..., None])[..., 0]
-    return np.where(np.isfinite(depth[..., 0]), np.linalg.norm(error, axis=2), np.inf)
+    result = np.full(observed.shape[:2], np.inf)
+    for v in range(len(views)):
+        view = views[v]
+        for m in range(len(points)):
+            x, y, rho = points[m, 0], points[m, 1], points[m, 2]
+            depth = view[2, 0] * x + view[2, 1] * y + view[2, 2] + view[2, 3] * rho
+            if depth > 0.0:
+                a = (view[0, 0] * x + view[0, 1] * y + view[0, 2] + view[0, 3] * rho) / depth - observed[v, m, 0]
+                b = (view[1, 0] * x + view[1, 1] * y + view[1, 2] + view[1, 3] * rho) / depth - observed[v, m, 1]
+                to_px = px_from_ray[v, m]
+                result[v, m] = math.hypot(to_px[0, 0] * a + to_px[0, 1] * b, to_px[1, 0] * a + to_px[1, 1] * b)
+    return result
 
 
 def _linear_inverse_depth(rays: Floats, observed: Floats, views: Floats, visible: np.ndarray) -> Floats:

@@ -16,6 +16,7 @@ import scipy
 
 from vplog.data import Bools, Floats
 from vplog.geometry import se3
+from vplog.geometry.small_matrices import invert
 
 _HUBER = 1.5
 """Sigmas beyond which an error counts linearly: 96 % as efficient as least squares on Gaussian errors (Huber 1981)."""
@@ -149,7 +150,7 @@ def _weigh(by_point, covariance, noise, variance, size, weight):
             total[i, j] += noise[i, j]
     if size == 3:
         total[2, 2] += variance
-    _invert(total, size, weight)
+    invert(total, size, weight)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -203,25 +204,3 @@ def _predict(T, point, predicted, by_point, by_pose):
         by_pose[i, 3], by_pose[i, 4], by_pose[i, 5] = -first * rho, -second * rho, -last * rho
     by_point[2, 2] += depth
     return True
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _invert(matrix, size, result):
-    """Write the inverse of the symmetric upper left `size` x `size`, 2 or 3."""
-    a, b, d = matrix[0, 0], matrix[0, 1], matrix[1, 1]
-    if size == 2:
-        determinant = a * d - b * b
-        result[0, 0], result[1, 1] = d / determinant, a / determinant
-        result[0, 1] = result[1, 0] = -b / determinant
-        return
-    c, e, f = matrix[0, 2], matrix[1, 2], matrix[2, 2]
-    xx, xy, xz = d * f - e * e, c * e - b * f, b * e - c * d
-    determinant = a * xx + b * xy + c * xz
-    result[0, 0], result[1, 1], result[2, 2] = (
-        xx / determinant,
-        (a * f - c * c) / determinant,
-        (a * d - b * b) / determinant,
-    )
-    result[0, 1] = result[1, 0] = xy / determinant
-    result[0, 2] = result[2, 0] = xz / determinant
-    result[1, 2] = result[2, 1] = (b * c - a * e) / determinant

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.data import Camera, Closures, Floats, Int32s, Ints, Keyframes, Verdict
+from vplog.features.matching import PairMatches
 from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.loops.calibration import body_twists, motion_covariance, rotation_share, stamp_covariance, turning_pairs
@@ -28,6 +29,7 @@ def drive_of(
     camera: Camera,
     features: FeaturesOf,
     settings: VerifySettings,
+    matches: PairMatches | None = None,
 ) -> Drive:
     """A drive as its candidates are checked.
 
@@ -40,7 +42,7 @@ def drive_of(
         if camera.baseline_m is not None:
             stereo = for_stereo(settings.landmarks, focal_px, camera.baseline_m)
             settings = settings.model_copy(update={"landmarks": stereo})
-    return Drive(keyframes, camera, features, settings)
+    return Drive(keyframes, camera, features, settings, matches or PairMatches(features, settings.matching))
 
 
 def verify_between(

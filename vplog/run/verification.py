@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vplog.data import Camera, Closures, Ints, Keyframes
+from vplog.data import Camera, Closures, Ints, Keyframes, Verdict
 from vplog.execution.execution import Execution
 from vplog.loops.candidate import Drive
 from vplog.loops.propose import Proposals
@@ -34,20 +34,32 @@ class DriveFeatures:
 
 def for_verification(drive: DriveFeatures) -> Drive:
     """Raises LogError for a calibrated camera with an unknown distortion model."""
-    return drive_of(drive.keyframes, drive.camera, drive.features.__getitem__, drive.settings)
+    features, settings = drive.features, drive.settings
+    matches = features.matches(settings.matching)
+    return drive_of(drive.keyframes, drive.camera, features.__getitem__, settings, matches)
 
 
 @step("verify", items=lambda proposals, *_: len(proposals.query))
 def verify(proposals: Proposals, drive: DriveFeatures, *, steps: Steps) -> Closures:
     """The ledger of `loops.verify.verify_between`, whose row depends on its two frames and the calibration alone.
 
-    A part has all candidates of some map frames, whose landmarks are made once all the same.
+    The best candidates of every keyframe are verified, and the others where one of those, or of a neighbouring
+    keyframe's, shows the same view; where none does they are left out. A part has all candidates of some map frames,
+    whose landmarks are made once all the same.
     """
-    places = _parts(proposals.match)
-    if not places:
+    if not len(proposals.query):
         return no_closures()
-    share = calibrated(drive, steps)
-    return merged(steps.in_parts(verify_part, [(proposals.rows(rows), share, drive) for rows in places]), places)
+    share, best = calibrated(drive, steps), proposals.rank < drive.settings.always
+
+    def verified(rows: Ints) -> Closures:
+        parts = [rows[part] for part in _parts(proposals.match[rows])]
+        return merged(steps.in_parts(verify_part, [(proposals.rows(part), share, drive) for part in parts]), parts)
+
+    first = verified(np.flatnonzero(best))
+    alike = first.query[~first.of(Verdict.TOO_FEW_MATCHES)]
+    near = np.isin(proposals.query, np.concatenate([alike - 1, alike, alike + 1]))
+    more = np.flatnonzero(~best & near)
+    return merged([first, verified(more)], [np.flatnonzero(best), more]) if len(more) else first
 
 
 def calibrated(drive: DriveFeatures, steps: Steps) -> float:

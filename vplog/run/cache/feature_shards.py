@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from vplog.data import Features
 from vplog.errors import ResultError
+from vplog.features.matching import MatchSettings, PairMatches
 from vplog.features.store import SIFT_BYTES, features_from, features_to, size_of
 from vplog.run.cache.stage_cache import CONTENT_AT, AbsentError, DamagedError
 
@@ -57,6 +58,7 @@ class Extracted:
         """CPU time of features, where the parts say it."""
         self.files: list[str] = []
         self._rows: list[tuple[Path, int, _Row]] = []
+        self._matches: dict[MatchSettings, PairMatches] = {}
 
     def add(self, path: Path) -> None:
         """Take the keyframes of the next part. Raises DamagedError, and AbsentError where there is no such file."""
@@ -99,6 +101,10 @@ class Extracted:
         path, begin, row = self._rows[at]
         data = _bytes_at(path, begin + row.offset, row.size)
         return features_from(data, row.features, row.width, row.height, bool(row.thumbnail), row.values)
+
+    def matches(self, settings: MatchSettings) -> PairMatches:
+        """Matches of pairs of keyframes, shared by the steps of a run."""
+        return self._matches.setdefault(settings, PairMatches(self.__getitem__, settings))
 
     @property
     def counts(self) -> list[int]:
