@@ -115,7 +115,7 @@ class _Equations:
         """Raises LinAlgError where the equations are indeterminate."""
         step = np.zeros(6 * len(poses))
         factor = scipy.linalg.cho_factor(self.hessian, check_finite=False)
-        step[6:] = -scipy.linalg.cho_solve(factor, self.gradient, check_finite=False)
+        step[6:] = -np.asarray(scipy.linalg.cho_solve(factor, self.gradient, check_finite=False))
         step = step.reshape(-1, 6)
         by_views = np.add.reduceat((step[self.view, None] @ self.gains)[:, 0], self.first)
         return poses @ se3.exp(step), points + self.own - by_views
