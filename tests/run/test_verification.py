@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.results.example import make_run
-from vplog.data import Closures
+from vplog.data import Closures, Verdict
+from vplog.loops.candidate import VerifySettings
+from vplog.loops.propose import Proposals
 from vplog.run import verification
 from vplog.run.cache.codecs import closures_codec
 from vplog.run.cache.stage_cache import digest_of
@@ -31,6 +34,33 @@ def test_a_ledger_in_parts_is_the_ledger(size: int, monkeypatch: pytest.MonkeyPa
     assert found.verdict == known.verdict
     nothing = _taken(known, np.empty(0, np.int64))
     assert len(codec.from_bytes(codec.to_bytes(nothing))) == 0
+
+
+def test_candidates_behind_the_best_are_verified_where_better_ones_show_the_view(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of six keyframes with four candidates each the third has one that shares enough matches, at rank 1."""
+    query, rank = (grid.ravel().astype(np.int32) for grid in np.mgrid[10:16, 0:4])
+    proposals = Proposals(query, rank * 2, rank, np.ones(24, np.float32), rank)
+    known = make_run(3).closures
+
+    def verified(_: Any, parts: list[Any]) -> list[Closures]:
+        return [ledger(part) for part, *_ in parts]
+
+    def ledger(part: Proposals) -> Closures:
+        alike = (part.query == 12) & (part.rank == 1)
+        verdict = [Verdict.TOO_FEW_INLIERS if one else Verdict.TOO_FEW_MATCHES for one in alike]
+        return replace(known.rows(np.zeros(len(part.query), np.int64)), **vars(part), verdict=verdict)
+
+    monkeypatch.setattr(verification, "calibrated", lambda *_: 0.0)
+    for always, expected in ((1, {0}), (2, {0, 1}), (9, {0, 1, 2, 3})):
+        drive: Any = SimpleNamespace(settings=VerifySettings(always=always))
+        steps: Any = SimpleNamespace(in_parts=verified)
+        found = verification.verify(proposals, drive, steps=steps)
+        ranks = {one: set(found.rank[found.query == one].tolist()) for one in range(10, 16)}
+        near = {0, 1, 2, 3} if always > 1 else expected
+        assert [ranks[one] for one in range(10, 16)] == [expected, near, near, near, expected, expected]
+        assert np.lexsort((found.rank, found.query)).tolist() == list(range(len(found)))
 
 
 def _taken(closures: Closures, rows: Any) -> Closures:
