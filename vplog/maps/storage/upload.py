@@ -92,7 +92,7 @@ class SentRun:
     """A finished run folder on an object store, which no snapshot names yet."""
 
     entry: dict[str, Any]
-    """What the manifest is to say of it."""
+    """Entry of the drive in the manifest."""
     began: float
     """Time before which nothing of it was sent, by the clock of the writer that commits it."""
 
@@ -160,7 +160,7 @@ def publish(mirror: Mirror, drive: str, sent: SentRun, made: Path) -> str:
 
 
 def _renamed(remote: RemotePath, sent: SentRun, drive: str) -> SentRun:
-    """The same run folder under another ID, copied within the store. Raises ResultError."""
+    """Copy of a run folder under another ID, made within the store. Raises ResultError."""
     files, name, record = sent.entry["files"], "keyframes.parquet", renamed(sent.entry["record"], drive)
     new = SentRun({**sent.entry, "record": record, "generation": secrets.token_hex(8)}, sent.began)
     with scratch("renamed") as folder, store_errors(remote):
