@@ -15,7 +15,7 @@ from vplog.batch.log_hashes import known_hashes
 from vplog.batch.plan import DriveInput
 from vplog.execution.execution import Execution
 from vplog.logs import TopicChoice
-from vplog.logs.formats.mcap_file import MAGIC
+from vplog.logs.formats.mcap_layout import MAGIC
 from vplog.results.run_record import read_run_json
 
 if TYPE_CHECKING:

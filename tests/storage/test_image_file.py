@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vplog.logs.detect import open_log
-from vplog.logs.topic_selection import TopicChoice
+from vplog import logs
 from vplog.storage.image_file import BadImageError, decode_image
 
 if TYPE_CHECKING:
@@ -169,7 +168,7 @@ def test_tiff_is_read_and_a_cut_one_is_not(compression: str | None, pixels: np.n
 def test_a_folder_of_tiff_is_a_log(tmp_path: Path) -> None:
     for number in range(4):
         (tmp_path / f"{number:03d}.tiff").write_bytes(FILES["tiff"])
-    log = open_log(tmp_path, TopicChoice())
+    log = logs.open(tmp_path)
     frames = log.frames(log.stamps())
     assert [frame.decode().image.shape for frame in frames] == [(120, 160)] * 4
 

@@ -130,10 +130,10 @@ def _logs_at(place: Path) -> list[Path]:
     """The log at a place, those below it, or those that match it."""
     text = place.url if isinstance(place, RemotePath) else str(place)
     if "*" not in text or place.exists():
-        return logs.below(place)
+        return logs.logs_below(place)
     if not (found := _matching(text)):
         raise LogError(f"No log matches {place}. Check the pattern; * stands for any part of a name, ** for folders.")
-    return [log for one in sorted(found, key=lambda one: natural_order(str(one))) for log in logs.below(one)]
+    return [log for one in sorted(found, key=lambda one: natural_order(str(one))) for log in logs.logs_below(one)]
 
 
 def _matching(pattern: str) -> list[Path]:

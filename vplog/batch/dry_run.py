@@ -87,7 +87,7 @@ def _sizes(one: PlannedDrive) -> dict[str, Any]:
     images, seconds, error, size = 0, 0.0, one.error, 0
     if one.state == "compute":
         try:
-            images, seconds = logs.summary(one.given.log, one.given.topics)
+            images, seconds = logs.open(one.given.log, one.given.topics).summary()
             size = _bytes(one.given.log)
         except (VplogError, OSError) as problem:
             error = str(problem)

@@ -11,12 +11,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
+import zstandard
+
 from vplog.errors import LogError, nearest_path, plural
 from vplog.logs import image_folder
 from vplog.logs.datasets import colmap, euroc, kitti, tum_rgbd, utm_images, video, vslam_lab
 from vplog.logs.datasets.images import read as read_images
 from vplog.logs.datasets.streams import DataSet, DataSetContainer
-from vplog.logs.formats import mcap_file, ros1_bag, sqlite_bag
+from vplog.logs.formats import mcap_layout, ros1_layout, sqlite_bag
 from vplog.logs.formats.compression import fetched, unpacked
 from vplog.logs.formats.container import Container, Contents, Notes
 from vplog.logs.formats.mcap_file import McapFile
@@ -35,9 +37,10 @@ from vplog.logs.topic_selection import EVERY_IMAGE, TopicChoice
 from vplog.storage.remote_path import RemotePath, located, names_below
 
 _RESULTS = {"run.json": "a run", "map.json": "a map", "library.json": "a library"}
-_MAGIC = {mcap_file.MAGIC: "mcap", ros1_bag.MAGIC: "ros1", sqlite_bag.MAGIC: "db3", b"\x28\xb5\x2f\xfd": "zstd"}
-_READERS = {"mcap": McapFile, "ros1": Ros1Bag, "db3": SqliteBag}
-_KINDS = {"mcap": "mcap", "ros1": "ros1", "db3": "ros2-db3"}
+_MAGIC = {
+    mcap_layout.MAGIC: "mcap", ros1_layout.MAGIC: "ros1", sqlite_bag.MAGIC: "ros2-db3", zstandard.FRAME_HEADER: "zstd",
+}  # fmt: skip
+_READERS = {"mcap": McapFile, "ros1": Ros1Bag, "ros2-db3": SqliteBag}
 _DATA_SETS = (kitti, euroc, vslam_lab, tum_rgbd, colmap, utm_images)
 _LOG_NAME = re.compile(r"\.(mcap|bag|db3)(\.zstd?)?$", re.IGNORECASE)
 """Names of logs among other files: to look into each of a bucket costs a request."""
@@ -55,9 +58,10 @@ _KNOWN = (
 )
 
 
-def open_log(path: Path, choice: TopicChoice) -> RecordedLog:
-    """The log at `path`. Raises LogError where there is none that vplog reads."""
-    path, notes = located(path), Notes()
+def open(path: Path, topics: TopicChoice | None = None) -> RecordedLog:
+    """The drive at `path`, its kind found by content, its topics by the rules of `topic_selection.py` or by name.
+    Raises LogError where there is no log, or where a topic of `topics` is not in it."""
+    path, choice, notes = located(path), topics or TopicChoice(), Notes()
     try:
         _check_there(path)
         return _open_folder(path, choice, notes) if path.is_dir() else _open_file(path, choice, notes)
@@ -65,8 +69,8 @@ def open_log(path: Path, choice: TopicChoice) -> RecordedLog:
         raise _unreadable(path, error) from None
 
 
-def check_log(path: Path) -> None:
-    """Raises LogError where there is nothing that could be a log, by the first bytes of files."""
+def check(path: Path) -> None:
+    """Raises LogError where there is nothing at `path` that looks like a log; of a file a few bytes are read."""
     path = located(path)
     try:
         _check_there(path)
@@ -83,8 +87,8 @@ def check_log(path: Path) -> None:
 
 
 def logs_below(path: Path) -> list[Path]:
-    """The logs in a folder by their names, a few levels deep: bags, folders of bags, data sets. The path itself where
-    it is one drive, or nothing is found there or can be read, as opening it says."""
+    """The logs in a folder, or under a prefix of an object store, by their names, a few levels deep. The path itself
+    where it is one drive, or nothing is found there or can be read, as opening it says."""
     path = located(path)
     try:
         if _LOG_NAME.search(path.name) or not path.is_dir() or len(_data_sets(path)) == 1:
@@ -130,7 +134,7 @@ def _open_file(path: Path, choice: TopicChoice, notes: Notes) -> RecordedLog:
             raise LogError(f"{path} is a video, and videos are read from local files. Copy it to this machine.")
         return _published(path, path.stem, video.read(path), notes, choice)
     container, kind = open_container(path, notes)
-    return _recorded(path, _name(path), _KINDS[kind], container, notes, choice)
+    return _recorded(path, _name(path), kind, container, notes, choice)
 
 
 def _published(path: Path, name: str, found: DataSet, notes: Notes, choice: TopicChoice) -> RecordedLog:
@@ -156,7 +160,7 @@ def open_container(path: Path, notes: Notes, name: str = "") -> tuple[Container,
             raise LogError(
                 _no_log(path) if inside is path else f"{path} does not hold a log when unpacked. A log is {_KNOWN}."
             )
-        if kind == "db3" and isinstance(inside, RemotePath):  # SQLite reads local files only
+        if kind == "ros2-db3" and isinstance(inside, RemotePath):  # SQLite reads local files only
             inside = copies.enter_context(fetched(inside))
         container = _READERS[kind](inside, notes, name or path.name)
         weakref.finalize(container, copies.pop_all().close)  # a process may read thousands of logs
@@ -172,11 +176,12 @@ class _Part(NamedTuple):
     contents: Contents
 
 
-def open_drive(paths: Sequence[Path], choice: TopicChoice) -> RecordedLog:
-    """Files of one drive, given in any order, as one log. Raises LogError where they cannot be."""
-    paths = [located(path) for path in paths]
+def open_drive(paths: Sequence[Path], topics: TopicChoice | None = None) -> RecordedLog:
+    """One drive recorded in several files, in any order. Raises LogError where they overlap in time, lie far apart,
+    differ in kind or have no topic in common."""
     if len(paths) == 1:
-        return open_log(paths[0], choice)
+        return open(paths[0], topics)
+    paths = [located(path) for path in paths]
     notes, parts = Notes(), []
     for path in paths:
         _check_there(path)
@@ -194,7 +199,7 @@ def open_drive(paths: Sequence[Path], choice: TopicChoice) -> RecordedLog:
         raise LogError(f"None of the {len(paths)} files can be read. {notes.account.sentences[0]}")
     parts = _in_order_of_time(parts)
     first, chain = parts[0], Chain([part.container for part in parts], notes)
-    return _recorded(first.path, _name(first.path), _KINDS[first.kind], chain, notes, choice)
+    return _recorded(first.path, _name(first.path), first.kind, chain, notes, topics or TopicChoice())
 
 
 def _in_order_of_time(parts: list[_Part]) -> list[_Part]:
@@ -266,9 +271,10 @@ def _data_sets(path: Path) -> list[Path]:
     return []
 
 
-def open_images(files: Sequence[Path], choice: TopicChoice) -> RecordedLog:
-    """Files of images as one log, each once, in natural order of their names or by the times in them."""
-    paths = [located(file) for file in dict.fromkeys(files)]
+def open_images(files: Sequence[Path], topics: TopicChoice | None = None) -> RecordedLog:
+    """Files of images of one camera, in any folders, each once, in natural order of their names or by the times in
+    them. Raises LogError where one is no image."""
+    paths, choice = [located(file) for file in dict.fromkeys(files)], topics or TopicChoice()
     for path in paths:
         try:
             _check_there(path)
@@ -279,6 +285,14 @@ def open_images(files: Sequence[Path], choice: TopicChoice) -> RecordedLog:
     root = Path(os.path.commonpath([path.absolute().parent for path in paths]))
     found = read_images(root, [path.absolute() for path in paths], (), choice.model_copy(update={"image": EVERY_IMAGE}))
     return _published(root, root.name, found, Notes(), choice.model_copy(update={"image": None}))
+
+
+def is_image_file(path: Path) -> bool:
+    """Whether a file is an image by its first bytes; not where it cannot be read."""
+    try:
+        return path.is_file() and image_folder.is_image(path)
+    except OSError:
+        return False
 
 
 def _images_in(path: Path, files: list[Path]) -> tuple[list[Path], set[Path]] | None:
@@ -350,8 +364,7 @@ def _name(path: Path) -> str:
 
 
 def _magic(path: Path) -> str:
-    with path.open("rb") as file:
-        head = file.read(max(map(len, _MAGIC)))
+    head = image_folder.first_bytes(path, max(map(len, _MAGIC)))
     return next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), "")
 
 
@@ -365,6 +378,4 @@ def _no_folder(path: Path, files: list[Path]) -> str:
 def _no_log(path: Path) -> str:
     if path.stat().st_size == 0:
         return f"{path} is empty (0 bytes). Was the recording stopped before anything was written?"
-    with path.open("rb") as file:
-        head = file.read(8)
-    return f"{path} starts with {head!r}, which no log does. A log is {_KNOWN}."
+    return f"{path} starts with {image_folder.first_bytes(path, 8)!r}, which no log does. A log is {_KNOWN}."

@@ -251,7 +251,7 @@ class TopicCollector:
                 known.add(calibration, message.data, position)
             case PoseMessage() as pose if channel in self.poses:
                 self.poses[channel].add(pose, message.log_ns, position)
-            case PathMessage(stamp_ns, _, poses):
+            case PathMessage(stamp_ns, poses):
                 late_ns = message.log_ns - stamp_ns
                 for pose in poses:
                     self.poses[channel].add(pose, max(pose.stamp_ns + late_ns, 0), position)

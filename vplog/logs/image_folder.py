@@ -37,11 +37,11 @@ _SIZED = 16
 
 def is_image(path: Path) -> bool:
     """By the first bytes: JPEG, PNG, WebP, BMP, TIFF, PNM."""
-    head = _head(path, 12)
+    head = first_bytes(path, 12)
     return head.startswith(_SIGNATURES) or (head[:4] == b"RIFF" and head[8:] == b"WEBP")
 
 
-def _head(path: Path, count: int) -> bytes:
+def first_bytes(path: Path, count: int) -> bytes:
     with path.open("rb") as file:
         return file.read(count)
 
@@ -169,7 +169,7 @@ def _by_bits(files: list[Path]) -> Group:
 
 def _bits(file: Path) -> str:
     """`16 bits`, `8 bits`, or nothing where the file is damaged or of another kind."""
-    head = _head(file, 25)
+    head = first_bytes(file, 25)
     return "" if head[:8] != PNG or len(head) < 25 else "16 bits" if head[24] == 16 else "8 bits"
 
 

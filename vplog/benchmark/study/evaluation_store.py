@@ -60,7 +60,7 @@ class Bench:
 
     names: list[str]
     """Names of the drives, short and different."""
-    logs: list[Log]
+    logs: Sequence[Log]
     hashes: list[str]
     """Hashes of the drives' files."""
     methods: dict[str, Any]

@@ -15,6 +15,7 @@ from vplog.data import Bytes, Ints
 from vplog.errors import LogError
 from vplog.logs.datasets.streams import DataSet, Stream, raw_image
 from vplog.logs.formats.container import Channel
+from vplog.logs.image_folder import first_bytes
 from vplog.logs.messages.records import BadMessageError, ImageMessage
 from vplog.logs.messages.video import (
     MAX_PIXELS,
@@ -53,8 +54,7 @@ class _Packet(NamedTuple):
 
 def is_video(path: Path) -> bool:
     """By the first bytes: ISO base media, Matroska and WebM, AVI."""
-    with path.open("rb") as file:
-        head = file.read(12)
+    head = first_bytes(path, 12)
     return head[4:8] == b"ftyp" or head[:4] == b"\x1a\x45\xdf\xa3" or (head[:4] == b"RIFF" and head[8:] == b"AVI ")
 
 

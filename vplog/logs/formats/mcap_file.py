@@ -19,10 +19,8 @@ from vplog.logs.formats.chunk_layout import Chunk, ChunkLosses
 from vplog.logs.formats.compression import BadChunkError, crc32, unpack
 from vplog.logs.formats.container import BRIEF, Channel, Contents, Message, Notes, Octets, Place, part_of
 from vplog.logs.formats.loss_account import sampled
-from vplog.logs.formats.mcap_layout import MAGIC, RECORD, read_layout
+from vplog.logs.formats.mcap_layout import RECORD, read_layout
 from vplog.storage.remote_path import RemotePath
-
-__all__ = ["MAGIC", "McapFile"]
 
 _IDL = ("ros2idl", "omgidl")
 """Schema languages whose writers may name types as C++ and DDS do."""

@@ -11,12 +11,11 @@ from vplog.logs.formats.chunk_layout import ChunkLosses
 from vplog.logs.formats.compression import BadChunkError, unpack
 from vplog.logs.formats.container import Channel, Contents, Message, Notes, Octets, Place, part_of
 from vplog.logs.formats.loss_account import sampled
-from vplog.logs.formats.ros1_layout import CONNECTION, MAGIC, MESSAGE, fields, number, read_layout, time_ns
+from vplog.logs.formats.ros1_layout import CONNECTION, MESSAGE, fields, number, read_layout, time_ns
 from vplog.storage.remote_path import RemotePath
 
 _FIELDS = {MESSAGE: {b"conn", b"time"}, CONNECTION: {b"conn", b"topic"}}
 """Header fields of each kind of record in the chunks."""
-__all__ = ["MAGIC", "Ros1Bag"]
 
 
 class Ros1Bag:

@@ -12,14 +12,6 @@ from vplog.logs.formats.container import Channel, Octets
 from vplog.logs.messages.records import ENCODINGS, BadMessageError, PoseMessage, Record, nanoseconds, short_type
 from vplog.logs.messages.ros import decode_ros
 
-_STAMPS = {
-    ("cdr", True): struct.Struct("<4xiI"),
-    ("cdr", False): struct.Struct(">4xiI"),
-    ("ros1", True): struct.Struct("<4xII"),
-}
-"""Stamps in ROS headers, by encoding and whether little endian: behind CDR's encapsulation or ROS 1's sequence
-number."""
-
 _NUMBERS = {
     "nav_msgs/Odometry": (7 + 36, 6 + 36),
     "geometry_msgs/PoseWithCovarianceStamped": (7 + 36, 0),
@@ -51,10 +43,10 @@ def decode(channel: Channel, data: Octets | Record) -> Record:
 def stamp_of(channel: Channel, data: Octets | Record) -> int:
     """The header stamp in ns, of ROS without looking at the rest. Raises BadMessageError."""
     if channel.encoding in ("cdr", "ros1") and isinstance(data, bytes | memoryview):
-        if len(data) < 12:
+        if len(data) < _HEAD:
             raise BadMessageError(f"{len(data)} bytes are too few for a header")
-        little = channel.encoding == "ros1" or data[1] == 1
-        return nanoseconds(*_STAMPS[channel.encoding, little].unpack_from(data))
+        cdr, order = channel.encoding == "cdr", "<" if channel.encoding == "ros1" or data[1] == 1 else ">"
+        return nanoseconds(*struct.unpack_from(f"{order}{'i' if cdr else 'I'}I", data, 4))
     record = decode(channel, data)
     return 0 if isinstance(record, list) else record.stamp_ns
 

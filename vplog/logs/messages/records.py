@@ -81,7 +81,6 @@ class PathMessage(NamedTuple):
     """The poses of a drive up to now."""
 
     stamp_ns: int
-    frame: str
     poses: list[PoseMessage]
 
 

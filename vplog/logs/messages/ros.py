@@ -217,7 +217,7 @@ def _path(fields: _Fields) -> Record:
     stamp_ns, frame = fields.header()
     count = fields.numbers("I")[0]
     poses = [_pose(fields, "7d") for _ in range(count)]
-    return PathMessage(stamp_ns, frame, [pose if pose.frame else pose._replace(frame=frame) for pose in poses])
+    return PathMessage(stamp_ns, [pose if pose.frame else pose._replace(frame=frame) for pose in poses])
 
 
 def _imu(fields: _Fields) -> Record:
