@@ -24,7 +24,7 @@ from vplog.cli.parser import Parser, flag, option, place
 from vplog.cli.printing import print_json, print_result, print_status
 from vplog.cli.progress import Progress, events_of
 from vplog.cli.results import add_results
-from vplog.errors import LogError, VplogError, causes, plural, was_interrupted
+from vplog.errors import LogError, ResultError, VplogError, causes, plural, was_interrupted
 from vplog.execution.cores import available, limited
 from vplog.execution.execution import Execution
 from vplog.storage.urls import without_secrets
@@ -277,8 +277,6 @@ def schemas(arguments: argparse.Namespace) -> None:
 
 
 def _folder(path: Path) -> None:
-    from vplog.errors import ResultError
-
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

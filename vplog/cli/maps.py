@@ -13,7 +13,7 @@ from vplog.cli import parser, printing
 from vplog.cli.parser import call, flag, option, place
 from vplog.cli.printing import print_result
 from vplog.cli.progress import Progress, one_stage
-from vplog.errors import plural
+from vplog.errors import ResultError, SettingsError, plural
 from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
@@ -137,8 +137,6 @@ def _end(
     arguments: argparse.Namespace, found: dict[str, Any], shown: Callable[[dict[str, Any]], None], wrong: str
 ) -> None:
     """Print the result of a batch. Raises ResultError where drives failed, even where stdout is closed."""
-    from vplog.errors import ResultError
-
     try:
         print_result(arguments, found, shown)
     finally:
@@ -151,7 +149,6 @@ def _end(
 
 def info_map(arguments: argparse.Namespace) -> None:
     """Show the drives, places and library of a map, and what failed."""
-    from vplog.errors import ResultError
     from vplog.maps.info import describe_map
 
     with one_stage(arguments, "check" if arguments.check else "read"):
@@ -180,7 +177,6 @@ def localize(arguments: argparse.Namespace) -> None:
 def serve_map(arguments: argparse.Namespace) -> None:
     """Answer queries and localisations over HTTP, read only, until Ctrl-C: POST an image to /query or /localize. A map
     that changes meanwhile is read again. There is no login: other machines come through a proxy that has one."""
-    from vplog.errors import SettingsError
     from vplog.maps.storage.download_cache import cache_in
 
     try:

@@ -92,6 +92,20 @@ def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         print_line("", ", ".join(f"{' '.join(title.split())} {cell}" for title, cell in named if cell))
 
 
+def print_records(columns: dict[str, str], records: Iterable[dict[str, Any]]) -> None:
+    """A table of records: by title the name of a field and its format, as `seconds:.1f`; what is None is blank."""
+    rows = [[_cell(record, *column.partition(":")[::2]) for column in columns.values()] for record in records]
+    print_table([*columns], rows)
+
+
+def _cell(record: dict[str, Any], name: str, form: str) -> str:
+    return "" if record[name] is None else format(record[name], form)
+
+
+def _tags(record: dict[str, Any]) -> str:
+    return " ".join(map("=".join, record["tags"].items()))
+
+
 def print_diff(found: dict[str, Any]) -> None:
     def cell(value: Any) -> str:
         return f"{value:.6g}" if isinstance(value, float) else "-" if value is None else str(value)
@@ -125,12 +139,9 @@ def print_info(found: dict[str, Any]) -> None:
     seconds = max(found["end_ns"] - found["start_ns"], 0) / 1e9
     print(f"log       {found['path']}")
     print_line("kind", f"{found['kind']}, {plural(found['messages'], 'message')} over {seconds:.1f} s")
-    rows = []
-    for topic in found["topics"]:
-        rate = "" if topic["rate_hz"] is None else f"{topic['rate_hz']:.1f}"
-        used = "yes" if topic["used"] else ""
-        rows.append((topic["name"], topic["type"], str(topic["count"]), rate, topic["role"], used, topic["why"]))
-    print_table(("topic", "type", "count", "Hz", "role", "used", "why"), rows)
+    topics = [topic | {"used": "yes" if topic["used"] else ""} for topic in found["topics"]]
+    columns = {"topic": "name", "type": "type", "count": "count", "Hz": "rate_hz:.1f"}
+    print_records(columns | {one: one for one in ("role", "used", "why")}, topics)
     for name, text in preflight_lines(found):
         print_line(name, text)
     for gap in found["gaps"]:
@@ -235,17 +246,11 @@ def print_evaluation(found: dict[str, Any]) -> None:
 
 
 def print_evaluated_map(found: dict[str, Any]) -> None:
-    def figures(one: dict[str, Any]) -> list[str]:
-        known = [(one[name], form) for name, form in (("ate_m", ".3f"), ("recall", ".3f"), ("false_closures", "d"))]
-        return ["" if value is None else f"{value:{form}}" for value, form in known]
-
-    rows = [
-        (one["drive"], " ".join(map("=".join, one["tags"].items())), one["vplog"] or "", *figures(one), one["error"])
-        for one in found["drives"]
-    ]
-    print_table(("drive", "tags", "vplog", "ATE m", "recall", "false", "error"), rows)
-    groups = [(name, str(one["drives"]), *figures(one)) for name, one in found["groups"].items()]
-    print_table(("mean of", "drives", "ATE m", "recall", "false"), groups)
+    figures = {"ATE m": "ate_m:.3f", "recall": "recall:.3f", "false": "false_closures"}
+    drives = [one | {"tags": _tags(one)} for one in found["drives"]]
+    print_records({"drive": "drive", "tags": "tags", "vplog": "vplog", **figures, "error": "error"}, drives)
+    groups = [one | {"group": name} for name, one in found["groups"].items()]
+    print_records({"mean of": "group", "drives": "drives", **figures}, groups)
 
 
 def _truth_notes(found: dict[str, Any]) -> list[str]:
@@ -314,21 +319,12 @@ def print_questions(found: dict[str, Any]) -> None:
     if not found["questions"]:
         print(f"{found['run']}: no closure is left to ask about")
         return
-    titles = ("query", "match", "query\nstamp ns", "match\nstamp ns", "verdict", "p_false", "wrong", "moves\nm", "rows")
-    names = ("query", "match", "query_stamp_ns", "match_stamp_ns", "verdict")
-    print_table(
-        titles,
-        [
-            (
-                *(str(one[name]) for name in names),
-                "" if one["p_false"] is None else f"{one['p_false']:.3f}",
-                f"{one['p_wrong']:.3f}",
-                f"{one['moved_m']:.3f}",
-                str(len(one["closures"])),
-            )
-            for one in found["questions"]
-        ],
-    )
+    columns = {
+        "query": "query", "match": "match", "query\nstamp ns": "query_stamp_ns", "match\nstamp ns": "match_stamp_ns",
+        "verdict": "verdict", "p_false": "p_false:.3f", "wrong": "p_wrong:.3f", "moves\nm": "moved_m:.3f",
+    }  # fmt: skip
+    records = [one | {"rows": len(one["closures"])} for one in found["questions"]]
+    print_records(columns | {"rows": "rows"}, records)
     pictures = [one["picture"] for one in found["questions"] if one["picture"]]
     if pictures:
         print(f"{'pictures':10}{os.path.dirname(pictures[0])}")  # noqa: PTH120
@@ -349,22 +345,15 @@ def print_optimised(found: dict[str, Any]) -> None:
     print(f"  {sum(found['seconds'].values()):.2f} s")
 
 
-_SIZES = (("bytes", "d"), ("images", "d"), ("seconds", ".1f"))
-"""Columns of the table of a dry run, with their formats."""
-_BATCH_COSTS = (("seconds", 1), ("peak_memory_mb", 0))
-"""Cost columns of the table of a batch, with their decimals."""
-
-
 def print_batch(found: dict[str, Any]) -> None:
-    rows = []
-    for drive in found["drives"]:
-        computed = drive["state"] == "computed"
-        counts = [str(drive[name]) if computed else "" for name in ("keyframes", "accepted")]
-        counts += [str(drive["attempts"] or "")]
-        counts += [f"{drive[name]:.{digits}f}" if drive[name] else "" for name, digits in _BATCH_COSTS]
-        rows.append((drive["drive"], drive["state"], *counts, drive["worker"], drive["error"]))
-    titles = ("drive", "state", "keyframes", "closures", "attempts", "seconds", "peak MB", "worker", "error")
-    print_table(titles, rows)
+    costs = ("attempts", "seconds", "peak_memory_mb")
+    rows = [one | {name: one[name] or None for name in costs} for one in found["drives"]]
+    rows = [one | ({} if one["state"] == "computed" else {"keyframes": None, "accepted": None}) for one in rows]
+    columns = {
+        "drive": "drive", "state": "state", "keyframes": "keyframes", "closures": "accepted", "attempts": "attempts",
+        "seconds": "seconds:.1f", "peak MB": "peak_memory_mb:.0f", "worker": "worker", "error": "error",
+    }  # fmt: skip
+    print_records(columns, rows)
     drives, threads = plural(len(found["drives"]), "drive"), plural(found["threads_per_job"], "thread")
     print_line(
         f"{found['map']}:",
@@ -382,14 +371,9 @@ def print_batch(found: dict[str, Any]) -> None:
 
 
 def print_dry_run(found: dict[str, Any]) -> None:
-    rows = [
-        (
-            one["drive"], one["state"], *(f"{one[name]:{form}}" if one["images"] else "" for name, form in _SIZES),
-            " ".join(map("=".join, one["tags"].items())), one["error"],
-        )
-        for one in found["drives"]
-    ]  # fmt: skip
-    print_table(("drive", "would", "bytes", "images", "seconds", "tags", "error"), rows)
+    sizes = {"bytes": "bytes", "images": "images", "seconds": "seconds:.1f"}
+    drives = [one | {"tags": _tags(one)} | ({} if one["images"] else dict.fromkeys(sizes)) for one in found["drives"]]
+    print_records({"drive": "drive", "would": "state", **sizes, "tags": "tags", "error": "error"}, drives)
     known = found["cpu_seconds_from"]
     source = f"as {plural(known, 'drive')} of the map took" if known else "as no drive of the map says otherwise"
     print_line(
@@ -417,12 +401,14 @@ def print_map(found: dict[str, Any]) -> None:
         joined = sum(len(one["drives"]) for one in found["components"])
         groups = len(found["components"])
         print(f"joined    {plural(joined, 'drive')} in {plural(groups, 'group')}, each in one frame")
-    rows = []
-    for drive in found["drives"]:
-        counts = (str(drive[name]) for name in ("keyframes", "candidates", "accepted"))
-        costs = (f"{value or 0:.1f}" for value in (drive["bytes"] / 1e6, drive["seconds"], drive["peak_memory_mb"]))
-        rows.append((drive["drive"], *counts, *costs, " ".join(map("=".join, drive["tags"].items()))))
-    print_table(("drive", "keyframes", "candidates", "accepted", "MB", "seconds", "peak MB", "tags"), rows)
+    costs = ("seconds", "peak_memory_mb")
+    drives = [
+        one | {name: one[name] or 0 for name in costs} | {"mb": one["bytes"] / 1e6, "tags": _tags(one)}
+        for one in found["drives"]
+    ]
+    columns = {name: name for name in ("drive", "keyframes", "candidates", "accepted")}
+    columns |= {"MB": "mb:.1f", "seconds": "seconds:.1f", "peak MB": "peak_memory_mb:.1f", "tags": "tags"}
+    print_records(columns, drives)
     for drive, failure in found["failures"].items():
         print_status(f"failed: {drive}: {failure['error']}")
     warn(found["problems"])
@@ -539,19 +525,10 @@ def print_redescribed(found: dict[str, Any]) -> None:
 
 def print_answers(found: dict[str, Any]) -> None:
     """The best place of every view; all of them are in the file and in the JSON."""
-    rows = [
-        (
-            one.get("query_name", str(one["query"])),
-            one["drive"],
-            one.get("match_name", str(one["keyframe"])),
-            f"{one['score']:.3f}",
-            str(one["support"]),
-            "" if one["p_match"] is None else f"{one['p_match']:.2f}",
-        )
-        for one in found["answers"]
-        if one["rank"] == 0
-    ]
-    print_table(("view", "drive", "keyframe", "score", "support", "p_match"), rows)
+    best = [{"query_name": one["query"], "match_name": one["keyframe"]} | one for one in found["answers"]]
+    columns = {"view": "query_name", "drive": "drive", "keyframe": "match_name"}
+    columns |= {"score": "score:.3f", "support": "support", "p_match": "p_match:.2f"}
+    print_records(columns, [one for one in best if one["rank"] == 0])
     warn(found["warnings"])
     views = plural(found["views"], "view")
     print(f"{found['log']}: {found['answered']} of {views} matched to a place of {found['map']}")
@@ -561,16 +538,11 @@ def print_answers(found: dict[str, Any]) -> None:
 
 def print_localized(found: dict[str, Any]) -> None:
     """The pose of every picture that has one, and why the others have none."""
-    rows = [
-        (
-            one["picture"], *(f"{one[name]:.3f}" for name in ("tx", "ty", "tz")), f"{one['sigma_m']:.2g}",
-            f"{one['sigma_deg']:.2g}", str(one["inliers"]), f"{one['drive']}:{one['keyframe']}",
-        )
-        for one in found["answers"]
-        if one["localized"]
-    ]  # fmt: skip
-    if rows:
-        print_table(("picture", "x\nm", "y\nm", "z\nm", "sigma\nm", "sigma\ndeg", "inliers", "at"), rows)
+    localized = [one | {"at": f"{one['drive']}:{one['keyframe']}"} for one in found["answers"] if one["localized"]]
+    columns = {"picture": "picture", "x\nm": "tx:.3f", "y\nm": "ty:.3f", "z\nm": "tz:.3f", "sigma\nm": "sigma_m:.2g"}
+    columns |= {"sigma\ndeg": "sigma_deg:.2g", "inliers": "inliers", "at": "at"}
+    if localized:
+        print_records(columns, localized)
     for one in found["answers"]:
         if not one["localized"]:
             print_line(f"{one['picture']}:", one["sentence"])

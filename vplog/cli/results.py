@@ -170,7 +170,6 @@ def _file_or_stdout(arguments: argparse.Namespace, binary: bool = False) -> Iter
     if arguments.output is not parser.STDOUT:  # ./- is a file
         yield arguments.output
         return
-    from vplog.errors import SettingsError
     from vplog.storage.scratch import scratch
 
     if arguments.json:
