@@ -15,7 +15,7 @@ from vplog.data import Bools, Bytes, Camera, Float32s, Floats, Frame
 from vplog.errors import LogError, plural
 from vplog.geometry.masking import filled
 from vplog.logs.cameras import camera_from_image
-from vplog.logs.formats.container import Channel, Container, Notes, Octets, Place
+from vplog.logs.formats.container import Channel, Container, Notes, Place, RawData
 from vplog.logs.masks import Mask, resized_mask
 from vplog.logs.messages import pixels, video
 from vplog.logs.messages.decode import decode
@@ -37,7 +37,7 @@ _TRIED = 10
 damaged has none before the next."""
 
 
-def image_in(channel: Channel, data: Octets | ImageMessage) -> ImageMessage:
+def image_in(channel: Channel, data: RawData | ImageMessage) -> ImageMessage:
     """The image of a message. Raises BadMessageError."""
     message = decode(channel, data)
     if not isinstance(message, ImageMessage):
@@ -51,7 +51,7 @@ class LoggedImage:
     decoded where it was read."""
 
     channel: Channel
-    data: Octets | ImageMessage | VideoFrame | BadMessageError
+    data: RawData | ImageMessage | VideoFrame | BadMessageError
     levels: Levels | None = None
     """Black and white of its topic, where that has 16 bits."""
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from vplog.data import Ints
 from vplog.errors import plural
-from vplog.logs.formats.container import BRIEF, Channel, Message, Notes, Octets, Place
+from vplog.logs.formats.container import HEADER_BYTES, Channel, Message, Notes, Place, RawData
 from vplog.logs.formats.loss_account import LossRuns
 from vplog.logs.messages.decode import decode, read_poses, stamp_of
 from vplog.logs.messages.records import (
@@ -59,7 +59,7 @@ class Images:
         """Add a message. Raises BadMessageError."""
         channel, log_ns, data, place = message
         self.stream.append(place)
-        if len(data) < BRIEF:
+        if len(data) < HEADER_BYTES:
             record = decode(channel, data) if data else None
             if record is None or (isinstance(record, ImageMessage) and not record.data):
                 raise _EmptyImageError
@@ -88,7 +88,7 @@ class Calibrations:
     _last: bytes = b""
     _first: CalibrationMessage | None = None
 
-    def add(self, calibration: CalibrationMessage, data: Octets | Record, position: int) -> None:
+    def add(self, calibration: CalibrationMessage, data: RawData | Record, position: int) -> None:
         self._last = bytes(data[_HEADER:]) if isinstance(data, bytes | memoryview) else b""
         self._first = self._first or calibration
         if not calibration.is_set:
@@ -97,7 +97,7 @@ class Calibrations:
             self.found.append(calibration)
             self.positions.append(position)
 
-    def repeats(self, data: Octets | Record) -> bool:
+    def repeats(self, data: RawData | Record) -> bool:
         """Whether a message of ROS is that before it but for its stamp."""
         if not self.found or self.channel.encoding not in ("cdr", "ros1"):
             return False

@@ -14,7 +14,7 @@ from tests.logs.drives import Drive, foxglove_messages, ros_messages, write_foxg
 from vplog.logs.formats import chunk_cache as chunks_module
 from vplog.logs.formats.chunk_cache import Chunks
 from vplog.logs.formats.compression import BadChunkError
-from vplog.logs.formats.container import BRIEF, Channel, Notes
+from vplog.logs.formats.container import HEADER_BYTES, Channel, Notes
 from vplog.logs.formats.mcap_file import ChunkReader, McapFile
 
 if TYPE_CHECKING:
@@ -101,10 +101,10 @@ def test_messages_are_found_in_place_as_in_the_whole(
         data += struct.pack("<BQ", opcode, len(body)) + body
     data = data[: max(len(data) - cut, 0)]
     wanted = {CHANNELS[i] for i in used}
-    for brief in ((), wanted):
+    for header_only in ((), wanted):
         defined: list[list] = [[], []]
         walks = [
-            ChunkReader(3, len(data), dict(CHANNELS), lambda *one, to=to: to.append(one), wanted, brief)  # pyrefly: ignore[missing-attribute]
+            ChunkReader(3, len(data), dict(CHANNELS), lambda *one, to=to: to.append(one), wanted, header_only)  # pyrefly: ignore[missing-attribute]
             for to in defined
         ]
         whole = walks[0].whole(data)
@@ -115,7 +115,7 @@ def test_messages_are_found_in_place_as_in_the_whole(
             assert getattr(walks[0], name) == getattr(walks[1], name)
         assert [(m.channel, m.log_ns, m.place) for m in whole] == [(m.channel, m.log_ns, m.place) for m in there]
         for a, b in zip(whole, there, strict=True):
-            least = BRIEF if brief and len(a.data) >= 4096 - 22 else len(a.data)
+            least = HEADER_BYTES if header_only and len(a.data) >= 4096 - 22 else len(a.data)
             assert bytes(a.data[:least]) == bytes(b.data[:least])
             assert bytes(a.data) == data[a.place[1] : a.place[2]]
 

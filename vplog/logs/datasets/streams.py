@@ -15,7 +15,7 @@ from vplog.geometry import se3
 from vplog.logs.calibrations.camera import CalibratedCamera
 from vplog.logs.cameras import BODY
 from vplog.logs.datasets.text_tables import numbers_of, rows_of, stamps_ns
-from vplog.logs.formats.container import BRIEF, Channel, Contents, Message, Notes, Place, by_topic
+from vplog.logs.formats.container import HEADER_BYTES, Channel, Contents, Message, Notes, Place, by_topic
 from vplog.logs.messages.pixels import scaled_depth_m
 from vplog.logs.messages.records import (
     BadMessageError,
@@ -87,14 +87,14 @@ class DataSetContainer:
         }
         return Contents(dict(sorted(counts.items())), *span_ns, self._truth, BODY, self._names, files)
 
-    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
+    def messages(self, channels: Collection[Channel], header_only: Collection[Channel] = ()) -> Iterator[Message]:
         """The messages in order of time."""
         numbers = [number for number, one in enumerate(self._streams) if one.channel in channels]
         at = [(int(ns), number, row) for number in numbers for row, ns in enumerate(self._streams[number].stamp_ns)]
         for stamp_ns, number, row in sorted(at):
             one = self._streams[number]
-            length = 0 if one.length is None or one.channel not in brief else one.length(row)
-            data = ImageMessage(stamp_ns, "", "", bytes(1), True) if length >= BRIEF else one.message(row)
+            length = 0 if one.length is None or one.channel not in header_only else one.length(row)
+            data = ImageMessage(stamp_ns, "", "", bytes(1), True) if length >= HEADER_BYTES else one.message(row)
             yield Message(one.channel, stamp_ns, data, (number, row))
 
     def read(self, place: Place) -> Record:

@@ -14,7 +14,7 @@ from typing import BinaryIO
 
 from vplog.execution.cores import allowed
 from vplog.logs.formats.compression import BadChunkError
-from vplog.logs.formats.container import Octets
+from vplog.logs.formats.container import RawData
 
 MOST_BYTES = 64 * 2**20
 """Bytes of unpacked chunks that a process caches: neighbouring chunks of image and depth are not unpacked twice."""
@@ -84,7 +84,7 @@ class Chunks:
         recent = _RECENT.get((self._file, number))
         return self._take(number, lambda: self._load(number)) if recent is None else recent
 
-    def part(self, number: int, start: int, stop: int) -> Octets:
+    def part(self, number: int, start: int, stop: int) -> RawData:
         """Bytes of a chunk where they lie, which keeps all of it; a copy of those of a large one."""
         data = self(number)
         return memoryview(data)[start:stop] if len(data) <= _VIEWED else data[start:stop]

@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from vplog.errors import LogError
-from vplog.logs.formats.container import Octets
+from vplog.logs.formats.container import RawData
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.scratch import scratch
 
@@ -92,7 +92,7 @@ _DECODERS = {
 }
 
 
-def unpack_zstd_message(data: Octets) -> bytes:
+def unpack_zstd_message(data: RawData) -> bytes:
     """One zstd frame with its own length, bounded like a chunk. Raises BadChunkError."""
     try:
         size = zstandard.frame_content_size(data)

@@ -10,13 +10,12 @@ from typing import Any, NamedTuple, Protocol
 from vplog.data import Gps, Trajectory
 from vplog.logs.formats.loss_account import LossAccount
 
-Octets = bytes | memoryview
+RawData = bytes | memoryview
 """Bytes of a message: its own where they are few, else a view of the chunk that holds them."""
 Place = tuple[int, ...]
 """Place of a message in its container; only the container that gave it out can read it."""
-BRIEF = 512
-"""Bytes of a large message that are there where it is only wanted briefly: its header, and more than a message without
-content has."""
+HEADER_BYTES = 512
+"""Bytes of a large message that suffice where its header alone is wanted: more than a message without content has."""
 _COPIED = 4096
 """Bytes of a message below which it is given as a copy: as cheap as a view, and quicker to read numbers from."""
 
@@ -37,11 +36,11 @@ class Message(NamedTuple):
     channel: Channel
     log_ns: int
     data: Any
-    """Octets; of a published data set the record that they would be decoded to."""
+    """RawData; of a published data set the record that they would be decoded to."""
     place: Place
 
 
-def part_of(data: bytes, start: int, stop: int) -> Octets:
+def part_of(data: bytes, start: int, stop: int) -> RawData:
     """The bytes of a message in a chunk, as far as they are there."""
     return data[start:stop] if stop - start < _COPIED else memoryview(data)[start:stop]
 
@@ -95,9 +94,9 @@ class Container(Protocol):
 
     def contents(self) -> Contents: ...
 
-    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
-        """The messages of these channels in file order. Of large ones of `brief` channels, in the encodings of ROS, no
-        more than the first BRIEF bytes need be there; `read` gives them whole."""
+    def messages(self, channels: Collection[Channel], header_only: Collection[Channel] = ()) -> Iterator[Message]:
+        """The messages of these channels in file order. Of large ones of `header_only` channels, in the encodings of
+        ROS, the first HEADER_BYTES suffice; `read` gives them whole."""
         ...
 
     def read(self, place: Place) -> Any:

@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
 from vplog.logs.formats.chunk_layout import Chunk, ChunkLosses
 from vplog.logs.formats.compression import BadChunkError, crc32, unpack
-from vplog.logs.formats.container import BRIEF, Channel, Contents, Message, Notes, Octets, Place, part_of
+from vplog.logs.formats.container import HEADER_BYTES, Channel, Contents, Message, Notes, Place, RawData, part_of
 from vplog.logs.formats.loss_account import sampled
 from vplog.logs.formats.mcap_layout import RECORD, read_layout
 from vplog.storage.remote_path import RemotePath
@@ -92,22 +92,23 @@ class McapFile:
                     chunk.counts = dict(reader.counts)
         return counts, times
 
-    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
+    def messages(self, channels: Collection[Channel], header_only: Collection[Channel] = ()) -> Iterator[Message]:
         wanted, chunks = set(channels), self._layout.chunks
         numbers = (number for number, chunk in enumerate(chunks) if self._losses.may_hold(chunk, wanted))
-        for number, data in self._data.iterate(numbers, lambda number: bool(brief) and self._is_read_in_place(number)):
+        in_place = (self._is_read_in_place,) if header_only else ()
+        for number, data in self._data.iterate(numbers, *in_place):
             chunk = chunks[number]
             if not self._losses.may_hold(chunk, wanted):  # by a definition that came meanwhile
                 continue
             end = chunk.stop - chunk.start if data is None else len(data)
-            reader = ChunkReader(number, end, self._channels, self._define, wanted, brief, chunk.cut)
+            reader = ChunkReader(number, end, self._channels, self._define, wanted, header_only, chunk.cut)
             if data is None:
                 yield from reader.in_place(lambda start, length, at=chunk.start: self._at(at + start, length))
             else:
                 yield from reader.whole(data)
             self._account_for_chunk(chunk, reader)
 
-    def read(self, place: Place) -> Octets:
+    def read(self, place: Place) -> RawData:
         number, start, stop = place
         chunk = self._layout.chunks[number]
         if self._local and _is_plain(chunk):  # as when its messages were found
@@ -207,17 +208,17 @@ class ChunkReader:
         channels: dict[int, Channel],
         define: Callable[[int, bytes], None],
         wanted: Collection[Channel] | None,
-        brief: Collection[Channel] = (),
+        header_only: Collection[Channel] = (),
         cut: bool = False,
     ) -> None:
         """`end` is its length, `cut` whether the file ends in it. Messages on `wanted` channels are given (None: on
-        all); those on `brief` ones need not be whole. `define` takes a schema or channel record and may add to
+        all); those on `header_only` ones need not be whole. `define` takes a schema or channel record and may add to
         `channels`."""
         self.position = 0
         self.last_ns: int | None = None
         """Log time of the last message, on whatever channel."""
         self.number, self.end, self._channels, self._define = number, end, channels, define
-        self._wanted, self._brief, self._cut = wanted, brief, cut
+        self._wanted, self._header_only, self._cut = wanted, header_only, cut
         self._used = {i: channel for i, channel in channels.items() if wanted is None or channel in wanted}
         self._ids: list[int] = []
         self._messages: list[Message] = []
@@ -298,4 +299,4 @@ class ChunkReader:
 
     def _is_needed(self, channel: Channel | None, there: int, length: int) -> bool:
         """Whether more of a message is needed than the bytes that are there."""
-        return channel is not None and (channel not in self._brief or there < BRIEF or length < _WINDOW)
+        return channel is not None and (channel not in self._header_only or there < HEADER_BYTES or length < _WINDOW)

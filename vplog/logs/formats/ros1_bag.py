@@ -9,7 +9,7 @@ from pathlib import Path
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
 from vplog.logs.formats.chunk_layout import ChunkLosses
 from vplog.logs.formats.compression import BadChunkError, unpack
-from vplog.logs.formats.container import Channel, Contents, Message, Notes, Octets, Place, part_of
+from vplog.logs.formats.container import Channel, Contents, Message, Notes, Place, RawData, part_of
 from vplog.logs.formats.loss_account import sampled
 from vplog.logs.formats.ros1_layout import CONNECTION, MESSAGE, fields, number, read_layout, time_ns
 from vplog.storage.remote_path import RemotePath
@@ -70,7 +70,7 @@ class Ros1Bag:
             counts.update(found)
         return counts, times
 
-    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
+    def messages(self, channels: Collection[Channel], header_only: Collection[Channel] = ()) -> Iterator[Message]:
         wanted, chunks = set(channels), self._layout.chunks
         rows = (row for row, chunk in enumerate(chunks) if self._losses.may_hold(chunk, wanted))
         for row, data in self._data.iterate(rows):
@@ -80,7 +80,7 @@ class Ros1Bag:
                 if (channel := self._channels.get(connection)) in wanted and channel:
                     yield Message(channel, log_ns, part_of(data, start, stop), (row, start, stop))
 
-    def read(self, place: Place) -> Octets:
+    def read(self, place: Place) -> RawData:
         return self._data.part(*place)
 
     def _connect(self, header: dict[bytes, bytes], data: bytes) -> None:

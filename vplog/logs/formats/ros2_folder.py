@@ -14,7 +14,7 @@ import yaml
 import zstandard
 
 from vplog.logs.formats.compression import BadChunkError, unpack_zstd_message
-from vplog.logs.formats.container import Channel, Container, Contents, Message, Notes, Octets, Place, by_topic
+from vplog.logs.formats.container import Channel, Container, Contents, Message, Notes, Place, RawData, by_topic
 from vplog.logs.formats.loss_account import LossRuns
 
 _MAX_METADATA = 4 * 2**20
@@ -65,12 +65,12 @@ class Chain:
             self._reconcile(self._metadata, by_topic(counts))
         return Contents(dict(sorted(counts.items())), start_ns, max((end for _, end in spans), default=0))
 
-    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
+    def messages(self, channels: Collection[Channel], header_only: Collection[Channel] = ()) -> Iterator[Message]:
         for number, part in enumerate(self._parts):
-            for message in part.messages(channels, brief):
+            for message in part.messages(channels, header_only):
                 yield message._replace(place=(number, *message.place))
 
-    def read(self, place: Place) -> Octets:
+    def read(self, place: Place) -> RawData:
         return self._parts[place[0]].read(place[1:])
 
     def _reconcile(self, known: Metadata, found: dict[str, int]) -> None:
@@ -101,7 +101,7 @@ class ZstdMessages:
         except BadChunkError:
             return b""
 
-    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
+    def messages(self, channels: Collection[Channel], header_only: Collection[Channel] = ()) -> Iterator[Message]:
         lost: defaultdict[str, LossRuns] = defaultdict(LossRuns)
         reason = ""
         for message in self._packed.messages(channels):

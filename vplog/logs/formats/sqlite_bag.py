@@ -109,7 +109,7 @@ class SqliteBag:
             most = max(most, *self._first(query) or [0])  # none where the index is what is damaged
         return most
 
-    def messages(self, channels: Collection[Channel], brief: Collection[Channel] = ()) -> Iterator[Message]:
+    def messages(self, channels: Collection[Channel], header_only: Collection[Channel] = ()) -> Iterator[Message]:
         ids = [topic for topic, channel in self._topics.items() if channel in channels]
         found: Counter[int] = Counter()
         for row, topic, time_ns, data in self._rows_of(ids):

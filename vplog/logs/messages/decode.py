@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vplog.data import Floats, Ints
-from vplog.logs.formats.container import Channel, Octets
+from vplog.logs.formats.container import Channel, RawData
 from vplog.logs.messages.records import ENCODINGS, BadMessageError, PoseMessage, Record, nanoseconds, short_type
 from vplog.logs.messages.ros import decode_ros
 
@@ -23,7 +23,7 @@ _HEAD = 12
 """Bytes before the names of frames: CDR's encapsulation of 4 bytes or ROS 1's sequence number, then the stamp."""
 
 
-def decode(channel: Channel, data: Octets | Record) -> Record:
+def decode(channel: Channel, data: RawData | Record) -> Record:
     """The record of a message, the bytes of images views of `data` where they can be. Raises BadMessageError."""
     if not isinstance(data, bytes | memoryview):
         return data
@@ -40,7 +40,7 @@ def decode(channel: Channel, data: Octets | Record) -> Record:
         raise BadMessageError(reason[:200]) from None
 
 
-def stamp_of(channel: Channel, data: Octets | Record) -> int:
+def stamp_of(channel: Channel, data: RawData | Record) -> int:
     """The header stamp in ns, of ROS without looking at the rest. Raises BadMessageError."""
     if channel.encoding in ("cdr", "ros1") and isinstance(data, bytes | memoryview):
         if len(data) < _HEAD:

@@ -16,7 +16,7 @@ import numpy as np
 
 from vplog.data import Floats
 from vplog.geometry import se3
-from vplog.logs.formats.container import Octets
+from vplog.logs.formats.container import RawData
 from vplog.logs.messages.flatbuffers import parse_flatbuffer
 from vplog.logs.messages.records import (
     BadMessageError,
@@ -39,7 +39,7 @@ _NUMBER_TYPES = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "f4", 
 """PackedElementField.NumericType."""
 
 
-def decode_foxglove(kind: str, encoding: str, data: Octets) -> Record:
+def decode_foxglove(kind: str, encoding: str, data: RawData) -> Record:
     """A record of type `foxglove.RawImage` and so on. Raises BadMessageError or what the parsers raise."""
     message = _message_class(kind)()
     if encoding == "json":

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from vplog.data import Bytes, Float32s
-from vplog.logs.formats.container import Octets
+from vplog.logs.formats.container import RawData
 from vplog.logs.messages.records import BadMessageError, ImageMessage
 from vplog.storage.image_file import BadImageError, decode_image, image_size
 
@@ -177,7 +177,7 @@ def depth_m(message: ImageMessage) -> Float32s:
     return np.where((pixels != 0) & np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan)).astype(np.float32)
 
 
-def scaled_depth_m(data: Octets, per_m: float) -> Float32s:
+def scaled_depth_m(data: RawData, per_m: float) -> Float32s:
     """(H, W) float32 m of an image file of 16 bits with `per_m` counts of a metre, NaN where unknown. Raises
     BadMessageError."""
     return _metres(_imdecode(data, unchanged=True), "16UC1") * np.float32(1000.0 / per_m)
@@ -210,7 +210,7 @@ def _raw(message: ImageMessage) -> tuple[Any, str]:
     return (pixels if channels == 1 else pixels.reshape(height, width, channels)), conversion
 
 
-def _imdecode(data: Octets, unchanged: bool = False) -> Any:
+def _imdecode(data: RawData, unchanged: bool = False) -> Any:
     """The pixels of an image file, as `decode_image` gives them. Raises BadMessageError."""
     try:
         return decode_image(data, unchanged)

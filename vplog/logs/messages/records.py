@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vplog.data import Floats
-from vplog.logs.formats.container import Channel, Octets
+from vplog.logs.formats.container import Channel, RawData
 
 
 class BadMessageError(Exception):
@@ -23,7 +23,7 @@ class ImageMessage(NamedTuple):
     frame: str
     encoding: str
     """ROS name of the pixel layout (`mono8`, `16UC1`, ...); the format string where compressed."""
-    data: Octets
+    data: RawData
     """A view of the message, where its encoding has the bytes as they are."""
     compressed: bool
     width: int = 0
@@ -122,7 +122,7 @@ class CloudMessage(NamedTuple):
     """Bytes of a row, padding included."""
     fields: list[tuple[str, int, str]]
     """Name, offset in the point, and numpy's type of each."""
-    data: Octets
+    data: RawData
     """A view of the message, where its encoding has the bytes as they are."""
     frame_from_cloud: Floats | None = None
     """(4, 4) where the points are not placed in `frame` itself."""

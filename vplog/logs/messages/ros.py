@@ -16,7 +16,7 @@ import numpy as np
 
 from vplog.data import Floats
 from vplog.geometry import se3
-from vplog.logs.formats.container import Octets
+from vplog.logs.formats.container import RawData
 from vplog.logs.messages.nmea import fix_of
 from vplog.logs.messages.records import (
     BadMessageError,
@@ -48,7 +48,7 @@ _ENCAPSULATION = 4
 """Bytes before a message in CDR: plain, big (0) or little (1) endian. Numbers are aligned to their size behind them."""
 
 
-def decode_ros(kind: str, encoding: str, data: Octets) -> Record:
+def decode_ros(kind: str, encoding: str, data: RawData) -> Record:
     """A record of type `sensor_msgs/Image` and so on; the bytes of images are a view of `data`. Raises BadMessageError,
     struct.error, ValueError (UnicodeDecodeError) or LookupError on damaged bytes."""
     fields = _Fields(data, encoding == "cdr")
@@ -62,7 +62,7 @@ class _Fields:
 
     __slots__ = ("_at", "_cdr", "_data", "_order")
 
-    def __init__(self, data: Octets, cdr: bool) -> None:
+    def __init__(self, data: RawData, cdr: bool) -> None:
         if cdr and bytes(data[:2]) not in (b"\0\0", b"\0\1"):
             raise BadMessageError("its CDR encapsulation is not supported")
         self._data, self._cdr, self._at = data, cdr, _ENCAPSULATION if cdr else 0
@@ -80,7 +80,7 @@ class _Fields:
         if self._cdr:
             self._at += (_ENCAPSULATION - self._at) % size
 
-    def octets(self) -> memoryview:
+    def uint8s(self) -> memoryview:
         """uint8[]."""
         (size,) = self.numbers("I")
         start, self._at = self._at, self._at + size
@@ -90,7 +90,7 @@ class _Fields:
 
     def text(self) -> str:
         """A string; those of CDR end with a zero."""
-        raw = self.octets()
+        raw = self.uint8s()
         return str(raw[:-1] if self._cdr else raw, "utf-8")
 
     def doubles(self) -> Floats:
@@ -132,7 +132,7 @@ def _image(fields: _Fields) -> Record:
     stamp_ns, frame = fields.header()
     (height, width), encoding = fields.numbers("2I"), fields.text()
     (big_endian,), (step,) = fields.numbers("B"), fields.numbers("I")
-    return ImageMessage(stamp_ns, frame, encoding, fields.octets(), False, width, height, step, bool(big_endian))
+    return ImageMessage(stamp_ns, frame, encoding, fields.uint8s(), False, width, height, step, bool(big_endian))
 
 
 def _packet(fields: _Fields) -> Record:
@@ -142,12 +142,12 @@ def _packet(fields: _Fields) -> Record:
     encoding = fields.text()
     fields.numbers("Q")  # pts
     fields.numbers("2B")  # flags, is_bigendian
-    return ImageMessage(stamp_ns, frame, encoding, fields.octets(), True)
+    return ImageMessage(stamp_ns, frame, encoding, fields.uint8s(), True)
 
 
 def _video(fields: _Fields) -> Record:
     """docs.foxglove.dev/docs/sdk/schemas."""
-    stamp_ns, frame, data = fields.stamp_ns(), fields.text(), fields.octets()
+    stamp_ns, frame, data = fields.stamp_ns(), fields.text(), fields.uint8s()
     return ImageMessage(stamp_ns, frame, fields.text(), data, True)
 
 
@@ -250,7 +250,7 @@ def _cloud(fields: _Fields) -> Record:
         name, (offset, datatype, _) = fields.text(), (*fields.numbers("IB"), *fields.numbers("I"))
         found.append((name, offset, _NUMBER_TYPES.get(datatype, "")))
     (big_endian,), (step, row_step) = fields.numbers("B"), fields.numbers("2I")
-    data, _ = fields.octets(), fields.numbers("B")  # is_dense
+    data, _ = fields.uint8s(), fields.numbers("B")  # is_dense
     order = ">" if big_endian else "<"
     typed = [(name, offset, order + kind) for name, offset, kind in found if kind]
     return CloudMessage(stamp_ns, frame, width, height, step, row_step, typed, data)
@@ -287,7 +287,7 @@ def _gps_fix(fields: _Fields) -> Record:
 
 _READERS: dict[str, Callable[[_Fields], Record]] = {
     "sensor_msgs/Image": _image,
-    "sensor_msgs/CompressedImage": lambda f: ImageMessage(*f.header(), f.text(), f.octets(), True),
+    "sensor_msgs/CompressedImage": lambda f: ImageMessage(*f.header(), f.text(), f.uint8s(), True),
     "ffmpeg_image_transport_msgs/FFMPEGPacket": _packet,
     "foxglove_msgs/CompressedVideo": _video,
     "sensor_msgs/CameraInfo": _calibration,
