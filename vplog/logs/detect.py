@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import re
 import weakref
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -62,17 +62,15 @@ def open(path: Path, topics: TopicChoice | None = None) -> RecordedLog:
     """The drive at `path`, its kind found by content, its topics by the rules of `topic_selection.py` or by name.
     Raises LogError where there is no log, or where a topic of `topics` is not in it."""
     path, choice, notes = located(path), topics or TopicChoice(), Notes()
-    try:
+    with _reading(path):
         _check_there(path)
         return _open_folder(path, choice, notes) if path.is_dir() else _open_file(path, choice, notes)
-    except OSError as error:
-        raise _unreadable(path, error) from None
 
 
 def check(path: Path) -> None:
     """Raises LogError where there is nothing at `path` that looks like a log; of a file a few bytes are read."""
     path = located(path)
-    try:
+    with _reading(path):
         _check_there(path)
         if not path.is_dir():
             if not (_magic(path) or video.is_video(path)):
@@ -82,8 +80,6 @@ def check(path: Path) -> None:
             found = any(_magic(file) or image_folder.is_image(file) for file in files)
             if not found and not any(map(image_folder.is_image, _files_below(path))):
                 raise LogError(_no_folder(path, files))
-    except OSError as error:
-        raise _unreadable(path, error) from None
 
 
 def logs_below(path: Path) -> list[Path]:
@@ -116,9 +112,14 @@ def _logs_below(folder: Path, levels: int) -> list[Path]:
     return [*logs, *(log for one in below for log in _logs_below(one, levels - 1))]
 
 
-def _unreadable(path: Path, error: OSError) -> LogError:
-    reason = error.strerror or " ".join(str(error).split())[:300].rstrip(".")
-    return LogError(f"Cannot read {path}: {reason}. Check the path and its permissions.")
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Raises LogError in place of OSError."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or " ".join(str(error).split())[:300].rstrip(".")
+        raise LogError(f"Cannot read {path}: {reason}. Check the path and its permissions.") from None
 
 
 def _check_there(path: Path) -> None:
@@ -184,17 +185,16 @@ def open_drive(paths: Sequence[Path], topics: TopicChoice | None = None) -> Reco
     paths = [located(path) for path in paths]
     notes, parts = Notes(), []
     for path in paths:
-        _check_there(path)
-        if path.is_dir():
-            raise LogError(f"{path} is a folder; give it by itself. Give a drive in several logs as its files.")
-        same_name = sum(other.name == path.name for other in paths) > 1
-        try:
-            container, kind = open_container(path, notes, str(path) if same_name else path.name)
-            parts.append(_Part(path, kind, container, container.contents()))
-        except OSError as error:
-            raise _unreadable(path, error) from None
-        except LogError as error:
-            notes.account.add("missing_file", None, (str(path), 0), [], f"Left out: {error}")
+        with _reading(path):
+            _check_there(path)
+            if path.is_dir():
+                raise LogError(f"{path} is a folder; give it by itself. Give a drive in several logs as its files.")
+            same_name = sum(other.name == path.name for other in paths) > 1
+            try:
+                container, kind = open_container(path, notes, str(path) if same_name else path.name)
+                parts.append(_Part(path, kind, container, container.contents()))
+            except LogError as error:
+                notes.account.add("missing_file", None, (str(path), 0), [], f"Left out: {error}")
     if not parts:
         raise LogError(f"None of the {len(paths)} files can be read. {notes.account.sentences[0]}")
     parts = _in_order_of_time(parts)
@@ -276,12 +276,10 @@ def open_images(files: Sequence[Path], topics: TopicChoice | None = None) -> Rec
     them. Raises LogError where one is no image."""
     paths, choice = [located(file) for file in dict.fromkeys(files)], topics or TopicChoice()
     for path in paths:
-        try:
+        with _reading(path):
             _check_there(path)
             if isinstance(path, RemotePath) or path.is_dir() or not image_folder.is_image(path):
                 raise LogError(f"{path} is no local file of an image. Give images, or one log by itself.")
-        except OSError as error:
-            raise _unreadable(path, error) from None
     root = Path(os.path.commonpath([path.absolute().parent for path in paths]))
     found = read_images(root, [path.absolute() for path in paths], (), choice.model_copy(update={"image": EVERY_IMAGE}))
     return _published(root, root.name, found, Notes(), choice.model_copy(update={"image": None}))

@@ -33,11 +33,7 @@ class _Loader(yaml.SafeLoader):
     """Plain values alone, and OpenCV's matrices as the mappings that they are."""
 
 
-def _matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict:
-    return loader.construct_mapping(node, deep=True)
-
-
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)  # type: ignore[arg-type]
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.construct_yaml_map)
 
 
 def load_tree(text: str) -> dict:
