@@ -10,10 +10,10 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog.batch.drive_inputs import drive_inputs
-from vplog.batch.engine import BatchOptions, LocalEngine, as_completed, open_engine
+from vplog.batch.engine import BatchOptions, Engine, LocalEngine, as_completed, open_engine
 from vplog.batch.log_hashes import NAME, known_hashes
 from vplog.batch.map_library import map_library
 from vplog.batch.plan import DriveInput, PlannedDrive, common_record, plan_drives, with_topics
@@ -31,9 +31,6 @@ from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline, load_pipeline, pipeline_from
 from vplog.storage.input_hashes import bytes_of
 from vplog.storage.remote_path import RemotePath, located
-
-if TYPE_CHECKING:
-    from vplog.batch.engine import Engine
 
 _FREE_BYTES = 10**10
 """Free space of the map's disk below which stage caches are removed: what a drive of several hours needs while it is

@@ -6,7 +6,7 @@ import argparse
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog import api
 from vplog.cli import parser, printing
@@ -16,8 +16,7 @@ from vplog.cli.progress import Progress, one_stage
 from vplog.errors import ResultError, SettingsError, plural
 from vplog.execution.execution import Execution
 
-if TYPE_CHECKING:
-    Verb = Callable[[argparse.Namespace], None]
+Verb = Callable[[argparse.Namespace], None]
 
 
 def export_map(arguments: argparse.Namespace) -> None:

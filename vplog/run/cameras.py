@@ -10,17 +10,19 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from vplog import logs
 from vplog.data import Bytes, Camera, Closures, Ints, Keyframes, Odometry, Reference
 from vplog.errors import LogError
+from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.loops.propose import Proposals, ProposeSettings, candidate_stops, propose
 from vplog.loops.verify import VerifySettings, verify_between
 from vplog.loops.verify_rig import Rig, verify_together
+from vplog.places.reference_choice import LibrarySettings
 from vplog.places.sequence import SequenceSettings, rank_places
 from vplog.results.camera_pictures import CameraPictures
 from vplog.run.cache.codecs import closures_codec
@@ -29,12 +31,8 @@ from vplog.run.feature_extraction import Extraction, decoded, extract
 from vplog.run.place_recognition import describe, shared_of
 from vplog.run.reference_library import own_images, own_references
 from vplog.run.verification import DriveFeatures, calibrated, for_verification, merged
+from vplog.stages import Log, PlaceState
 from vplog.storage.input_hashes import files_of
-
-if TYPE_CHECKING:
-    from vplog.execution.execution import Execution
-    from vplog.places.reference_choice import LibrarySettings
-    from vplog.stages import Log, PlaceState
 
 _log = logging.getLogger(__name__)
 VIEW_BY_VIEW = SequenceSettings(length=1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -20,13 +20,11 @@ from vplog.maps.search.exact import RankedPlaces, best_places, merge, no_answers
 from vplog.maps.search.index import SegmentView, pictures_of, read_column, update_index
 from vplog.maps.search.segment import Segment
 from vplog.maps.storage.layout import PICTURES
+from vplog.maps.storage.map_store import Store
 from vplog.stages import CodedState, PlaceState, index_of_part
 
-if TYPE_CHECKING:
-    from vplog.maps.storage.map_store import Store
-
-    Search = Callable[[Sequence[Any], int], RankedPlaces]
-    """The best so many places for each view."""
+Search = Callable[[Sequence[Any], int], RankedPlaces]
+"""The best so many places for each view."""
 
 BEST = 16
 """Places that are looked up for each query at first: 192 bytes, as much as the codes of one."""

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, ExitStack, closing, contextmanage
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,9 @@ from vplog.data import Floats, Int32s, Ints
 from vplog.errors import ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
+from vplog.loops.candidate import Drive
 from vplog.loops.localize import KeyframeLandmarks
+from vplog.loops.verify import VerifySettings
 from vplog.maps.geo_bounds import earth_of_run
 from vplog.maps.joining.drive_pairs import known_camera
 from vplog.maps.joining.joint_record import Component, joint_components, keyframe_poses
@@ -29,9 +31,11 @@ from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.layout import PICTURES
-from vplog.pipeline import recorded_pipeline
+from vplog.maps.storage.map_store import Store
+from vplog.pipeline import Pipeline, recorded_pipeline
 from vplog.results import run_record, tables
 from vplog.results.camera_pictures import camera_pictures
+from vplog.results.geo import Earth
 from vplog.results.landmark_table import LandmarkTable
 from vplog.run.landmarks import landmark_key, landmarks_file, run_drive, write_drive_landmarks
 from vplog.run.provenance import library_at
@@ -40,15 +44,8 @@ from vplog.storage.json_records import plain
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.scratch import scratch
 
-if TYPE_CHECKING:
-    from vplog.loops.candidate import Drive
-    from vplog.loops.verify import VerifySettings
-    from vplog.maps.storage.map_store import Store
-    from vplog.pipeline import Pipeline
-    from vplog.results.geo import Earth
-
-    Search = Callable[[Sequence[Any], int], list[list[tuple[int, int]]]]
-    """Drive and row in `Landmarked` of the likeliest places of each of some descriptors, best first."""
+Search = Callable[[Sequence[Any], int], list[list[tuple[int, int]]]]
+"""Drive and row in `Landmarked` of the likeliest places of each of some descriptors, best first."""
 
 
 class Landmarked(NamedTuple):

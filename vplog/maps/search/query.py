@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -17,7 +17,7 @@ from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
 from vplog.loops.match_probability import LookAlikes
-from vplog.maps.geo_bounds import DriveBounds, box_of_fixes
+from vplog.maps.geo_bounds import Box, DriveBounds, box_of_fixes
 from vplog.maps.search.exact import RankedPlaces, best_places
 from vplog.maps.search.index import SegmentView, pictures_of, read_column, update_index
 from vplog.maps.search.probability import answer_probabilities
@@ -25,7 +25,9 @@ from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, LineSearch,
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import reading_drive
+from vplog.maps.storage.download_cache import Cache
 from vplog.maps.storage.layout import PICTURES
+from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline
 from vplog.places.sequence import SequenceSettings
 from vplog.places.views import views_of
@@ -35,11 +37,6 @@ from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.stages import CodedState, EvidenceState, FrameState, Log, PlaceState, StoredState
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.scratch import check_file_output
-
-if TYPE_CHECKING:
-    from vplog.maps.geo_bounds import Box
-    from vplog.maps.storage.download_cache import Cache
-    from vplog.maps.storage.map_store import Store
 
 
 @dataclass(frozen=True)

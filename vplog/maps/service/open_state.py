@@ -9,28 +9,25 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vplog.data import Int32s, Ints
 from vplog.errors import VplogError
 from vplog.execution.execution import Execution
 from vplog.maps.geo_bounds import DriveBounds
-from vplog.maps.localization.places import opened
+from vplog.maps.localization.places import Places, opened
 from vplog.maps.search.exact import best_places
 from vplog.maps.search.index import SegmentView, pictures_of, update_index
 from vplog.maps.search.query import MapQuery, open_map, search
 from vplog.maps.search.sequences import LineSearch
 from vplog.maps.storage import map_store, objects
 from vplog.maps.storage.damage import reading_drive
+from vplog.maps.storage.download_cache import Cache
+from vplog.maps.storage.map_store import Store
+from vplog.pipeline import Pipeline
 from vplog.results import tables
 from vplog.stages import CodedState, PlaceState
 from vplog.storage.remote_path import RemotePath
-
-if TYPE_CHECKING:
-    from vplog.maps.localization.places import Places
-    from vplog.maps.storage.download_cache import Cache
-    from vplog.maps.storage.map_store import Store
-    from vplog.pipeline import Pipeline
 
 _DRIVES = 4096
 """Drives whose stamps stay in memory: some 100 MB of drives of 2000 keyframes."""
