@@ -50,7 +50,7 @@ class Clock:
 
 
 @dataclass(frozen=True, eq=False)
-class Repaired:
+class AlignedStamps:
     """Stamps of one topic on one clock."""
 
     stamp_ns: Ints
@@ -69,7 +69,7 @@ class Repaired:
     """Messages by the skew of the clock that they came on."""
 
 
-def align_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None) -> Repaired | None:
+def align_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None) -> AlignedStamps | None:
     """The header stamps without jumps of their clock; None where they follow no clock. Both (M,) in ns, M >= 1. Of
     several clocks, `reference_ns` is the skew of the one to end on; None takes that of most messages."""
     step, log_step = np.diff(header_ns), np.diff(log_ns)
@@ -98,7 +98,7 @@ def align_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None) 
     order = [clock for clock in clocks if clock is not None]
     jumps = [before - behind for before, behind in pairwise(order) if before != behind]
     log_jumps = _log_jumps(header_ns, log_ns, jump_ns)
-    return Repaired(stamp_ns, valid, chosen, jumps, log_jumps, unclear, counts)
+    return AlignedStamps(stamp_ns, valid, chosen, jumps, log_jumps, unclear, counts)
 
 
 def _runs(header_ns: Ints, log_ns: Ints, least_ns: float) -> tuple[list[slice], set[int]]:

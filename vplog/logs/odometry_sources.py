@@ -20,7 +20,7 @@ from vplog.logs.formats.container import Channel, Contents, Notes
 from vplog.logs.gather import TopicCollector
 from vplog.logs.messages.records import short_type
 from vplog.logs.stamps import NONE
-from vplog.logs.tf_odometry import FrameTree, clean
+from vplog.logs.tf_odometry import FrameTree, frame_name
 from vplog.logs.topic_selection import SOURCES, Selection
 from vplog.logs.tracks import PoseTrack
 
@@ -142,7 +142,7 @@ def _by_twists(
     if inside.sum() < len(rows):
         notes.add(f"{text}.")
         return dead_reckoned(stamp_ns, moving, variances)
-    if placed is None and clean(read.imu.frame) not in ("", track.child, "base_link"):
+    if placed is None and frame_name(read.imu.frame) not in ("", track.child, "base_link"):
         notes.add(f"{read.imu.topic}: its frame has no static transform; it is taken to be mounted as the body is.")
     body_from_imu = np.eye(4) if placed is None else placed
     stamp_ns, turned, off = turned_by_gyro(stamp_ns, moving, gyro_ns, measured[:, :3], body_from_imu)

@@ -16,7 +16,7 @@ from vplog.logs.messages.clouds import scan_of
 from vplog.logs.messages.decode import decode
 from vplog.logs.messages.records import BadMessageError, CloudMessage
 from vplog.logs.stamps import rows_of
-from vplog.logs.tf_odometry import clean
+from vplog.logs.tf_odometry import frame_name
 
 if TYPE_CHECKING:
     from vplog.logs.content import LogContent
@@ -73,7 +73,7 @@ class ScanReader:
         """Frame of the first scans that decode; empty where none does."""
         for row in range(min(_TRIED, len(self._content.scan_ns))):
             with suppress(BadMessageError):
-                return clean(self._cloud(row).frame)
+                return frame_name(self._cloud(row).frame)
         return ""
 
     def _cloud(self, row: int) -> CloudMessage:

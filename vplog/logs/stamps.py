@@ -18,8 +18,8 @@ from vplog.logs.clocks import (
     LEAST_JUMP_NS,
     LEAST_STEP_NS,
     STEP_PERIODS,
+    AlignedStamps,
     Clock,
-    Repaired,
     align_clock,
 )
 from vplog.logs.formats.container import Notes
@@ -52,7 +52,7 @@ class Stamps:
     common: Clock | None = None
     """The clock that all topics of the log are to be on, where that is known."""
     _positions: array[int] = field(default_factory=partial(array, "q"))
-    _found: tuple[int, Repaired | None] | None = None
+    _found: tuple[int, AlignedStamps | None] | None = None
     """The one clock of so many messages."""
 
     def add(self, header_ns: int, log_ns: int, position: int | None = None) -> None:
@@ -85,7 +85,7 @@ class Stamps:
         found = self._aligned()
         return {} if found is None else found.counts
 
-    def _aligned(self) -> Repaired | None:
+    def _aligned(self) -> AlignedStamps | None:
         if self._found is None or self._found[0] != len(self.log_ns):
             header_ns, log_ns = np.array(self.header_ns, np.int64), np.array(self.log_ns, np.int64)
             stamped = _stamped(header_ns, log_ns)

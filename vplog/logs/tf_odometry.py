@@ -37,7 +37,7 @@ class FrameTree:
         self.dropped = 0
         """Transforms that were NaN, infinite or without rotation."""
         for transform in transforms:
-            parent, child = clean(transform.frame), clean(transform.child)
+            parent, child = frame_name(transform.frame), frame_name(transform.child)
             pose = np.array([*transform.position, *transform.quaternion], np.float64)
             if parent == child or not are_usable(pose[None]).all():
                 self.dropped += 1
@@ -47,14 +47,14 @@ class FrameTree:
             self._from[parent][child], self._from[child][parent] = parent_from_child, se3.inverse(parent_from_child)
 
     def __contains__(self, frame: str) -> bool:
-        return clean(frame) in self._from
+        return frame_name(frame) in self._from
 
     def __len__(self) -> int:
         return len(self._from)
 
     def between(self, a: str, b: str) -> Floats | None:
         """a_from_b (4, 4) by the shortest chain, up and down the tree; None where there is none."""
-        start, goal = clean(a), clean(b)
+        start, goal = frame_name(a), frame_name(b)
         reached = {start: np.eye(4)}
         queue = deque([start])
         while queue and goal not in reached:
@@ -66,7 +66,7 @@ class FrameTree:
         return reached.get(goal)
 
 
-def clean(frame: str) -> str:
+def frame_name(frame: str) -> str:
     """tf1 wrote frames with a leading slash, tf2 without."""
     return frame.lstrip("/")
 
@@ -117,7 +117,7 @@ class DynamicTransforms:
 
     def add(self, transforms: list[PoseMessage], log_ns: int, position: int) -> None:
         for transform in transforms:
-            edge = clean(transform.frame), clean(transform.child)
+            edge = frame_name(transform.frame), frame_name(transform.child)
             link = self._links.get(edge)
             if link is None:
                 link = self._links[edge] = _Link(transform)

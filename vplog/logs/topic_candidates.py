@@ -10,7 +10,7 @@ from vplog.logs.messages.decode import decode
 from vplog.logs.messages.pixels import is_depth, is_image, may_be_thermal
 from vplog.logs.messages.records import BadMessageError, CalibrationMessage, ImageMessage, kind_of
 from vplog.logs.messages.video import codec_of
-from vplog.logs.tf_odometry import clean
+from vplog.logs.tf_odometry import frame_name
 from vplog.logs.topic_selection import Candidate
 from vplog.storage.image_file import image_size
 
@@ -57,7 +57,7 @@ def _candidate(channel: Channel, count: int, kind: str, first: ImageMessage | Ca
         if not codec and (is_depth(first) or named):
             role = "depth"
     calibrated = isinstance(first, CalibrationMessage) and bool(first.matrix[0, 0] > 0)
-    frame = clean(first.frame) if first else ""
+    frame = frame_name(first.frame) if first else ""
     supported = not isinstance(first, ImageMessage) or is_image(first)
     return Candidate(channel, count, role, frame, calibrated, codec, encoding, size or (0, 0), supported)
 

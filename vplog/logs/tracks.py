@@ -19,7 +19,7 @@ from vplog.logs.messages.decode import Poses
 from vplog.logs.messages.nmea import SENTENCES
 from vplog.logs.messages.records import FixMessage, ImuMessage, PoseMessage
 from vplog.logs.stamps import Stamps
-from vplog.logs.tf_odometry import are_usable, clean
+from vplog.logs.tf_odometry import are_usable, frame_name
 
 _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 """ROS orders x y z, then rotations about X Y Z; vplog the other way."""
@@ -71,9 +71,9 @@ class PoseTrack:
 
     def add_all(self, poses: Poses, log_ns: list[int], positions: list[int] | None = None) -> None:
         """Add several messages that name the same frames."""
-        self.child = self.child or clean(poses.child)
-        self.parent = self.parent or clean(poses.frame)
-        if clean(poses.child) != self.child:
+        self.child = self.child or frame_name(poses.child)
+        self.parent = self.parent or frame_name(poses.frame)
+        if frame_name(poses.child) != self.child:
             self._others += len(log_ns)
             return
         usable = are_usable(poses.poses)

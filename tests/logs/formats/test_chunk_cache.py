@@ -107,8 +107,8 @@ def test_messages_are_found_in_place_as_in_the_whole(
             ChunkReader(3, len(data), dict(CHANNELS), lambda *one, to=to: to.append(one), wanted, header_only)  # pyrefly: ignore[missing-attribute]
             for to in defined
         ]
-        whole = walks[0].whole(data)
-        there = walks[1].in_place(lambda start, length: data[start : start + length])
+        whole = walks[0].read(data)
+        there = walks[1].read_in_place(lambda start, length: data[start : start + length])
         assert defined[0] == defined[1]
         assert walks[0].__dict__.keys() == walks[1].__dict__.keys()
         for name in ("position", "last_ns", "counts"):

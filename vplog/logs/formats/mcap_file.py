@@ -85,7 +85,7 @@ class McapFile:
             else:
                 data = self._data(number)
                 reader = ChunkReader(number, len(data), self._channels, self._define, None, cut=chunk.cut)
-                times += sampled([message.log_ns for message in reader.whole(data)])
+                times += sampled([message.log_ns for message in reader.read(data)])
                 damaged = self._account_for_chunk(chunk, reader) or not data
                 counts.update(reader.counts | Counter(chunk.counts) if damaged else reader.counts)
                 if not damaged:
@@ -103,9 +103,9 @@ class McapFile:
             end = chunk.stop - chunk.start if data is None else len(data)
             reader = ChunkReader(number, end, self._channels, self._define, wanted, header_only, chunk.cut)
             if data is None:
-                yield from reader.in_place(lambda start, length, at=chunk.start: self._at(at + start, length))
+                yield from reader.read_in_place(lambda start, length, at=chunk.start: self._at(at + start, length))
             else:
-                yield from reader.whole(data)
+                yield from reader.read(data)
             self._account_for_chunk(chunk, reader)
 
     def read(self, place: Place) -> RawData:
@@ -143,7 +143,7 @@ class McapFile:
         """Take the schemas and channels of all chunks, and those of a damaged summary where no chunk has them."""
         for number in range(len(self._layout.chunks)):
             data = self._data(number)
-            ChunkReader(number, len(data), self._channels, self._define, None).whole(data)
+            ChunkReader(number, len(data), self._channels, self._define, None).read(data)
         for opcode, data in self._layout.summary_definitions:
             self._define(opcode, data, doubtful=True)
         self._layout.summary_definitions.clear()
@@ -176,7 +176,7 @@ class McapFile:
     def _add_damaged_chunk(self, number: int, error: BadChunkError) -> None:
         """Account for a damaged chunk, and take its schemas and channels, which other chunks need."""
         define = partial(self._define, doubtful=True)
-        ChunkReader(number, len(error.data), self._channels, define, None).whole(error.data)
+        ChunkReader(number, len(error.data), self._channels, define, None).read(error.data)
         self._unread[number] = f", left out: {error}"
         self._add_unread(number)
 
@@ -228,33 +228,33 @@ class ChunkReader:
         """Messages by channel id."""
         return Counter(self._ids)
 
-    def whole(self, data: bytes) -> list[Message]:
+    def read(self, data: bytes) -> list[Message]:
         """The messages of the chunk, of which `data` are all bytes."""
-        self._go(data)
-        return self._sound()
+        self._parse(data)
+        return self._without_damaged()
 
-    def in_place(self, read: Callable[[int, int], bytes]) -> list[Message]:
+    def read_in_place(self, read: Callable[[int, int], bytes]) -> list[Message]:
         """The messages of a chunk that is not packed, from what `read(start, length)` gives of its bytes."""
         while (left := self.end - self.position) >= RECORD.size:
             before = self.position
             data = read(before, min(_WINDOW, left))
-            self._go(data)
+            self._parse(data)
             if self.position == before:
                 length = RECORD.size + RECORD.unpack_from(data)[1] if len(data) >= RECORD.size else left + 1
                 if not len(data) < length <= left:
                     break
-                self._go(read(before, length))
+                self._parse(read(before, length))
                 if self.position == before:
                     break
-        return self._sound()
+        return self._without_damaged()
 
-    def _sound(self) -> list[Message]:
+    def _without_damaged(self) -> list[Message]:
         """The messages found, without the one before damage: its length may be what is damaged."""
         if self.position < self.end and not self._cut and self._ids and self._ids.pop() in self._used:
             self._messages.pop()
         return self._messages
 
-    def _go(self, data: bytes) -> None:
+    def _parse(self, data: bytes) -> None:
         """On through `data`, which lie at `position` in the chunk, up to the first record that more is needed of."""
         base, at, size, left = self.position, 0, len(data), self.end - self.position
         used = self._used
@@ -274,7 +274,7 @@ class ChunkReader:
                     place = self.number, base + start, base + stop
                     self._messages.append(Message(used[channel_id], log_ns, part_of(data, start, stop), place))
             elif opcode in _DEFINES:
-                self._learn(opcode, data[at + RECORD.size : stop])
+                self._take_definition(opcode, data[at + RECORD.size : stop])
             at = stop
         while at + RECORD.size <= size:  # too short for a message
             opcode, length = RECORD.unpack_from(data, at)
@@ -282,11 +282,11 @@ class ChunkReader:
             if stop > size or opcode == _IS_MESSAGE or opcode in _OUTSIDE:
                 break
             if opcode in _DEFINES:
-                self._learn(opcode, data[at + RECORD.size : stop])
+                self._take_definition(opcode, data[at + RECORD.size : stop])
             at = stop
         self.position = base + at
 
-    def _learn(self, opcode: int, data: bytes) -> None:
+    def _take_definition(self, opcode: int, data: bytes) -> None:
         """Take a definition; it may be of a wanted channel, and a log may have ten thousands of them."""
         self._define(opcode, data)
         number = int.from_bytes(data[:2], "little")  # of a schema or channel record, its first field
