@@ -24,8 +24,8 @@ from vplog.logs.formats.container import Channel
 from vplog.logs.topic_selection import Candidate, Selection, TopicChoice, further_cameras
 from vplog.loops.propose import Proposals
 from vplog.results import tables
-from vplog.results.camera_pictures import CameraPictures
 from vplog.results.mcap_read import read_pictures
+from vplog.results.run_cameras import CameraPictures
 from vplog.results.run_record import read_run_json
 from vplog.run import cameras
 from vplog.verbs.demo import SMALL, make_drive

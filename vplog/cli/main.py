@@ -53,7 +53,10 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
     words = sys.argv[1:] if argv is None else argv
     root = _parser()
     if "_ARGCOMPLETE" in os.environ:  # set by the shell's completion, of the extra `completion`
-        _complete(root)
+        with suppress(ImportError):
+            import argcomplete
+
+            argcomplete.autocomplete(root)  # writes the words that may follow, and exits
     arguments = root.parse_args(words)
     arguments.command = words
     arguments.shown = getattr(arguments, "output", None)  # a verb may write elsewhere first
@@ -85,14 +88,6 @@ def _run_verb(argv: Sequence[str] | None) -> NoReturn:
         text = " ".join(str(error).split())[:200]
         _fail(arguments, f"Internal error: {type(error).__name__}: {text}. See it with --debug.")
     sys.exit(0)
-
-
-def _complete(root: argparse.ArgumentParser) -> None:
-    """Write the words that may follow those in the environment, and exit; nothing without argcomplete."""
-    with suppress(ImportError):
-        import argcomplete
-
-        argcomplete.autocomplete(root)
 
 
 @contextmanager

@@ -7,6 +7,7 @@ Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -203,3 +204,12 @@ def _relative_errors(estimated: Floats, true: Floats, first: Ints, last: Ints) -
 
 def _rms(error: Floats) -> float:
     return float(np.sqrt(np.mean(error**2)))
+
+
+def motion_figures(motions: Floats) -> dict[str, Any]:
+    """Samples, and RMSE and maximum of distances (m) and angles (deg), of motions (K, 4, 4); None where K is 0."""
+    found: dict[str, Any] = {"samples": len(motions)}
+    for unit, values in (("m", np.linalg.norm(motions[:, :3, 3], axis=1)), ("deg", np.degrees(se3.angle(motions)))):
+        found[f"rmse_{unit}"] = float(np.sqrt((values**2).mean())) if len(values) else None
+        found[f"max_{unit}"] = float(values.max()) if len(values) else None
+    return found

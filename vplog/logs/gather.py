@@ -11,7 +11,7 @@ from vplog.data import Ints
 from vplog.errors import plural
 from vplog.logs.formats.container import HEADER_BYTES, Channel, Message, Notes, Place, RawData
 from vplog.logs.formats.loss_account import LossRuns
-from vplog.logs.messages.decode import decode, read_poses, stamp_of
+from vplog.logs.messages.decode import FRAME_ID_AT, decode, read_poses, stamp_of
 from vplog.logs.messages.records import (
     BadMessageError,
     CalibrationMessage,
@@ -29,8 +29,6 @@ from vplog.logs.tf_odometry import DynamicTransforms
 from vplog.logs.topic_selection import Selection
 from vplog.logs.tracks import FixTrack, ImuTrack, PoseTrack
 
-_HEADER = 12
-"""Bytes before the frame_id of a message with a header: encapsulation (CDR) or sequence number (ROS 1), and stamp."""
 PARTS = ("lidar", "mask", "right", "depth", "image")
 """Topics of images and scans of a selection; what is several of them is the last."""
 PATH = "nav_msgs/Path"
@@ -89,7 +87,7 @@ class Calibrations:
     _first: CalibrationMessage | None = None
 
     def add(self, calibration: CalibrationMessage, data: RawData | Record, position: int) -> None:
-        self._last = bytes(data[_HEADER:]) if isinstance(data, bytes | memoryview) else b""
+        self._last = bytes(data[FRAME_ID_AT:]) if isinstance(data, bytes | memoryview) else b""
         self._first = self._first or calibration
         if not calibration.is_set:
             self.unset += not self.found
@@ -101,7 +99,7 @@ class Calibrations:
         """Whether a message of ROS is that before it but for its stamp."""
         if not self.found or self.channel.encoding not in ("cdr", "ros1"):
             return False
-        return isinstance(data, bytes | memoryview) and data[_HEADER:] == self._last
+        return isinstance(data, bytes | memoryview) and data[FRAME_ID_AT:] == self._last
 
     def finish(self, images: Stamps, times: Stamps, notes: Notes) -> list[CalibrationMessage]:
         """The calibrations that are set; the first one where none is. Each with the stamp of the first of the `images`

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from vplog.data import USED, Closures, Floats, Ints
+from vplog.evaluate.trajectory import motion_figures
 from vplog.geometry import se3
-from vplog.maps.joining.joint_record import Component, joint_components, keyframe_poses
+from vplog.maps.joining.joint_record import joint_components, keyframe_poses
 from vplog.maps.storage.map_store import Store, reading
 from vplog.results import tables
 from vplog.storage.json_records import differences
@@ -74,7 +75,7 @@ def _content(store: Store) -> _Content:
     for drive in abouts:
         closures |= _pairs(tables.read_closures(store.file(drive, "closures.parquet")), drive, drive, stamps)
     own = len(closures)
-    for component in dict.fromkeys(_key(one) for one in joint.values()):
+    for component in dict.fromkeys(one.folder.name for one in joint.values()):
         path = store.root / "joint" / component / "joins.parquet"
         if store.mirror is not None:
             store.mirror.rest([path.relative_to(store.root).as_posix()])
@@ -82,10 +83,6 @@ def _content(store: Store) -> _Content:
             closures |= _pairs(ledger, query, match, stamps)
     frame = {drive: joint[drive].drives[0] if drive in joint else drive for drive in abouts}
     return _Content(store.head().settings, stamps, poses, frame, closures, len(closures) - own)
-
-
-def _key(component: Component) -> str:
-    return component.folder.name
 
 
 def _pairs(ledger: Closures, query: str, match: str, stamps: dict[str, Ints]) -> dict[Pair, None]:
@@ -111,9 +108,4 @@ def _moved(before: _Content, after: _Content) -> dict[str, Any]:
         if len(known) >= 3:
             aligned, _ = se3.umeyama(poses[:, :3, 3], known[:, :3, 3])
             apart.append(se3.between(known, aligned @ poses))
-    whole = np.concatenate([np.zeros((0, 4, 4)), *apart])
-    found: dict[str, Any] = {"samples": len(whole)}
-    for unit, values in (("m", np.linalg.norm(whole[:, :3, 3], axis=1)), ("deg", np.degrees(se3.angle(whole)))):
-        found |= {f"rmse_{unit}": float(np.sqrt((values**2).mean())) if len(values) else None}
-        found |= {f"max_{unit}": float(values.max()) if len(values) else None}
-    return found
+    return motion_figures(np.concatenate([np.zeros((0, 4, 4)), *apart]))

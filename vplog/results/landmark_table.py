@@ -16,8 +16,8 @@ import numpy as np
 import pyarrow as pa
 
 from vplog.data import Bytes, Camera, Features, Floats
-from vplog.results.camera_record import camera_from
 from vplog.results.keyframe_table import KeyframeTable, write_groups
+from vplog.results.run_cameras import camera_from
 from vplog.results.tables import column, reading
 from vplog.storage.json_records import plain
 from vplog.storage.parquet_limits import VERSION_ABOUT, VERSION_KEY

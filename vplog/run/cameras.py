@@ -24,7 +24,7 @@ from vplog.loops.verify import VerifySettings, verify_between
 from vplog.loops.verify_rig import Rig, verify_together
 from vplog.places.reference_choice import LibrarySettings
 from vplog.places.sequence import SequenceSettings, rank_places
-from vplog.results.camera_pictures import CameraPictures
+from vplog.results.run_cameras import CameraPictures
 from vplog.run.cache.codecs import closures_codec
 from vplog.run.cache.steps import Steps, step
 from vplog.run.feature_extraction import Extraction, decoded, extract

@@ -18,8 +18,8 @@ from vplog.features.store import FeatureStore
 from vplog.loops.candidate import Drive
 from vplog.loops.undistort import project
 from vplog.loops.verify import VerifySettings, drive_of
-from vplog.results.camera_pictures import camera_pictures, camera_topics
 from vplog.results.landmark_table import write_landmarks
+from vplog.results.run_cameras import camera_pictures, camera_topics
 from vplog.results.run_record import CACHE
 from vplog.run.cache.code_hash import code_of
 from vplog.run.feature_extraction import Extraction, stored_features

@@ -11,6 +11,7 @@ import numpy as np
 from vplog import logs
 from vplog.data import USED, Floats
 from vplog.errors import ResultError, SettingsError
+from vplog.evaluate.trajectory import motion_figures
 from vplog.geometry import se3
 from vplog.results import run_record, tables
 from vplog.results.html import mapping
@@ -133,15 +134,11 @@ def _closures(folder: Path) -> dict[tuple[int, int], None]:
     return dict.fromkeys(pairs)
 
 
-def _moved(folders: Sequence[Path]) -> dict[str, float | int]:
+def _moved(folders: Sequence[Path]) -> dict[str, Any]:
     """Distance and angle between the trajectories of two runs where they have the same stamps."""
     known, poses, _ = _same_stamps(folders)
     aligned, _ = se3.umeyama(poses[:, :3, 3], known[:, :3, 3])
-    apart = se3.between(known, aligned @ poses)
-    found: dict[str, float | int] = {"samples": len(known)}
-    for unit, values in (("m", np.linalg.norm(apart[:, :3, 3], axis=1)), ("deg", np.degrees(se3.angle(apart)))):
-        found |= {f"rmse_{unit}": float(np.sqrt((values**2).mean())), f"max_{unit}": float(values.max())}
-    return found
+    return motion_figures(se3.between(known, aligned @ poses))
 
 
 def _same_stamps(folders: Sequence[Path]) -> tuple[Floats, Floats, Floats]:

@@ -19,7 +19,7 @@ _NUMBERS = {
     "geometry_msgs/TransformStamped": (7, 0),
 }
 """float64 at the end of a message: x y z, x y z w and a (6, 6) covariance; and those of a twist behind them."""
-_HEAD = 12
+FRAME_ID_AT = 12
 """Bytes before the names of frames: CDR's encapsulation of 4 bytes or ROS 1's sequence number, then the stamp."""
 
 
@@ -43,7 +43,7 @@ def decode(channel: Channel, data: RawData | Record) -> Record:
 def stamp_of(channel: Channel, data: RawData | Record) -> int:
     """The header stamp in ns, of ROS without looking at the rest. Raises BadMessageError."""
     if channel.encoding in ("cdr", "ros1") and isinstance(data, bytes | memoryview):
-        if len(data) < _HEAD:
+        if len(data) < FRAME_ID_AT:
             raise BadMessageError(f"{len(data)} bytes are too few for a header")
         cdr, order = channel.encoding == "cdr", "<" if channel.encoding == "ros1" or data[1] == 1 else ">"
         return nanoseconds(*struct.unpack_from(f"{order}{'i' if cdr else 'I'}I", data, 4))
@@ -96,11 +96,11 @@ def read_ros_poses(channel: Channel, messages: list[bytes]) -> Poses | None:
         return None
     first = decode(channel, messages[0])
     rows = np.frombuffer(b"".join(messages), np.uint8).reshape(-1, size)
-    if not isinstance(first, PoseMessage) or (rows[:, _HEAD:at] != rows[0, _HEAD:at]).any():
+    if not isinstance(first, PoseMessage) or (rows[:, FRAME_ID_AT:at] != rows[0, FRAME_ID_AT:at]).any():
         return None
     if cdr and (rows[:, :4] != (0, 1, 0, 0)).any():  # encapsulation: plain CDR, little endian, no options
         return None
-    stamps = np.ascontiguousarray(rows[:, 4:_HEAD]).view("<u4").astype(np.int64)
+    stamps = np.ascontiguousarray(rows[:, 4:FRAME_ID_AT]).view("<u4").astype(np.int64)
     if cdr and (stamps[:, 0] >= 2**31).any():  # negative
         return None
     numbers = np.ascontiguousarray(rows[:, at:]).view("<f8")

@@ -15,7 +15,7 @@ from vplog.execution.execution import Execution
 from vplog.loops.propose import Proposals, ProposeSettings, propose
 from vplog.loops.verify import Drive, no_closures, verify_between
 from vplog.places.sequence import rank_places
-from vplog.results.camera_pictures import CameraPictures
+from vplog.results.run_cameras import CameraPictures
 from vplog.run.cameras import VIEW_BY_VIEW, best_together, of_keyframes, once
 from vplog.run.place_recognition import shared_of
 from vplog.run.verification import merged

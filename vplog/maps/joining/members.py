@@ -19,9 +19,8 @@ from vplog.loops.verify import VerifySettings, calibration_share, drive_of
 from vplog.maps.storage.layout import described_with, folder_name
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables
-from vplog.results.camera_pictures import CameraPictures, camera_pictures, camera_topics
-from vplog.results.camera_record import camera_from
 from vplog.results.feature_table import FeatureTable, write_features
+from vplog.results.run_cameras import CameraPictures, camera_from, camera_pictures, camera_topics
 from vplog.run.feature_extraction import Extracted, stored_features
 from vplog.run.provenance import stored_log
 from vplog.run.reextraction import ReextractedFeatures

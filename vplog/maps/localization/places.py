@@ -34,9 +34,9 @@ from vplog.maps.storage.layout import PICTURES
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline, recorded_pipeline
 from vplog.results import run_record, tables
-from vplog.results.camera_pictures import camera_pictures
 from vplog.results.geo import Earth
 from vplog.results.landmark_table import LandmarkTable
+from vplog.results.run_cameras import camera_pictures
 from vplog.run.landmarks import landmark_key, landmarks_file, run_drive, write_drive_landmarks
 from vplog.run.provenance import library_at
 from vplog.stages import CodedState, PlaceState

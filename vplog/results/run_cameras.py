@@ -1,16 +1,34 @@
-"""The pictures of each camera of a run, by its tables."""
+"""The cameras of a run: their records, and the pictures of each by its tables."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from vplog.data import Ints, Keyframes
+from vplog.data import Camera, Ints, Keyframes
 from vplog.errors import ResultError
 from vplog.geometry import se3
 from vplog.results import tables
+
+_CAMERA: dict[str, Callable[[Any], Any]] = {
+    "name": str, "distortion_model": str, "width": int, "height": int, "disparity_zero_px": float, "baseline_m": float,
+    "matrix": lambda rows: np.array(rows, np.float64).reshape(3, 3),
+    "distortion": lambda values: np.array(values, np.float64).reshape(-1),
+    "body_from_camera": lambda rows: np.array(rows, np.float64).reshape(4, 4),
+}  # fmt: skip
+"""Fields of a camera, from plain values."""
+
+
+def camera_from(values: dict[str, Any], again: str) -> Camera:
+    """The camera of plain values. Raises ResultError, with the remedy `again`, where the values are not one."""
+    try:
+        known = {name: kind(values[name]) for name, kind in _CAMERA.items() if values[name] is not None}
+        return Camera(**(dict[str, Any](matrix=None, baseline_m=None) | known))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ResultError(f"The record of a camera is damaged: {error}. {again}") from None
 
 
 class CameraPictures(NamedTuple):
