@@ -21,7 +21,7 @@ from tests.results.example import COUNT, METADATA, make_run
 from tests.results.test_mcap import decode, of
 from vplog.data import USED, Gps, Verdict
 from vplog.errors import ResultError
-from vplog.results import foxglove, geo, mcap_read
+from vplog.results import geo, mcap_read
 from vplog.results.contracts import TOPICS
 from vplog.results.geo import Earth
 from vplog.results.mcap import McapExtras, ReferenceBoxes, camera_topic, write_mcap
@@ -162,21 +162,11 @@ def test_pictures_references_and_fixes_come_back(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(found.gps, name), getattr(GPS, name))
 
 
-def test_rows_of_pictures_are_those_of_the_metadata_or_of_older_frames(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pictures_without_rows_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mcap_read, "_picture_rows", lambda _: [])
     write(tmp_path / "new.mcap")
     with pytest.raises(ResultError, match="cannot be read"):
         mcap_read.read_pictures(tmp_path / "new.mcap")
-    order, image = sorted(SHOWN.pictures, key=lambda row: (int(RUN.closures.query[row]), row)), foxglove.image
-    older = [f"closure_{row}" for row in (7, *(row + 5 for row in order))]
-    monkeypatch.setattr(
-        foxglove, "image", lambda ns, frame, data: image(ns, older.pop(0) if frame == "closure" else frame, data)
-    )
-    write(tmp_path / "old.mcap")
-    found = mcap_read.read_pictures(tmp_path / "old.mcap").pictures
-    assert {row + 5: SHOWN.pictures[row] for row in order}.items() <= found.items()
 
 
 @pytest.mark.parametrize("cut", [0, 7, 100, 5000, -10])

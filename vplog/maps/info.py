@@ -40,7 +40,7 @@ def _damaged_files(store: Store) -> list[str]:
         lines = [line for folder in folders for line in damaged_files(folder)]
         names = (name for name in regular_files(store.root) if name.endswith(".parquet") and name[:5] != "runs/")
         return [*lines, *filter(None, (damaged_table(store.root / name) for name in names))]
-    wrong = list(store.mirror.damaged.values())
+    wrong: list[str] = []
     for drive in list(store.mirror.drives):
         try:
             store.full_run(drive)

@@ -53,7 +53,7 @@ class CameraPicture:
 
 def read_pictures(path: Path) -> McapContent:
     """The pictures, references and fixes of a result.mcap. Raises ResultError where it is missing or damaged."""
-    rows, pictures, references, fixes, views, thumbnails = [], [], {}, [], {}, {}
+    pictures, references, fixes, views, thumbnails = [], {}, [], {}, {}
     with _reading(path) as reader:
         for attachment in reader.iter_attachments():
             if named := re.fullmatch(r"reference-(\d{1,6})\.jpg", attachment.name):
@@ -66,11 +66,8 @@ def read_pictures(path: Path) -> McapContent:
             if channel.topic == FIXES:
                 fixes.append(LocationFix.FromString(message.data))
                 continue
-            picture = CompressedImage.FromString(message.data)
-            pictures.append(picture.data)
-            if named := re.fullmatch(r"closure_(\d{1,9})", picture.frame_id):  # as older versions named the frame
-                rows.append(int(named[1]))
-        named = list(zip(rows or _picture_rows(reader), pictures, strict=True))
+            pictures.append(CompressedImage.FromString(message.data).data)
+        named = list(zip(_picture_rows(reader), pictures, strict=True))
     by_row = {row: data for row, data in named if row is not None}
     return McapContent(by_row, views, references, _gps(fixes) if fixes else None, thumbnails)
 

@@ -378,13 +378,3 @@ def test_drives_that_satellites_tell_apart_are_not_compared(copy: Path) -> None:
     far = PIPELINE.model_copy(update={"join": JoinSettings(apart_m=1.0)})
     with map_store.reading(copy) as store:
         assert candidates.drives_to_search(store, records, later, state, far)[3] == [1, 2]
-
-
-def test_states_of_an_older_vplog_are_taken_over(whole: Path, copy: Path) -> None:
-    """Of each drive in a file of its own."""
-    for row in read_compressed(copy / STATES_FILE):
-        older = {name: row[name] for name in ("drive", "position", "member", "made_from", "pairs")}
-        run_record.write_run_json(copy / "joins" / f"drive={row['drive']}" / "joins.json", older)
-    (copy / STATES_FILE).unlink()
-    assert joined(copy)["searched"] == []
-    assert digests(copy) == digests(whole)

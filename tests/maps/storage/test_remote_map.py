@@ -27,7 +27,6 @@ from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import UnreachableError
 from vplog.pipeline import load_pipeline
 from vplog.results import tables
-from vplog.storage.json_records import with_checksum
 from vplog.storage.remote_path import located, objects_below
 
 if TYPE_CHECKING:
@@ -660,41 +659,3 @@ def test_a_damaged_joint_record_stops_no_writer(root: Any, verb: Callable[..., S
         assert "map join" in damage_warnings(store)[0]
     assert rest_of(root) == {"joins/drive=one/joins.parquet": "{}"}
     assert not any(name.startswith(("joint", "joins/drive=two")) for name in names(root))
-
-
-def test_a_map_of_the_format_before_is_read_and_goes_on(root: Any, verb: Callable[..., Said]) -> None:
-    """Every drive had its own manifest; the next writer makes a snapshot of them."""
-    make_map(root, {"one": 1, "two": 2, "bad": 3})
-    with map_store.writing(root) as store:
-        write_rest(store, "1")
-        store.update_failures({"failed": {"log": "failed.mcap", "error": "why"}})
-    made = snapshot.Manifest(root).now
-    generations = {name: about["generation"] for name, about in made["rest"].items()}
-    files = {name: {"bytes": about["bytes"], "sha256": about["sha256"]} for name, about in made["rest"].items()}
-    for name in files:
-        objects.copy(root / "rest" / generations[name] / name, root / "rest" / ("1" * 16) / name)
-    olds: dict[str, dict[str, Any]] = {
-        "map.json": {"format": 1, "library": made["library"], "settings": made["settings"]},
-        "rest.json": {"generation": "1" * 16, "replaces": None, "files": files}, "failures.json": made["failures"],
-    }  # fmt: skip
-    for drive, one in made["drives"].items():
-        olds[f"runs/drive={drive}/drive.json"] = {
-            **one["record"], "generation": one["generation"], "replaces": None, "files": one["files"],
-        }  # fmt: skip
-    olds["runs/drive=bad/drive.json"].pop("files")
-    objects.remove(root / "snapshots")
-    for name, record in olds.items():
-        (root / name).ask("put", json.dumps(with_checksum(record)).encode())
-    assert same_state(root) == {"one": {1}, "two": {2}}
-    said = verb("map", "info", root, "--json").json
-    assert said["failures"].keys() == {"failed"}
-    assert "drive.json is not a manifest" in said["damaged"]["bad"]
-    assert rest_of(root)["joint.json"] == "1"
-    with map_store.writing(root) as store:
-        put(store, "three", 3)
-    assert snapshot.Manifest(root).log[0]["version"] > 0
-    assert upload.vacuum(store.mirror, -1.0)["objects"] > 0  # pyrefly: ignore[bad-argument-type]
-    assert not any(name.endswith(("drive.json", "rest.json")) for name in names(root))
-    assert same_state(root) == {"one": {1}, "two": {2}, "three": {3}}
-    assert rest_of(root)["joint.json"] == "1"
-    assert (root / "libraries" / LIBRARY / "library.json").exists()

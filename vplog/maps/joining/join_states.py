@@ -12,8 +12,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from vplog.errors import ResultError
-from vplog.maps.storage.layout import folder_name
-from vplog.results import run_record
 from vplog.storage.compressed_json import read_compressed, write_compressed
 
 if TYPE_CHECKING:
@@ -22,8 +20,6 @@ if TYPE_CHECKING:
 STATES = "states-"
 _OF_EACH = 512
 """Positions of a file: with 30 pairs a drive it has some 5 MB, a tenth of that compressed."""
-_OLDER = "joins.json"
-"""In the folder of each drive, in maps of an older vplog."""
 _PAIR = {"match": str, "match_key": str, "candidates": int, "verified": int, "ledger": str}
 
 
@@ -63,8 +59,7 @@ class JoinState:
 
 def read_states(store: Store, drives: Collection[str]) -> dict[str, JoinState]:
     """The states that are known of these drives; of a damaged file none."""
-    names = store.names_beside("joins")
-    files = sorted(f"joins/{name}" for name in names if name.startswith(STATES))
+    files = sorted(f"joins/{name}" for name in store.names_beside("joins") if name.startswith(STATES))
     store.fetch_beside(files)
     found, text = dict[str, JoinState](), dict[str, str]()
     for name in files:
@@ -75,16 +70,6 @@ def read_states(store: Store, drives: Collection[str]) -> dict[str, JoinState]:
         for row in rows if isinstance(rows, list) else ():
             if (state := _state(row, text)) is not None and state.drive in drives:
                 found[state.drive] = state
-    older = {drive: f"joins/{folder_name(drive)}/{_OLDER}" for drive in drives if drive not in found}
-    older = {drive: name for drive, name in older.items() if name.split("/")[1] in names}
-    store.fetch_beside(older.values())
-    for drive, name in older.items():
-        try:
-            record = run_record.read_run_json(store.root / name)
-        except ResultError:
-            continue
-        if (state := _state({**record, "drive": drive}, text)) is not None:
-            found[drive] = state
     return found
 
 
@@ -97,9 +82,6 @@ def write_states(store: Store, states: Iterable[JoinState], changed: Collection[
         if any(one.drive in changed for one in inside):
             rows = [asdict(one) for one in sorted(inside, key=lambda one: (one.position, one.drive))]
             write_compressed(store.root / "joins" / f"{STATES}{number:05d}.json.gz", rows)
-    for name in (f"joins/{folder_name(drive)}/{_OLDER}" for drive in changed):
-        if store.has_beside(name):
-            store.remove_beside(name)
 
 
 def _state(row: Any, text: dict[str, str]) -> JoinState | None:

@@ -141,7 +141,7 @@ class Store:
         if self.mirror is None:
             return drive_record(self.root / "runs" / folder_name(drive))
         if drive not in self.mirror.drives:
-            raise ResultError(self.mirror.damaged.get(drive, f"{self} has no drive {drive!r}."))
+            raise ResultError(f"{self} has no drive {drive!r}.")
         return self.mirror.drives[drive]["record"]
 
     def figures(self, drive: str) -> dict[str, Any]:

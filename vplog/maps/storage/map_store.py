@@ -58,7 +58,7 @@ def reading(root: Path, cache: Cache | None = None, as_of: str | None = None) ->
     try:
         with scratch("map", None if cache is None else cache.open_folders) as folder:
             mirror = Mirror(root, folder, cache, as_of=as_of)
-            yield Store(folder, mirror, mirror.damaged)
+            yield Store(folder, mirror)
     finally:
         if cache is not None:
             cache.trim()
@@ -94,7 +94,7 @@ def _writing_remote(root: RemotePath) -> Iterator[Store]:
             upload.begin(mirror)
         except UnreachableError as error:
             raise SettingsError(f"{error} Choose another place with -o.") from None
-        store = Store(folder, mirror, mirror.damaged)
+        store = Store(folder, mirror)
         store.staging.mkdir()
         try:
             yield store

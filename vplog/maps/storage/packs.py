@@ -68,7 +68,7 @@ def _plan(mirror: Mirror) -> list[list[_Member]]:
         (drive, name, about)
         for drive, entry in sorted(entries.items())
         for name, about in sorted(entry["files"].items())
-        if about["bytes"] <= MOST_SECTION // 2 and about["sha256"]
+        if about["bytes"] <= MOST_SECTION // 2
     ]
     used = Counter[str]()
     for _, _, about in small:

@@ -88,8 +88,6 @@ class Mirror:
         self.manifest = Manifest(remote, as_of)
         self.drives: dict[str, dict[str, Any]] = dict(self.manifest.now["drives"])
         """As the snapshot has them."""
-        self.damaged = dict(self.manifest.damaged)
-        """Drives of an older map that cannot be read, and why."""
         self.held: dict[str, dict[str, Any]] = {}
         """Files beside drives that were fetched or sent, by name."""
         self.rest_damage = ""
@@ -275,7 +273,7 @@ class Mirror:
         if about is None or target.exists():
             return ""
         target.parent.mkdir(parents=True, exist_ok=True)
-        if self.cache is not None and about["sha256"] and self.cache.fetch_to(about["sha256"], target):
+        if self.cache is not None and self.cache.fetch_to(about["sha256"], target):
             return ""
         part = target.with_name(f".{target.name}.part")
         try:
@@ -289,7 +287,7 @@ class Mirror:
             raise
         except OSError as error:
             raise UnreachableError(f"Cannot read {place}: {reason(error)}. Try again later.") from None
-        if (about["sha256"] or digest, about["bytes"]) != (digest, part.stat().st_size):
+        if (about["sha256"], about["bytes"]) != (digest, part.stat().st_size):
             part.unlink()
             return f"{place} does not have the length and sha256 that its manifest names"
         part.replace(target)
@@ -328,7 +326,6 @@ class Mirror:
             folder.parent.mkdir(parents=True, exist_ok=True)
             made.rename(folder)
         self.drives[drive] = entry
-        self.damaged.pop(drive, None)
 
     def run(self, drive: str) -> Path:
         """The drive's local folder."""

@@ -25,15 +25,14 @@ from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, cast
-from urllib.parse import unquote
 
 from pydantic import ConfigDict, Field, StrictInt, TypeAdapter, with_config
 from typing_extensions import TypedDict  # as pydantic needs it below Python 3.12
 
 from vplog.errors import ResultError, SettingsError
-from vplog.maps.storage import objects, older_maps
+from vplog.maps.storage import objects
 from vplog.maps.storage.damage import UnreachableError
-from vplog.maps.storage.layout import ADD_AGAIN, FORMAT, folder_name
+from vplog.maps.storage.layout import FORMAT
 from vplog.storage.folders import is_below
 from vplog.storage.json_records import has_checksum, with_checksum
 from vplog.storage.parquet_limits import check_version
@@ -41,7 +40,7 @@ from vplog.storage.remote_path import RemotePath, reason
 from vplog.version import __version__
 
 STORE_FORMAT, PACKED_FORMAT = FORMAT + 1, FORMAT + 2
-"""Versions of this manifest, before and after `map compact`. Before them each drive had its own (older_maps.py)."""
+"""Versions of this manifest, before and after `map compact`."""
 LISTED = 100
 """Snapshots that map.json names, 200 bytes each."""
 _TRIES, _PAUSE_S = 100, 0.02
@@ -81,8 +80,7 @@ class _Pack(TypedDict):
 
 class _File(TypedDict):
     bytes: StrictInt
-    sha256: Annotated[str, Field(pattern="^([0-9a-f]{64})?$")]
-    """Empty where it is not known, in a library that an older vplog sent."""
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     tag: NotRequired[str]
     """ETag."""
     rows: NotRequired[StrictInt]
@@ -178,8 +176,6 @@ class Manifest:
         self.now: Snapshot
         self.layers: list[tuple[dict[str, Any], dict[str, Any]]] = []
         """Name and content of those of the newest snapshot."""
-        self.damaged: dict[str, str] = {}
-        """Why drives of an older map cannot be read."""
         self.read()
 
     def read(self) -> None:
@@ -193,12 +189,7 @@ class Manifest:
                 return
             head = _json(found.data, place)
             check_version(cast("Path", place), head.get("format"), PACKED_FORMAT, head.get("vplog"))
-            if head["format"] < STORE_FORMAT and self.as_of is None:
-                self._read_older(head)
-                return
             rows = _validated(_ROWS, head.get("snapshots", []), place)
-            if not rows and head["format"] < STORE_FORMAT:
-                raise SettingsError(f"{self.remote} has no snapshots before the next change. Leave out --as-of.")
             if not rows:
                 raise ResultError(f"{place} names no snapshot: it is damaged. Copy it back from a backup.")
             if self.as_of is not None:
@@ -210,7 +201,7 @@ class Manifest:
                     (row, known.get(row["object"]) or self._object(row, _LAYER)) for row in top.pop("layers")
                 ]
                 self.now = top | _merged([*(layer for _, layer in self.layers), top])
-            self.log, self.damaged = rows, {}
+            self.log = rows
 
     def _object(self, row: dict[str, Any], kind: TypeAdapter[Any]) -> dict[str, Any]:
         """A snapshot or a layer. Raises ResultError, and OSError."""
@@ -226,24 +217,6 @@ class Manifest:
             return _checked(kind.validate_json(zlib.decompressobj(31).decompress(data, _MOST_BYTES)), place)
         except (ValueError, zlib.error):
             raise _no_snapshot(place) from None
-
-    def _read_older(self, head: dict[str, Any]) -> None:
-        """Take a map of the format before snapshots as one, but for drives that cannot be read."""
-        found, drives = older_maps.read(self.remote, head)
-        self.damaged, sound = {}, dict[str, Any]()
-        for folder, entry in drives.items():
-            place = self.remote / "runs" / folder / "drive.json"
-            try:
-                drive = entry["record"].get("drive", "")
-                checked({**empty(), "drives": {drive: entry}}, place)
-                if folder != folder_name(drive):
-                    raise ResultError("")
-                sound[drive] = entry
-            except ResultError:
-                self.damaged[unquote(folder.removeprefix("drive="))] = (
-                    f"{place} is not a manifest of vplog. Move it out of the map, and {ADD_AGAIN}"
-                )
-        self.now = checked({**empty(), **found, "drives": sound}, self.remote / "map.json")
 
     def commit(self, what: str, change: Callable[[Snapshot], object]) -> None:
         """Make `change` to the newest snapshot; it is called again where another writer comes in between, and may raise
@@ -277,7 +250,7 @@ class Manifest:
         head = with_checksum({"format": version, "vplog": __version__, "snapshots": rows})
         written = objects.put_if(self.remote / "map.json", json.dumps(head, indent=1).encode(), self.version)
         if written is not None:
-            self.version, self.log, self.now, self.layers, self.damaged = written, rows, wanted, layers, {}
+            self.version, self.log, self.now, self.layers = written, rows, wanted, layers
             return True
         self.read()
         if row in self.log:  # the response was lost, and this is a repetition

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from vplog.errors import ResultError, SettingsError
-from vplog.maps.storage import objects, older_maps
+from vplog.maps.storage import objects
 from vplog.maps.storage.damage import complete_record, rows_of
 from vplog.maps.storage.layout import (
     RUN_TABLES,
@@ -38,7 +38,7 @@ VACUUM_S = 86_400
 """Age below which nothing is removed: no upload of a drive takes a day."""
 _PROBE = ".conditional-writes"
 """An empty object that no write may replace, for the store itself to show that it heeds conditions."""
-_OWN = ("runs", "packs", "rest", "libraries", "snapshots", "joins", "joint", *TABLES, *older_maps.NAMES)
+_OWN = ("runs", "packs", "rest", "libraries", "snapshots", "joins", "joint", *TABLES)
 """Names in a map's folder that are of vplog."""
 _FIGURES = ("counts", "totals", "warnings", "descriptor_bits")
 """Fields of run.json that `map info` shows."""
