@@ -119,8 +119,8 @@ def best_hypothesis(
         found.append(replace(alone, log_evidence=alone.log_evidence + margin))
     best = _likeliest(found)[0] if cost is None else _least_cost(claimed, found, cost)
     if best.weight[loops].any():
-        others = attempted(lambda: _undisputed(claimed, best, found, cost))
-        others = others or attempted(lambda: _readmitted(claimed, best, optimiser, cost))
+        others = attempted(lambda: _readmitted(claimed, best, optimiser, cost))
+        others = others or attempted(lambda: _undisputed(claimed, best, found, cost))
     elif log_odds is not None:
         some = _likeliest([one for one in found if one.weight[loops].any()])
         others = attempted(lambda: [one for one in some if _recognised(claimed, one, chain, log_odds, cost)])
