@@ -151,8 +151,8 @@ class City:
             shared_references=[np.empty(0, np.uint16)] * count, shared_overlap=[np.empty(0, np.float32)] * count,
             matches=rows, landmarks=rows, inliers=rows, spread=shares, reverse_inliers=rows, scale=["depth"] * count,
             match_from_query=measured, information=np.broadcast_to(np.diag(CLOSURE**-2.0), (count, 6, 6)).copy(),
-            verdict=[Verdict.ACCEPTED] * count, p_false=np.full(count, P_FALSE), residual_before=nan, residual_after=nan,
-            weight=nan, query_camera=rows, match_camera=rows,
+            verdict=[Verdict.ACCEPTED] * count, p_false=np.full(count, P_FALSE), residual_before=nan,
+            residual_after=nan, weight=nan, query_camera=rows, match_camera=rows,
         )  # fmt: skip
         path = self.root / "joins" / f"drive=d{later:06d}" / f"match=d{earlier:06d}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
