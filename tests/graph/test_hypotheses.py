@@ -256,3 +256,24 @@ def test_sets_are_compared_at_the_same_sigmas() -> None:
     """47 true and 32 false closures: by the sigmas that each implies, a set without 19 of the true ones is likelier."""
     room = world(1795648788)
     np.testing.assert_array_equal(back_ends.vplog_run(room).kept, room.is_true)
+
+
+@pytest.mark.parametrize(("less_likely", "disputed"), [(1.0, True), (20.0, False)])
+def test_what_contradicting_sets_have_in_common_is_true(less_likely: float, disputed: bool) -> None:
+    factors = Factors.of(ring(80, loops=30).graph)
+    loops = np.flatnonzero(is_loop(factors.graph))
+    best, other, part = (np.ones(len(factors.graph.a)) for _ in range(3))
+    best[loops[:3]] = other[loops[-5:]] = part[loops[:20]] = 0.0
+    sets, poses = (best, other, part), factors.graph.world_from_body
+    found = [hypotheses.hypothesis_of(factors, one, poses, Sigmas()) for one in sets]
+    found = [replace(one, log_evidence=-fall) for one, fall in zip(found, (0.0, less_likely, 1.0), strict=True)]
+    common = hypotheses._undisputed(factors, found[0], found, None)
+    assert [one.weight.tolist() for one in common] == ([np.minimum(best, other).tolist()] if disputed else [])
+
+
+def test_a_larger_family_of_false_closures_is_told_from_the_true_set_by_improving_both() -> None:
+    """21 closures an aisle off in two families, and 16 true ones: sets with some of either are likelier at first."""
+    aisles = world(1729006799)
+    answer = back_ends.vplog_run(aisles)
+    assert answer.kept[aisles.is_true].all()
+    assert answer.kept[~aisles.is_true].sum() <= 2

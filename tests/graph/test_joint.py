@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -19,8 +20,8 @@ SHIFT = se3.exp(np.array([0.1, -0.2, 2.0, 30.0, 10.0, -3.0]))
 CLOSURE = np.diag(1.0 / drives.CLOSURE_SIGMA**2)
 
 
-def lap(seed: int) -> tuple[SessionGraph, np.ndarray]:
-    ring = drives.ring(80, loops=10, seed=seed)
+def lap(seed: int, loops: int = 10) -> tuple[SessionGraph, np.ndarray]:
+    ring = drives.ring(80, loops, seed=seed)
     graph = ring.graph
     return SessionGraph(graph, np.array([kind == EdgeKind.ODOMETRY for kind in graph.kind])), ring.true
 
@@ -36,9 +37,28 @@ def between(later: int, earlier: int, true: list[np.ndarray], count: int, seed: 
     z = se3.between(true[earlier][match], true[later][query])
     z = z @ se3.exp(random.normal(size=(count, 6)) * drives.CLOSURE_SIGMA)
     z[:false] = z[:false] @ se3.exp(random.normal(size=(false, 6)) * [0.1, 0.1, 0.5, 4.0, 4.0, 0.3])
-    return Between(
-        later, earlier, query, match, z, np.broadcast_to(CLOSURE, (count, 6, 6)).copy(), np.zeros(count, bool)
-    )
+    information, none = np.broadcast_to(CLOSURE, (count, 6, 6)).copy(), np.zeros(count)
+    return Between(later, earlier, query, match, z, information, none > 0, none)
+
+
+def one_run(true: list[np.ndarray], log_odds: float) -> Between:
+    """Closures of 16 neighbouring keyframes."""
+    every = between(1, 0, true, len(true[1]), seed=3)
+    return replace(some(every, np.arange(20, 36)), log_odds=np.full(16, log_odds))
+
+
+def some(tie: Between, rows: np.ndarray) -> Between:
+    names = ("query", "match", "match_from_query", "information", "of_odometry", "log_odds")
+    return replace(tie, **{name: getattr(tie, name)[rows] for name in names})
+
+
+@pytest.mark.parametrize(("p_false", "maps"), [(0.02, [(0, 1)]), (0.4, [(0,), (1,)]), (0.5, [(0,), (1,)])])
+def test_drives_that_share_one_stretch_are_joined_where_recognition_is_sure(p_false: float, maps: list) -> None:
+    """Nothing but the closures themselves tells how the drives lie to each other."""
+    (first, true_first), (second, true_second) = (lap(seed, loops=0) for seed in (1, 2))
+    ties = one_run([true_first, true_second], math.log(p_false / (1.0 - p_false)))
+    found = join([first, moved(second, SHIFT)], [ties], GncSettings(), JoinSettings(), RefineSettings())
+    assert found.maps == maps
 
 
 def joint_error(poses: list[np.ndarray], true: list[np.ndarray]) -> float:
@@ -128,10 +148,8 @@ def test_one_view_that_looks_like_others_joins_nothing() -> None:
     laps = [lap(seed) for seed in (1, 2)]
     tie = between(1, 0, [true for _, true in laps], 12, 0)
     rows = np.array([3, 3, 3, 3])
-    one = replace(
-        tie, query=tie.query[rows], match=tie.match[rows] + np.arange(-1, 3), of_odometry=tie.of_odometry[rows],
-        match_from_query=tie.match_from_query[rows], information=tie.information[rows],
-    )  # fmt: skip
+    one = some(tie, rows)
+    one = replace(one, match=one.match + np.arange(-1, 3))
     found = join([drive for drive, _ in laps], [one], GncSettings(), JoinSettings(), RefineSettings())
     assert found.maps == [(0,), (1,)]
 
@@ -154,10 +172,7 @@ def looking_alike(true: list[np.ndarray], random: np.random.Generator) -> Betwee
     z = se3.between(true[0][match], true[0][np.full(6, 60)]) @ wrong
     z = z @ se3.between(true[1][np.full(6, 20)], true[1][query])
     z = z @ se3.exp(random.normal(size=(6, 6)) * drives.CLOSURE_SIGMA)
-    return replace(
-        tie, query=query, match=match, match_from_query=z, information=tie.information[rows],
-        of_odometry=tie.of_odometry[rows],
-    )  # fmt: skip
+    return replace(some(tie, rows), query=query, match=match, match_from_query=z)
 
 
 def test_neighbours_of_one_place_that_looks_like_another_join_nothing() -> None:
@@ -178,10 +193,7 @@ def test_places_that_all_look_like_their_neighbours_do_not_part_what_others_join
     rows = np.concatenate([np.arange(start, start + 4) for start in (5, 20, 40)])
     aside = se3.exp(np.array([0.0, 0.0, 0.3, 5.0, 0.0, 0.0]))
     z = se3.inverse(true[0][tie.match[rows]]) @ aside @ true[2][tie.query[rows]]
-    false = replace(
-        tie, query=tie.query[rows], match=tie.match[rows], match_from_query=z, information=tie.information[rows],
-        of_odometry=tie.of_odometry[rows],
-    )  # fmt: skip
+    false = replace(some(tie, rows), match_from_query=z)
     ties = [between(1, 0, true, 15, 0), between(2, 1, true, 15, 1), false]
     found = join([drive for drive, _ in laps], ties, GncSettings(), JoinSettings(), RefineSettings())
     assert found.maps == [(0, 1, 2)]

@@ -44,6 +44,8 @@ _STEADY = 0.2
 """Change of the covariance in a round, as a share, below which it is settled."""
 _UNLIKE = 0.1
 """Autocorrelation below which errors are taken as uncorrelated."""
+_MOST_CORRELATED = 0.99
+"""Correlation of the errors of fixes that follow each other, most."""
 
 
 class GpsSettings(Settings):
@@ -86,8 +88,6 @@ class Fixes:
     warnings: list[str]
     alike: float = 1.0
     """Correlated fixes with the information of one, by which the covariance is multiplied: GPS errors wander."""
-    innovation: float = 1.0
-    """Variance of an error that the error of the fix before it does not predict, as a share."""
 
     def __len__(self) -> int:
         return len(self.row)
@@ -279,25 +279,39 @@ def with_noise_of(fixes: Fixes, inlier: Floats, poses: Floats, checks: float) ->
     of their residuals as far as it is positive (Geyer, Practical Markov Chain Monte Carlo, 1992).
     """
     world = world_from_enu(poses, fixes, np.maximum(inlier, 1e-9))
-    sound = np.flatnonzero(inlier)
-    error = ((antennas(poses, fixes) - world[:3, 3]) @ world[:3, :3] - fixes.enu_m)[sound]
-    root = np.linalg.cholesky(np.linalg.inv(fixes.covariance[sound]))
-    white = (np.swapaxes(root, 1, 2) @ error[:, :, None])[:, :, 0]
-    power = max(float((white**2).mean()), 1e-12)
-    alike, innovation = 1.0, 1.0
+    white = _whitened(poses, fixes, inlier)
+    power, alike = max(float((white**2).mean()), 1e-12), 1.0
     for lag in range(1, len(white) // 4):
         share = float((white[lag:] * white[:-lag]).mean()) / power
         if share < _UNLIKE:
             break
         alike += 2.0 * share
-        innovation = 1.0 - share**2 if lag == 1 else innovation
-    checks = min(max(checks, 0.0), 3.0 * len(sound))
-    factor = most_likely_variance(power * 3.0 * len(sound) / alike, checks / alike) * alike
-    fixes = replace(fixes, covariance=fixes.covariance * factor, alike=alike, innovation=innovation)
+    checks = min(max(checks, 0.0), float(white.size))
+    factor = most_likely_variance(power * white.size / alike, checks / alike) * alike
+    fixes = replace(fixes, covariance=fixes.covariance * factor, alike=alike)
     chi2 = chi2_of_fixes(poses, fixes, world) * alike
     inlier = (chi2 <= chi2_quantile(fixes.settings.inlier_probability, 3)).astype(float)
     _check_enough(inlier)
     return fixes, inlier, factor
+
+
+def _whitened(poses: Floats, fixes: Fixes, inlier: Floats) -> Floats:
+    """(K, 3) errors of the inliers (F,), 0 or 1, in their sigma."""
+    world, sound = world_from_enu(poses, fixes, np.maximum(inlier, 1e-9)), np.flatnonzero(inlier)
+    error = ((antennas(poses, fixes) - world[:3, 3]) @ world[:3, :3] - fixes.enu_m)[sound]
+    root = np.linalg.cholesky(np.linalg.inv(fixes.covariance[sound]))
+    return (np.swapaxes(root, 1, 2) @ error[:, :, None])[:, :, 0]
+
+
+def _autoregressive_cost(white: Floats) -> float:
+    """Negative log density, but for a constant, of errors (K, 3) in sigmas of a first-order autoregression, which is
+    the likeliest of no less noise."""
+    after, before = white[1:], white[:-1]
+    rho = min(max(float((after * before).sum() / max((before**2).sum(), 1e-12)), 0.0), _MOST_CORRELATED)
+    innovation = np.concatenate([white[:1], (after - rho * before) / math.sqrt(1.0 - rho**2)])
+    variance = max(float((innovation**2).mean()), 1.0)
+    log_volume = white.size * math.log(variance) + after.size * math.log(1.0 - rho**2)
+    return 0.5 * (float((innovation**2).sum()) / variance + log_volume)
 
 
 def noisier(fixes: Fixes, estimated: Fixes | None) -> Fixes:
@@ -333,11 +347,10 @@ def cost_of_fixes(factors: Factors, weight: Floats, poses: Floats, fixes: Fixes)
                 break
     except GraphError:
         return most * len(fixes)
-    alone, count, alike = Objective(factors, weight), float(inlier.sum()), fixes.alike
-    cost = together.cost(se3.between(fit[:1], fit)) - alone.cost(poses) + most * float((1.0 - inlier).sum())
-    # of correlated noise, a fix adds the innovation over the one before it
-    innovation = _times_noisier(fixes, known) / alike * fixes.innovation
-    cost += 1.5 * count * (math.log(innovation) + 1.0 - 1.0 / alike)
+    alone, edges = Objective(factors, weight), replace(together, positions=None)
+    cost = edges.cost(se3.between(fit[:1], fit)) - alone.cost(poses) + most * float((1.0 - inlier).sum())
+    claimed = replace(known, covariance=known.covariance / known.alike)
+    cost += _autoregressive_cost(_whitened(fit, claimed, inlier))
     return cost + 0.5 * (together.information(fit).log_determinant() - _log_determinant(alone, poses))
 
 

@@ -16,7 +16,7 @@ from vplog.data import EdgeKind, Floats, Ints, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, residual_sigma
 from vplog.graph.factors import Factors
-from vplog.graph.joint import Between, Joined, JoinSettings, SessionGraph, as_one, maps_of, middle, places
+from vplog.graph.joint import Between, Joined, JoinSettings, SessionGraph, as_one, log_odds_of, maps_of, middle, places
 from vplog.graph.least_squares import descend
 from vplog.graph.refine import Refined, RefineSettings, refine, rescaled
 from vplog.graph.solve import decided
@@ -80,7 +80,7 @@ def place(drive: SessionGraph, anchored: Sequence[Anchored], solve: Optimiser, s
     while any(joined):
         used = [at for at in along if at not in apart]
         graph, rows = _against(drive, [anchored[at] for at in used])
-        decision = decided(graph, solve)
+        decision = decided(graph, solve, log_odds=log_odds_of(graph, [anchored[at].between for at in used], rows))
         loose = [
             at
             for at, part in zip(used, rows, strict=True)

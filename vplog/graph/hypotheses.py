@@ -120,12 +120,35 @@ def best_hypothesis(
     best = _likeliest(found)[0] if cost is None else _least_cost(claimed, found, cost)
     if best.weight[loops].any():
         others = attempted(lambda: _readmitted(claimed, best, optimiser, cost))
+        others = others or attempted(lambda: _undisputed(claimed, best, found, cost))
     elif log_odds is not None:
         some = _likeliest([one for one in found if one.weight[loops].any()])
         others = attempted(lambda: [one for one in some if _recognised(claimed, one, chain, log_odds, cost)])
     else:
         others = []
     return next(iter(others), best)
+
+
+def _undisputed(claimed: Factors, best: Hypothesis, found: list[Hypothesis], cost: Cost | None) -> list[Hypothesis]:
+    """The hypothesis with the closures that every other that contradicts it, and is hardly less likely, has as well;
+    none where nothing contradicts it, or all is disputed."""
+
+    def likelihood(one: Hypothesis) -> float:
+        costs = 0.0 if cost is None else cost(_times(claimed, one.sigmas), one.weight, one.poses)
+        return one.log_evidence - costs
+
+    enough, common = likelihood(best) - _VERY_STRONG, np.array(best.weight)
+    for one in found:
+        if one.log_evidence > enough and _contradict(one, best) and (common > one.weight).any():
+            common = np.minimum(common, one.weight) if cost is None or likelihood(one) > enough else common
+    if (common == best.weight).all() or not common[is_loop(claimed.graph)].any():
+        return []
+    return [_refit(claimed, common, best.poses, best.sigmas)]
+
+
+def _contradict(one: Hypothesis, other: Hypothesis) -> bool:
+    """Whether closures are true by the one alone, and others by the other alone."""
+    return bool((one.weight > other.weight).any() and (one.weight < other.weight).any())
 
 
 def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: Cost | None) -> list[Hypothesis]:
@@ -274,7 +297,8 @@ def _searched(claimed: Factors, gnc: GncSettings, loops: Ints, chain: OdometryCh
     if all((one.weight[loops] == 0).mean() <= _ALIKE for one in best):  # next to all agree
         return found + [_improved(claimed, one) for one in best]
     grown = attempted(lambda: [_grown(claimed, sigmas, chain)])
-    found += [_improved(claimed, one, whole) for one in [*best, *grown]]
+    rival = _likeliest([one for one in found if _contradict(one, best[0])])
+    found += [_improved(claimed, one, whole) for one in [*best, *rival, *grown]]
     for one in _likeliest(found):
         found += attempted(lambda one=one: _tested(claimed, gnc, one.weight, one.poses, one.sigmas))
     return found

@@ -82,6 +82,8 @@ class Between:
     """(L, 6, 6), in the frame of the query."""
     of_odometry: Bools
     """(L,) closures whose metres are the odometry's."""
+    log_odds: Floats
+    """(L,) of being false by recognition, 0 where nothing is known of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +131,7 @@ def join(
             if at not in apart and len(one.query) and one.later in inside and one.earlier in inside
         ]
         graph, of_odometry, starts, rows = as_one(drives, members, [between[at] for at in ties])
-        decision = decided(graph, solve)
+        decision = decided(graph, solve, log_odds=log_odds_of(graph, [between[at] for at in ties], rows))
         weights = decision.solution.weight
         loose = [
             at
@@ -150,6 +152,14 @@ def join(
             count = len(drives[member].graph.world_from_body)
             poses[member] = refined.solution.world_from_body[start : start + count]
     return Joined(maps_of(len(drives), between, joined), poses, solved, weight, residual, apart)
+
+
+def log_odds_of(graph: PoseGraph, between: Sequence[Between], rows: Sequence[slice]) -> Floats:
+    """(E,) log of the odds of being false: what each Between has at its `rows`, 0 of other edges."""
+    result = np.zeros(len(graph.a))
+    for one, part in zip(between, rows, strict=True):
+        result[part] = one.log_odds
+    return result
 
 
 def places(one: Between, spacing: int, weight: Floats | None = None) -> int:

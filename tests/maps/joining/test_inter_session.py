@@ -14,6 +14,7 @@ from vplog.execution.execution import Execution
 from vplog.graph.joint import JoinSettings
 from vplog.loops.propose import Proposals
 from vplog.maps.joining import inter_session
+from vplog.pipeline import Pipeline
 
 if TYPE_CHECKING:
     import pytest
@@ -44,8 +45,9 @@ def looked_at(
 
     monkeypatch.setattr(inter_session, "verify_between", verify)
     drive: Any = SimpleNamespace(camera=SimpleNamespace(matrix=np.eye(3) if calibrated else None))
-    settings = settings or JoinSettings()
-    return looks, inter_session.closures_between(proposals(), drive, drive, settings, 0.0, Execution())
+    monkeypatch.setattr(inter_session, "mirrored_evidence", lambda some, *_: np.zeros(len(some.query), np.int64))
+    pipeline = Pipeline(join=settings or JoinSettings())
+    return looks, inter_session.closures_between(proposals(), drive, drive, pipeline, 0.0, Execution())
 
 
 def test_drives_that_do_not_meet_cost_one_look_at_the_highest_scores(monkeypatch: pytest.MonkeyPatch) -> None:

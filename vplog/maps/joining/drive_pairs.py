@@ -71,7 +71,10 @@ class PairTask:
 
 def depends(pipeline: Pipeline) -> dict[str, Any]:
     """The settings and the code that the closures between two drives depend on, beside the drives."""
-    settings = {name: getattr(pipeline, name).model_dump(mode="json") for name in ("propose", "sequence", "verify")}
+    settings = {
+        name: getattr(pipeline, name).model_dump(mode="json")
+        for name in ("propose", "sequence", "verify", "false_rate")
+    }
     settings["join"] = pipeline.join.model_dump(mode="json", exclude={"keep_features", "judged_anew", "grown_share"})
     return {"settings": settings, "code": code_of(*_CODE)["code"]}
 
@@ -94,7 +97,7 @@ def compute_pair(task: PairTask) -> bytes:
             return max(task.later_camera.each[query].rotation_share, task.earlier_camera.each[match].rotation_share)
 
         pair = DrivePair(0, 0, task.proposals, task.shared)
-        ledger = closures_by_cameras(pair, later, earlier, task.pipeline.join, share, task.execution)
+        ledger = closures_by_cameras(pair, later, earlier, task.pipeline, share, task.execution)
         header = tables.TableMetadata(depends(task.pipeline)["settings"], task.library)
         ends_at = later[0].drive.keyframes, earlier[0].drive.keyframes
         return tables.joins_as_bytes([(*ends_at, ledger)], header, task.key)

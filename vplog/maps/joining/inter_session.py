@@ -12,6 +12,7 @@ import numpy as np
 
 from vplog.data import Bools, Closures, Int32s, Ints, SharedReferences, Verdict
 from vplog.execution.execution import Execution
+from vplog.loops.false_rate import FalseRateSettings, at_rate, evidence, mirrored_evidence, null_pairs, with_p_false
 from vplog.loops.propose import Proposals, ProposeSettings, propose
 from vplog.loops.verify import Drive, no_closures, verify_between
 from vplog.places.sequence import rank_places
@@ -190,7 +191,7 @@ def closures_between(
     proposals: Proposals,
     later: Drive,
     earlier: Drive,
-    settings: JoinSettings,
+    pipeline: Pipeline,
     share: float,
     execution: Execution,
     fetch: Callable[[Int32s, Int32s], None] = lambda *_: None,
@@ -199,9 +200,11 @@ def closures_between(
 
     The best candidates of the highest-scoring queries come first. Where geometry confirms none of them, the drives
     share no place; else the best of each other query follows, and then all candidates of the queries around confirmed
-    ones: these are for the graph, and left out without calibration. `share` is the larger `calibration_share` of the
-    two drives; `fetch` gets queries and matches before they are verified. Progress counts candidates.
+    ones: these are for the graph, and left out without calibration. `p_false` is by candidates with the query mirrored.
+    `share` is the larger `calibration_share` of the two drives; `fetch` gets queries and matches before they are
+    verified. Progress counts candidates.
     """
+    settings = pipeline.join
     _, best = np.unique(proposals.query, return_index=True)
     by_score = best[np.argsort(-proposals.score[best], kind="stable")]
     count = max(settings.first_look, -(-len(best) // _FIRST_SHARE))
@@ -223,7 +226,20 @@ def closures_between(
             others = _near_confirmed(proposals.query, confirmed(), settings.around)
             others[best] = False
             verify_rows(np.flatnonzero(others))
-    return merged([ledger for _, ledger in verified], [rows for rows, _ in verified])
+    ledger = merged([ledger for _, ledger in verified], [rows for rows, _ in verified])
+    return _rated(ledger, later, earlier, pipeline.false_rate, execution) if evidence(ledger).any() else ledger
+
+
+def _rated(
+    ledger: Closures, later: Drive, earlier: Drive, settings: FalseRateSettings, execution: Execution
+) -> Closures:
+    """The ledger with `p_false`, and without what is likelier to be false than `settings.rate`."""
+    count = min(null_pairs(evidence(ledger), settings), len(ledger))
+    some = ledger.rows(np.linspace(0, len(ledger) - 1, count).astype(np.int64))
+    proposals = Proposals(some.query, some.match, some.rank, some.score, some.support)
+    mirror = mirrored_evidence(proposals, later, earlier, execution)
+    ledger = with_p_false(ledger, np.zeros(len(ledger), bool), mirror, np.zeros(0, np.int64), np.zeros(0, bool))
+    return ledger if settings.rate is None else at_rate(ledger, settings.rate)
 
 
 class CameraDrive(NamedTuple):
@@ -237,7 +253,7 @@ class CameraDrive(NamedTuple):
 
 
 def closures_by_cameras(
-    pair: DrivePair, later: Sequence[CameraDrive], earlier: Sequence[CameraDrive], settings: JoinSettings,
+    pair: DrivePair, later: Sequence[CameraDrive], earlier: Sequence[CameraDrive], pipeline: Pipeline,
     share: Callable[[int, int], float], execution: Execution,
 ) -> Closures:  # fmt: skip
     """The ledger of the keyframes of two drives, with the references that explain both places: `closures_between` of
@@ -250,7 +266,7 @@ def closures_by_cameras(
         proposals = replace(pair.proposals, query=query, match=match).rows(rows)
         queries, matches = later[q], earlier[m]
         fetch = partial(_fetch, queries, matches)
-        ledger = closures_between(proposals, queries.drive, matches.drive, settings, share(q, m), execution, fetch)
+        ledger = closures_between(proposals, queries.drive, matches.drive, pipeline, share(q, m), execution, fetch)
         known, chosen = pair.shared, rows.tolist()
         shared = SharedReferences([known.references[row] for row in chosen], [known.overlap[row] for row in chosen])
         ledger = with_shared(ledger, proposals, shared)

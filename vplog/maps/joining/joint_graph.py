@@ -14,6 +14,7 @@ from vplog.graph import joint as graph_joint
 from vplog.graph.build import busier
 from vplog.graph.correct_trajectory import correct_trajectory
 from vplog.graph.refine import Refined, about_odometry
+from vplog.loops.false_rate import log_odds_false
 from vplog.maps.storage.damage import reading_drive
 from vplog.results import tables
 from vplog.run.back_end import by_odometry
@@ -137,6 +138,7 @@ def verified_closures(later: int, earlier: int, ledger: Closures) -> graph_joint
         match_from_query=ledger.match_from_query[rows],
         information=ledger.information[rows] / shared[:, None, None],
         of_odometry=np.array([ledger.scale[row] == "odometry" for row in rows.tolist()], bool),
+        log_odds=log_odds_false(ledger)[rows],
     )
 
 

@@ -145,7 +145,7 @@ def _ledgers(drives: Sequence[DriveRun], state: PlaceState, pipeline: Pipeline, 
         if pair is None:
             return no_closures()
         return closures_by_cameras(
-            pair, cameras[later], cameras[earlier], pipeline.join,
+            pair, cameras[later], cameras[earlier], pipeline,
             lambda query, match: max(shares[later][query], shares[earlier][match]),
             execution.within(f"{drives[later].name} in {drives[earlier].name}"),
         )  # fmt: skip
