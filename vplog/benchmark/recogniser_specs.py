@@ -62,6 +62,8 @@ def read_method(text: str, pipeline: Pipeline, others: Iterable[str] = ()) -> An
         return type(chosen).read(tree, f"method {text}")
     except SettingsError as error:
         what, _, _ = str(error).rpartition(" `vplog config`")
+        if name in plugin_names():  # its settings are its own, and named in what is said
+            raise SettingsError(what) from None
         raise SettingsError(f"{what} `vplog config --set places.kind={chosen.kind}` prints them all.") from None
 
 
