@@ -19,7 +19,7 @@ from vplog.benchmark import compare
 from vplog.benchmark.compare_figures import queries_shown
 from vplog.benchmark.feature_cache import FeatureFolder
 from vplog.benchmark.method_scores import MethodInputs, evaluate_method, stored_bytes
-from vplog.benchmark.recogniser_specs import read_method, split_methods
+from vplog.benchmark.recogniser_specs import read_method, read_methods, split_methods
 from vplog.benchmark.sequence_fit import sequence_warning
 from vplog.benchmark.traversals import candidate_stops, extract_traversal, references_of
 from vplog.errors import LogError, SettingsError
@@ -242,6 +242,13 @@ def test_methods_that_do_not_exist(name: str, said: str) -> None:
     assert "\n" not in str(error.value)
 
 
+def test_answers_are_a_method_where_they_are_taken() -> None:
+    for answers in (True, False):
+        with pytest.raises(SettingsError) as error:
+            read_methods(["answer:paper.csv"], Pipeline(), answers=answers)
+        assert ("Did you mean answers?" in str(error.value)) == answers
+
+
 # Two drives, or one
 
 
@@ -439,6 +446,11 @@ def test_folders_are_labels(verb: Verb, traversals: tuple[Path, Path], tmp_path:
     found = verb("compare", sets[1], sets[0], "--methods", "thumbnail", "--truth", "labels", "--json", *QUICK).json
     assert (found["queries"], found["truth"]["labels"], found["truth"]["pairs"]) == (FRAMES, 4, 4 * FRAMES)
     assert found["answers"][5]["query_name"] == "place 1/1.png"
+    table = tmp_path / "labels.csv"
+    rows = [f"place {number // 4}/{number % 4}.png,{number // 4}\n" for number in range(FRAMES)]
+    table.write_text("".join(["image,label\n", *rows]))
+    listed = verb("compare", sets[1], sets[0], "--methods", "thumbnail", "--truth", table, "--json", *QUICK).json
+    assert listed["truth"]["pairs"] == 4 * FRAMES
     truth = tmp_path / "truth.csv"
     truth.write_text("query,match\nplace 1/0.png,place 3/1.png\nplace 2/0.png,place 3/1.png\n")
     study = ("study", *sets, "--methods", "thumbnail", "--only", "pairs", "--seeds", 1, "--json", *QUICK)

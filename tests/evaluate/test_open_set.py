@@ -46,3 +46,18 @@ def test_figures_of_a_method() -> None:
     assert (known["auroc"], known["mean"], sum(known["count"])) == (1.0, 0.5, 3)
     assert known["expected_calibration_error"] == pytest.approx(0.5 / 3, abs=1e-6)
     assert score_open_set(ranks_of(scores, [])) == {}
+
+
+def test_queries_that_have_nothing_to_be_found_in_are_not_nowhere() -> None:
+    """The first frames of a drive in its own past: no score of theirs says that they were told apart."""
+    scores = np.array([[np.nan, np.nan], [0.9, np.nan], [0.3, 0.8]], np.float32)
+    pairs = listed_pairs(np.array([[2, 1]]), np.arange(3), np.arange(2))
+    found = score_open_set(
+        replace(rank_queries(scores, pairs, np.array([0, 1, 2])), p_match=np.array([np.nan, 0.5, 1.0]))
+    )
+    assert (found["without_match"], found["auroc"], found["recall_at_1_percent_false_alarms"]) == (1, 0.0, 0.0)
+    assert found["p_match"]["auroc"] == 1.0
+    first = score_open_set(
+        rank_queries(scores[[0, 2]], listed_pairs(np.array([[1, 1]]), np.arange(2), np.arange(2)), np.array([0, 2]))
+    )
+    assert (first["without_match"], first["auroc"]) == (0, None)

@@ -74,6 +74,8 @@ def test_a_plugin_is_imported_when_it_is_named_and_not_before() -> None:
     found = read_method(f"{NAME}:blocks=2", Pipeline())
     assert NAME in sys.modules
     assert (found.kind, found.blocks) == (NAME, 2)
+    with pytest.raises(SettingsError, match=r"Settings: kind, blocks\.$"):
+        read_method(f"{NAME}:rows=2", Pipeline())
 
 
 @pytest.mark.usefixtures("installed")

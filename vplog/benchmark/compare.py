@@ -234,7 +234,7 @@ def _open(
     execution: Execution,
 ) -> _Drives:  # fmt: skip
     """The logs, the truth and the library of a comparison."""
-    topics = every_image(options.topics) if truth is not None and truth.kind == "labels" else options.topics
+    topics = every_image(options.topics) if truth is not None and truth.is_labels else options.topics
     options = replace(options, topics=topics)
     query_log = logs.open(query, topics)
     map_log = query_log if same_drive(query, other) else logs.open(other, topics)
@@ -248,7 +248,7 @@ def _open(
 
 
 def every_image(topics: logs.TopicChoice | None) -> logs.TopicChoice:
-    """Labels tell the folders of places from those of cameras: all images are read unless some are chosen."""
+    """Labels tell places from cameras: all images are read unless some are chosen."""
     topics = topics or logs.TopicChoice()
     return topics if topics.image is not None else topics.model_copy(update={"image": EVERY_IMAGE})
 

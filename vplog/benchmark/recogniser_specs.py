@@ -21,10 +21,11 @@ def split_methods(text: str) -> list[str]:
     return [name.strip() for name in re.split(r",(?![^\[{]*[\]}])", text)]
 
 
-def read_method(text: str, pipeline: Pipeline) -> Any:
+def read_method(text: str, pipeline: Pipeline, others: Iterable[str] = ()) -> Any:
     """The recogniser of `kind`, `kind:FILE`, `pipeline` or `file.yaml`, each with `:setting=value` as often as wanted.
 
-    A kind has its default settings, or the pipeline's where it is the pipeline's own. Raises SettingsError.
+    A kind has its default settings, or the pipeline's where it is the pipeline's own. Raises SettingsError, which names
+    `others` among the methods.
     """
     name, *assignments = text.split(":")
     known = KINDS
@@ -44,8 +45,9 @@ def read_method(text: str, pipeline: Pipeline) -> Any:
         except SettingsError as error:
             if Path(name).suffix in (".yaml", ".yml"):
                 raise
-            methods = f"Methods: {', '.join(sorted({*known, *plugin_names()} - {'plugin'}))}."
-            raise SettingsError(f"No method {name!r}.{nearest(name, known)} {methods} {error}") from None
+            names = sorted({*known, *plugin_names(), *others} - {"plugin"})
+            methods = f"Methods: {', '.join(names)}."
+            raise SettingsError(f"No method {name!r}.{nearest(name, names)} {methods} {error}") from None
     if isinstance(chosen, PluginSettings) and chosen.name:
         chosen = chosen.recogniser()
     tree = {"kind": chosen.kind, **chosen.model_dump(mode="json", exclude_unset=True)}
@@ -60,6 +62,8 @@ def read_method(text: str, pipeline: Pipeline) -> Any:
         return type(chosen).read(tree, f"method {text}")
     except SettingsError as error:
         what, _, _ = str(error).rpartition(" `vplog config`")
+        if name in plugin_names():  # its settings are its own, and named in what is said
+            raise SettingsError(what) from None
         raise SettingsError(f"{what} `vplog config --set places.kind={chosen.kind}` prints them all.") from None
 
 
@@ -67,10 +71,10 @@ def read_methods(methods: Iterable[str], pipeline: Pipeline, answers: bool = Fal
     """The recognisers of several names, with `answers` also files of answers: `answers:FILE.csv`."""
     names = list(methods)
     recognisers: dict[str, Any] = {}
+    others = ["answers"] if answers else []
     for name in names:
         kind, _, file = name.partition(":")
-        is_file = answers and kind == "answers"
-        recognisers[name] = AnswersSettings(file=file) if is_file else read_method(name, pipeline)
+        recognisers[name] = AnswersSettings(file=file) if kind in others else read_method(name, pipeline, others)
     if not names or len(recognisers) < len(names):
         raise SettingsError(f"--methods {','.join(names)}: name each method once, and one at least.")
     return recognisers

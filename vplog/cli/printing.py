@@ -565,7 +565,7 @@ def print_comparison(found: dict[str, Any]) -> None:
     if not truth:
         shares = {}
         _print_best_answers(found["answers"])
-    nowhere = found["queries"] > found["positives"]
+    nowhere = any(one.get("open_set", {}).get("auroc") is not None for one in found["methods"].values())
     titles = [*shares.values(), *(("AUROC", "R@1%\nalarms") if truth and nowhere else ()), "bytes"]
     rows: list[Sequence[str]] = []
     for name, method in found["methods"].items():

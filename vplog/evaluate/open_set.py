@@ -16,18 +16,21 @@ FALSE_ALARMS = 0.01
 def score_open_set(ranks: Ranks) -> dict[str, Any]:
     """Figures of the scores of answers, and of `p_match` where it is known; empty where no query has a match.
 
-    `auroc` and `recall_at_1_percent_false_alarms` need queries without a match, None where all have one.
+    `auroc` and `recall_at_1_percent_false_alarms` need queries without a match, None where all have one. Queries that
+    are looked for among no rows, as the first of a drive in its own past, count for neither.
     """
     if not ranks.positive.any():
         return {}
-    found: dict[str, Any] = {"without_match": int((~ranks.positive).sum())}
-    scores = np.where(np.isnan(ranks.top_score), -np.inf, ranks.top_score.astype(np.float64))
-    found["auroc"] = auroc(scores, ranks.positive)
-    found["recall_at_1_percent_false_alarms"] = recall_at_false_alarms(scores, ranks.top_true, ranks.positive)
+    asked = ranks.candidates > 0
+    positive = ranks.positive[asked]
+    found: dict[str, Any] = {"without_match": int((~positive).sum())}
+    scores = np.where(np.isnan(ranks.top_score), -np.inf, ranks.top_score.astype(np.float64))[asked]
+    found["auroc"] = auroc(scores, positive)
+    found["recall_at_1_percent_false_alarms"] = recall_at_false_alarms(scores, ranks.top_true[asked], positive)
     if ranks.p_match is not None:
         known = reliability_of_matches(ranks)
         found["p_match"] = {
-            "auroc": auroc(np.nan_to_num(ranks.p_match, nan=-1.0), ranks.positive),
+            "auroc": auroc(np.nan_to_num(ranks.p_match[asked], nan=-1.0), positive),
             "mean": round(float(np.nanmean(ranks.p_match)), 6),
             **known.as_json(),
         }

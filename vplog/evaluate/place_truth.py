@@ -77,6 +77,11 @@ class TruthChoice:
             return read_table(Path(self.source))[0] == ["query", "match"]
         return self.kind == "npy"
 
+    @property
+    def is_labels(self) -> bool:
+        """Whether it gives every image its place: by its folder, or by one table or two."""
+        return self.kind == "labels" or (self.kind == "csv" and not self.lists_pairs)
+
 
 @dataclass(frozen=True, eq=False)
 class PlaceTruth:

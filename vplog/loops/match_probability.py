@@ -4,8 +4,12 @@ Two groups (Efron, Large-Scale Inference, 2010, chapter 5): queries that are som
 nowhere, whose best row is the best of rows that only look alike. What such rows reach each query shows by its second
 and third best place. Scores with an exponential tail have independent spacings, that of rank i is 1/i of the first in
 the mean (Renyi, On the theory of order statistics, 1953): twice the second spacing above the second place is a draw of
-what the best of look-alike rows would be. Of queries that have a place the second best is itself the best of these, so
-the more queries have one, the more cautious the probabilities are.
+what the best of look-alike rows would be.
+
+Queries that have a place need not score others as queries that have none do: where a score is a share of what explains
+a view, little is left for others. So a draw counts by how likely its own query is nowhere, which follows from its
+spacings alone: the ratio of two exponential spacings of any one scale has a known distribution. Where queries that have
+a place score others higher, the probabilities are the more cautious the more of these there are.
 """
 
 from __future__ import annotations
@@ -16,7 +20,6 @@ import numpy as np
 import scipy
 
 from vplog.data import Float32s, Floats, Ints
-from vplog.loops.false_rate import conformal_p
 
 _LEAST = 20
 """Queries, at least, from which rates can be learned: one more or less then changes them by 5 %."""
@@ -43,12 +46,13 @@ def probabilities(best: Floats, share: Floats | float = 1.0) -> Floats | None:
     known = np.flatnonzero(np.isfinite(best).all(axis=1)) if len(best) else np.empty(0, np.int64)
     if len(known) < _LEAST:
         return None
-    first, second, third = best[known].T
     found = np.full(len(best), np.nan)
+    first, second, third = best[known].T
     tail = 2.0 * (second - third)
-    found[known] = 1.0 - null_probabilities(
-        first, second + tail * (1.0 + np.log(np.broadcast_to(share, len(best))[known]))
-    )
+    base = second + tail * np.log(np.broadcast_to(share, len(best))[known])
+    gap = np.maximum(first - base, 0.0)
+    own = np.divide(tail, gap + tail, out=np.ones(len(known)), where=gap + tail > 0)
+    found[known] = 1.0 - null_probabilities(first, base + tail, own)
     return found
 
 
@@ -100,14 +104,23 @@ class LookAlikes:
             self.rows[queries] = scores.shape[1]
 
 
-def null_probabilities(found: Floats, null: Floats) -> Floats:
-    """(N,) local false discovery rate by a null sample (K,), falling with the score: the ratio of densities by isotonic
-    regression on both samples, the share of nulls by Storey 2002, eq. 6, at one half."""
-    share = min(1.0, (1.0 + (conformal_p(found, null) > 0.5).sum()) / (0.5 * len(found)))
+def null_probabilities(found: Floats, null: Floats, own: Floats) -> Floats:
+    """(N,) local false discovery rate by a null draw of each query, falling with the score. `own`, the p-values of each
+    query by itself, tell the share of nulls, by Storey 2002, eq. 6, at one half, and by their density what each draw
+    counts."""
+    count = len(own)
+    share = min(1.0, (1.0 + (own > 0.5).sum()) / (0.5 * count))
+    nowhere = np.minimum(1.0, share * _density_ratio(-own, -(np.arange(count) + 0.5) / count, np.ones(count)))
+    return np.minimum(1.0, share * _density_ratio(found, null, nowhere))
+
+
+def _density_ratio(found: Floats, null: Floats, weight: Floats) -> Floats:
+    """(N,) density of nulls (K,), each of a weight, by that of the found (N,), by isotonic regression on both."""
     null = np.append(null, np.inf)  # one more above all: no score is certain for free
+    weight = np.append(weight, weight.mean())
     pool, of_null = np.concatenate([found, null]), np.repeat([0.0, 1.0], [len(found), len(null)])
+    weights = np.concatenate([np.ones(len(found)), weight * (len(found) / weight.sum())])
     order = np.lexsort((of_null, pool))
     fitted = np.empty(len(pool))
-    fitted[order] = scipy.optimize.isotonic_regression(of_null[order], increasing=False).x
-    odds = fitted[: len(found)] / np.maximum(1.0 - fitted[: len(found)], 1e-9)
-    return np.minimum(1.0, share * odds * len(found) / len(null))
+    fitted[order] = scipy.optimize.isotonic_regression(of_null[order], weights=weights[order], increasing=False).x
+    return fitted[: len(found)] / np.maximum(1.0 - fitted[: len(found)], 1e-9)

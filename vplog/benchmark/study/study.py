@@ -64,7 +64,7 @@ def study(
     Raises VplogError with one line where that cannot be.
     """
     min_gap, topics = options.min_gap, options.topics
-    if truth.kind == "labels":
+    if truth.is_labels:
         topics = every_image(topics)
     chosen = _choose(options.only, len(drives))
     recognisers = read_methods(options.methods, pipeline)
