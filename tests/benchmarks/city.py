@@ -241,7 +241,7 @@ def undecided() -> Iterator[None]:
     """All closures are taken for true."""
     before = joint.decided, growth.decided
 
-    def plain(graph: PoseGraph, _: Any) -> Decision:
+    def plain(graph: PoseGraph, *_: Any, **__: Any) -> Decision:
         return Decision(graph, LmSettings()(graph), Sigmas())
 
     joint.decided = growth.decided = plain  # pyrefly: ignore
