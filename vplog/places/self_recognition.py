@@ -64,8 +64,8 @@ def misleading_patches(keypoints: Floats, patches: Floats, references: Sequence[
     """(L,) references around which significantly fewer are recognised with patches than without (McNemar's test), and
     with less margin, by the (L, L) votes of each kind.
 
-    Of several drives in one map each is decided by itself: those of another may show the same place in other light, where
-    patches alone find it. Nor is one a stranger that keypoints find: it may show the place on the way back.
+    Of several drives in one map each is decided by itself: another may show the same places in other light, where
+    patches alone find them. Nor is a reference a stranger that keypoints find: it may show the place on the way back.
     """
     near, names = neighbours(references), np.array([one.drive for one in references])
     neighbour = np.where(near, keypoints, 0.0).max(axis=1, keepdims=True)
