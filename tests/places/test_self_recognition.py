@@ -112,6 +112,21 @@ def test_each_drive_of_a_library_decides_on_its_patches_in_any_order(seed: int) 
     assert weights.tolist() == np.where(order < 24, 0.0, PATCH_WEIGHT).tolist()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_drive_of_the_same_way_in_other_light_does_not_switch_patches_off(seed: int) -> None:
+    """By night keypoints are others, and patches alone find the place: in a drive of its own that is no mistake."""
+    rng, count = np.random.default_rng(seed), 30
+    drives = [_at(row, drive=name) for name in ("day", "night") for row in range(count)]
+    rng.shuffle(drives)
+    row, name = np.array([one.stamp_ns for one in drives]), np.array([one.drive for one in drives])
+    one_drive = name[:, None] == name
+    keypoints = np.where(one_drive & (np.abs(row[:, None] - row) == 1), rng.uniform(1, 2, (2 * count, 2 * count)), 0.0)
+    patches = np.where(~one_drive & (row[:, None] == row), 9.0, 0.0)
+    assert not misleading_patches(keypoints, patches, drives).any()
+    storeys = [replace(one, drive="one", stamp_ns=one.stamp_ns + 100 * (one.drive == "night")) for one in drives]
+    assert misleading_patches(keypoints, patches, storeys).all(), "in one drive they are storeys"
+
+
 def test_evidence_is_what_counts_on_the_references_that_two_places_share() -> None:
     references = _tower_and_street(1)
     state = BobbSettings().learn(references, Execution())

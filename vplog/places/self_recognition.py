@@ -64,12 +64,13 @@ def misleading_patches(keypoints: Floats, patches: Floats, references: Sequence[
     """(L,) references around which significantly fewer are recognised with patches than without (McNemar's test), and
     with less margin, by the (L, L) votes of each kind.
 
-    Of several drives in one map each part is decided by itself. A reference that keypoints find may show the same place
-    on the way back, and is no stranger.
+    Of several drives in one map each is decided by itself: another may show the same places in other light, where
+    patches alone find them. Nor is a reference a stranger that keypoints find: it may show the place on the way back.
     """
-    near = neighbours(references)
+    near, names = neighbours(references), np.array([one.drive for one in references])
     neighbour = np.where(near, keypoints, 0.0).max(axis=1, keepdims=True)
-    place = near | ((keypoints > 0) & (keypoints >= _SAME_PLACE * neighbour))
+    again = (keypoints > 0) & (keypoints >= _SAME_PLACE * neighbour)
+    place = near | again | (names[:, None] != names)
     without, together = margin(keypoints, near, place), margin(keypoints + PATCH_WEIGHT * patches, near, place)
     gain, change = together - without, (np.sign(together) - np.sign(without)) / 2.0
     most, less = np.zeros(len(near)), np.zeros(len(near), bool)
