@@ -23,8 +23,9 @@ _STEPS = 6
 """Levenberg-Marquardt steps; a window starts from the last one's result, and two or three converge."""
 _CONVERGED = 1e-3
 """Relative decrease of the error that ends it: far below a sigma of the newest pose."""
-_FIXED = 1e-6
-"""Sigma of the distance of the two oldest views without depths, as a share of it: it stays as it is."""
+_FIXED = 1e-4
+"""Sigma of the distance of the two oldest views without depths, as a share of it: nothing else tells it, so it stays as
+it is; a stiffer one has steps rejected that turn the views."""
 _BEHIND = 2.0
 """Error of a landmark behind a view in normalised coordinates, as GTSAM's."""
 _WEAK = 1e-9
