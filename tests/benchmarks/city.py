@@ -244,7 +244,7 @@ def undecided() -> Iterator[None]:
     def plain(graph: PoseGraph, *_: Any, **__: Any) -> Decision:
         return Decision(graph, LmSettings()(graph), Sigmas())
 
-    joint.decided = growth.decided = plain  # pyrefly: ignore
+    joint.decided = growth.decided = plain
     try:
         yield
     finally:
