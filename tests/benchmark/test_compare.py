@@ -543,7 +543,7 @@ def test_frames_without_truth_are_left_out(verb: Verb, drive: Demo, tmp_path: Pa
         (("DUSK", "DAY", "--truth", "index", "--min-gap", "5"), "--min-gap is for a drive compared with itself"),
         (("DAY", "--truth", "index", "--min-gap", "5"), "none of the 16 frames of day shows a place of a frame of day"),
         (("DUSK", "DAY", "--truth", "index", "--methods", "bobb,bobb"), "name each method once"),
-        (("DUSK", "DAY", "--truth", "index", "--methods", "bobb,surf"), "No method 'surf'. Methods: bobb"),
+        (("DUSK", "DAY", "--truth", "index", "--methods", "bobb,surf"), "No method 'surf'. Methods: answers, bobb"),
         (
             ("DUSK", "DAY", "--truth", "index", "--distance-m", "3"),
             "takes no --distance-m: it is for utm, poses, a TUM",
