@@ -20,12 +20,14 @@ from vplog.maps.condensation.own_queries import PASSES, OwnPlaces, later_passes
 from vplog.maps.condensation.redundancy import OwnQueries, RemovalCandidates, remove_cross_validated, remove_redundant
 from vplog.maps.condensation.references import removal_order
 from vplog.maps.joining.candidate_drives import places_of
+from vplog.maps.joining.joint_record import read_joint
 from vplog.maps.search.query import open_map
 from vplog.maps.storage import map_store
 from vplog.maps.storage.map_store import Store
 from vplog.places.bobb import NOBODY
 from vplog.places.code_search import build_lists
 from vplog.results import tables
+from vplog.results.run_record import write_run_json
 from vplog.testing.pictures import reference
 
 if TYPE_CHECKING:
@@ -232,6 +234,20 @@ def test_drives_that_nothing_joins_are_condensed_each_for_itself(whole: Path, tm
     assert told["queries"]["by_other_drives"] == 0
     assert any("No drives are joined" in line for line in told["warnings"])
     assert all(one["places"]["after"] for one in told["drives"])
+
+
+def test_drives_that_came_since_the_whole_was_solved_are_in_its_frame(whole: Path, tmp_path: Path, verb: Verb) -> None:
+    def queries(name: str) -> dict[str, Any]:
+        return verb("map", "condense", whole, "-o", tmp_path / name, "--json").json["queries"]
+
+    solved = queries("solved")
+    assert solved["by_other_drives"] > 0
+    record = {name: value for name, value in read_joint(whole).items() if name != "record_sha256"}
+    component = record["groups"][0]["components"][0]
+    shutil.copytree(whole / "joint" / component["folder"], whole / "joint" / "component=grown")
+    component["grown"] = {component["drives"][-1]: "component=grown"}
+    write_run_json(whole / "joint.json", record)
+    assert queries("grown") == solved
 
 
 def test_a_map_on_a_store_is_condensed_as_a_folder_is(whole: Path, tmp_path: Path, verb: Verb) -> None:

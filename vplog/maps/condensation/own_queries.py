@@ -88,7 +88,7 @@ def read_own_places(store: Store, drives: Mapping[str, Mapping[str, Any]], state
         if len(keyframe) and keyframe.max() >= len(known):
             wrong = f"{store} has more keyframes of {drive} than the graph that joins it."
             raise ResultError(f"{wrong} Join the drives again: vplog map join {store}")
-        where = joint[drive].folder if drive in joint else drive
+        where = joint[drive].drives[0] if drive in joint else drive
         # two cameras at one place show different things
         frame = [numbers.setdefault((where, one), len(numbers)) for one in camera.tolist()]
         keyframes.append(keyframe)
