@@ -16,6 +16,7 @@ from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 
 from tests.batch.test_batch import OPTIONS, QUICK, tables
@@ -27,6 +28,8 @@ from vplog.batch.ray_cluster import ClusterHead
 from vplog.batch.ray_engine import translated
 from vplog.errors import SettingsError
 from vplog.execution.execution import Execution
+from vplog.maps.search.exact import Shard
+from vplog.maps.storage.remote_map import StoredFile
 from vplog.pipeline import load_pipeline
 from vplog.results.run_record import read_run_json
 from vplog.storage.scratch import scratch
@@ -138,6 +141,22 @@ def test_two_nodes_that_share_nothing_make_the_same_map_though_one_worker_is_kil
     monkeypatch.setattr(ray_engine, "made_by", lambda: {"code": "other", "versions": {}})
     with pytest.raises(SettingsError, match="has vplog's code"):
         run_batch(logs, root, pipeline, options=BatchOptions(engine="ray", address=cluster.address))
+
+
+def test_segments_are_searched_by_the_node_that_has_them(
+    nodes: tuple[Any, list[Path]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ray_cluster, "_ANSWER_TIMEOUT_S", 600.0)
+
+    def node(_: Shard) -> str:
+        return ray.get_runtime_context().get_node_id()
+
+    files = [StoredFile(f"s3://map/{number}", f"{number:064}", 1) for number in range(32)]
+    shards = [Shard([file], [], [], np.zeros((256, 256), np.uint8), "both", 1, Execution()) for file in files]
+    with ray_engine.ray_engine(nodes[0].address, 1, None) as engine:
+        first, second = list(engine.executor.map(node, shards)), list(engine.executor.map(node, shards[::-1]))
+    assert first == second[::-1]
+    assert len(set(first)) == 2
 
 
 def test_a_cluster_that_wants_a_token_or_has_no_cpus_is_said(

@@ -7,6 +7,7 @@ module is imported only with `--engine ray`, and by Ray's workers.
 
 from __future__ import annotations
 
+import hashlib
 import platform
 import secrets
 from collections.abc import Callable, Iterator
@@ -171,10 +172,26 @@ class RayExecutor(Executor):
     """Ray tasks as `concurrent.futures` has them, with so many cores each."""
 
     def __init__(self, ray: Any, head: ClusterHead, cores: int = 1) -> None:
-        self._head, self._task = head, ray.remote(num_cpus=cores)(call)
+        self._ray, self._head, self._cores, self._task = ray, head, cores, ray.remote(num_cpus=cores)(call)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        return self.follow(self._task.remote(fn, *args, **kwargs))
+        """A task, which goes to any node with free cores; one whose argument has a `locality`, a text, goes to the node
+        that others with the same text went to, in whose cache its files are."""
+        locality, task = getattr(args[0], "locality", "") if args else "", self._task
+        if locality:
+            affinity = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy
+            task = task.options(scheduling_strategy=affinity(self._node_for(locality), soft=True))
+        return self.follow(task.remote(fn, *args, **kwargs))
+
+    def _node_for(self, locality: str) -> str:
+        """Of the nodes with enough cores the one whose name, together with the text, has the largest hash (rendezvous
+        hashing): few texts move where a node comes or goes, and none where the cluster starts again."""
+
+        def rank(node: dict[str, Any]) -> list[bytes]:
+            return [hashlib.sha256(f"{node[name]} {locality}".encode()).digest() for name in ("NodeName", "NodeID")]
+
+        able = [one for one in self._ray.nodes() if one["Alive"] and one["Resources"].get("CPU", 0) >= self._cores]
+        return max(able, key=rank)["NodeID"]
 
     def follow(self, answer: Any) -> Future[Any]:
         """The future of a Ray task, whose errors are those of this side."""

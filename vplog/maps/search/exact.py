@@ -83,6 +83,11 @@ class Shard:
     top: int
     execution: Execution
 
+    @property
+    def locality(self) -> str:
+        """Hash of the first of its files on an object store, which a machine that searched it before has cached."""
+        return getattr(self.segments[0], "sha256", "") if self.segments else ""
+
 
 def best_places(
     parts: Sequence[SegmentView], state: CodedState, views: Sequence[Place], top: int,
