@@ -12,6 +12,7 @@ from vplog.benchmark.answers import file_stem
 from vplog.data import Bytes, Float32s, Floats, Ints
 from vplog.evaluate.open_set import reliability_of_matches
 from vplog.evaluate.retrieval import Ranks, Reliability, average_precision, precision_recall, recall_at
+from vplog.places.vocabulary import spread_rows
 from vplog.run.figures.canvas import as_text, saved_figure
 from vplog.storage.image_file import decode_image
 
@@ -108,7 +109,7 @@ def queries_shown(ranks: Ranks) -> Ints:
     answered = ranks.top_row >= 0
     if not ranks.positive.any():
         rows = np.flatnonzero(answered)
-        return rows[np.unique(np.linspace(0, len(rows) - 1, min(_SHOWN, len(rows))).astype(int))]
+        return rows[spread_rows(len(rows), _SHOWN)]
     # among rows of equal score the first may be right, and counts by halves
     wrong = np.flatnonzero(answered & (ranks.top_true <= 0.5) & (ranks.top_row != ranks.true_row))
     wrong = wrong[np.argsort(-ranks.top_score[wrong], kind="stable")]

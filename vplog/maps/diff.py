@@ -77,8 +77,7 @@ def _content(store: Store) -> _Content:
     own = len(closures)
     for component in dict.fromkeys(one.folder.name for one in joint.values()):
         path = store.root / "joint" / component / "joins.parquet"
-        if store.mirror is not None:
-            store.mirror.rest([path.relative_to(store.root).as_posix()])
+        store.fetch_beside([path.relative_to(store.root).as_posix()])
         for (query, match), ledger in tables.read_joins(path).items():
             closures |= _pairs(ledger, query, match, stamps)
     frame = {drive: joint[drive].drives[0] if drive in joint else drive for drive in abouts}

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import Any
 
 from vplog.errors import LibraryError, ResultError, SettingsError, nearest_path
 from vplog.execution.execution import Execution
+from vplog.logs.image_folder import natural_order
 from vplog.maps.import_places import PLACES_ONLY, drives_of_file, import_places_of
 from vplog.maps.joining.drive_pairs import DRIVE_FILES
 from vplog.maps.storage import layout, map_store
@@ -54,7 +54,7 @@ def merge_maps(
                 continue
             _, drives = map_store.common_library(source)
             copy_library(store, source, library)
-            for drive in natural_order(drives.keys() & set(chosen) if chosen else drives):
+            for drive in sorted(drives.keys() & set(chosen) if chosen else drives, key=natural_order):
                 taken = _merge_drive(store, source, drives[drive], known, by_content)
                 outcomes += [] if taken is None else [taken]
                 execution.progress(f"merge {number} of {len(sources)}", len(outcomes), len(outcomes))
@@ -109,7 +109,9 @@ def _check_chosen(sources: Sequence[Store | Path], chosen: Sequence[str]) -> Non
         else:
             known |= source.drives().keys() | source.damaged.keys()
     if unknown := [drive for drive in chosen if drive not in known]:
-        raise SettingsError(f"No map given has a drive {unknown[0]!r}. Drives: {', '.join(natural_order(known))}.")
+        raise SettingsError(
+            f"No map given has a drive {unknown[0]!r}. Drives: {', '.join(sorted(known, key=natural_order))}."
+        )
 
 
 def copy_library(store: Store, other: Store, library: str) -> None:
@@ -212,13 +214,3 @@ def _content(record: dict[str, Any]) -> str:
         return canonical_json([record["inputs"], record.get("topics")])
     own = ("earth", "key", "drive", "format", "files")
     return canonical_json({name: value for name, value in record.items() if name not in own})
-
-
-def natural_order(drives: Iterable[str]) -> list[str]:
-    """IDs in natural order: drive, drive-2, drive-10."""
-
-    def numbered(drive: str) -> tuple[str, int]:
-        named = re.fullmatch(r"(.+)-(\d{1,9})", drive)
-        return (named[1], int(named[2])) if named else (drive, 1)
-
-    return sorted(drives, key=numbered)

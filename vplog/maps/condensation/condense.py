@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -139,12 +139,9 @@ def _write(store: Store, new: Store, found: Condensed) -> None:
         store.mirror.rest()
     for name in ("joins", "joint"):  # they name the drives by keys that they still have
         if (store.root / name).is_dir():
-            copy_folder(store.root / name, new.root / name, f"{name} of {store} to {new}", **_LINKED)
+            copy_folder(store.root / name, new.root / name, f"{name} of {store} to {new}", copy_function=layout.link)
     if (store.root / "joint.json").is_file():
         layout.link(store.root / "joint.json", new.root / "joint.json")
-
-
-_LINKED: dict[str, Callable[..., Any]] = {"copy_function": layout.link}
 
 
 def _write_drive(store: Store, new: Store, record: Mapping[str, Any], found: Condensed, number: int) -> None:
@@ -155,7 +152,8 @@ def _write_drive(store: Store, new: Store, record: Mapping[str, Any], found: Con
     def copied(_: Path) -> None:
         shutil.rmtree(made, ignore_errors=True)
         ignored = shutil.ignore_patterns("drive.json")  # it comes last: what has it is whole
-        copy_folder(store.full_run(drive), made, f"{drive} of {store} to {new}", ignore=ignored, **_LINKED)
+        what = f"{drive} of {store} to {new}"
+        copy_folder(store.full_run(drive), made, what, copy_function=layout.link, ignore=ignored)
         if other or len(retained) < store.rows("descriptors", drive):
             table, column = made / "descriptors.parquet", found.places.columns[number]
             tables.write_some_descriptors(table, table, retained, column, library)

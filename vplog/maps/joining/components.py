@@ -177,11 +177,14 @@ def solve_group(
         record = {**solution_record(names, joins, refined), "made_from": group.key}
         run_record.write_run_json(made / "component.json", record)  # last: it is whole
         components.append({"folder": folder, "drives": names})
-    pairs = [(group.pair_ledgers[pair], reason) for pair, reason in sorted(joined.apart.items())]
-    apart = [
-        {"query_drive": pair.later, "match_drive": pair.earlier, "reason": reason.strip()} for pair, reason in pairs
-    ]
+    pairs = {at: (pair.later, pair.earlier) for at, pair in enumerate(group.pair_ledgers)}
+    apart = _apart_records({pairs[at]: reason for at, reason in sorted(joined.apart.items())})
     return {"key": group.key, "drives": list(group.drives), "components": components, "apart": apart}
+
+
+def _apart_records(apart: Mapping[tuple[str, str], str]) -> list[dict[str, str]]:
+    """The pairs of drives, later and earlier one, that their closures do not join, as joint.json has them."""
+    return [{"query_drive": a, "match_drive": b, "reason": reason.strip()} for (a, b), reason in apart.items()]
 
 
 def _ledger(store: Store, entry: PairLedger, gone: dict[str, str]) -> Closures:
@@ -275,12 +278,9 @@ def _grown(
             break
         except LostPosesError as error:
             lost.add(error.drive)
-    apart = [
-        {"query_drive": later, "match_drive": earlier, "reason": why.strip()}
-        for (later, earlier), why in growth.apart.items()
-    ]
     key = "" if growth.failed or damaged else group.key  # tried again
-    record = {"key": key, "drives": list(group.drives), "components": growth.records(), "apart": apart}
+    record = {"key": key, "drives": list(group.drives), "components": growth.records()}
+    record["apart"] = _apart_records(growth.apart)
     if growth.reasons or damaged:
         record["reason"] = " ".join([*growth.reasons, *damaged.values()])
     gone |= damaged

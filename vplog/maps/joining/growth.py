@@ -11,6 +11,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,7 +31,6 @@ from vplog.maps.joining.joint_graph import (
     verified_closures,
     with_solve,
     write_drive,
-    write_ledgers,
 )
 from vplog.maps.joining.joint_record import fetch_poses, is_whole
 from vplog.maps.storage.damage import reading_drive
@@ -242,10 +242,9 @@ class Growth:
         for drive, one in drives.items():
             (made / folder_name(drive)).mkdir(parents=True)
             write_drive(made / folder_name(drive), "", one, poses[drive], self._header)
-        ends = {one: None for pair in ledgers for one in pair}
-        number = {drive: at for at, drive in enumerate(ends)}
-        numbered = {(number[later], number[earlier]): one for (later, earlier), one in ledgers.items()}
-        write_ledgers(made / "joins.parquet", [self._keyframes(one)[0] for one in ends], numbered, self._header)
+        keyframes = {one: self._keyframes(one)[0] for one in set(chain.from_iterable(ledgers))}
+        rows = [(keyframes[later], keyframes[earlier], one) for (later, earlier), one in ledgers.items()]
+        tables.write_joins(made / "joins.parquet", rows, self._header)
         record = {"drives": list(poses), "joins": [pair_record(*pair, one) for pair, one in ledgers.items()]}
         if refined is not None:
             record = solution_record(list(poses), [], refined)

@@ -85,8 +85,7 @@ def fetch_poses(store: Store, folders: Mapping[str, str]) -> None:
 def components_in(store: Store) -> list[dict[str, Any]] | None:
     """The components that count: `folder` in MAP/joint and `drives`, in order of their first drives; None where nothing
     was joined yet. Raises ResultError where the record is damaged."""
-    if store.mirror is not None:
-        store.mirror.rest(["joint.json"])
+    store.fetch_beside(["joint.json"])
     groups = read_joint(store.root).get("groups")
     return groups and [component for group in groups for component in group["components"]]
 
@@ -106,8 +105,7 @@ def keyframe_poses(store: Store, joint: Mapping[str, Component], drive: str) -> 
         with reading_drive(drive):
             return tables.read_keyframes(store.file(drive, "keyframes.parquet"))[1]
     path = joint[drive].folder / folder_name(drive) / "keyframes.parquet"
-    if store.mirror is not None:
-        store.mirror.rest([path.relative_to(store.root).as_posix()])
+    store.fetch_beside([path.relative_to(store.root).as_posix()])
     try:
         return tables.read_keyframes(path)[1]
     except ResultError:

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from urllib.parse import unquote
 
 from vplog.errors import LibraryError, NewerError, ResultError, nearest_path
-from vplog.maps.geo_bounds import earth_from_record, earth_of_run
+from vplog.maps.geo_bounds import earth_from_record
 from vplog.maps.storage.catalogue import Entry, read_catalogue, state_of, write_catalogue
 from vplog.maps.storage.damage import (
     DamagedDriveError,
@@ -73,11 +73,6 @@ class Store:
         return self.root / "index"
 
     @property
-    def joint_damage(self) -> str:
-        """Why a writer has dropped the joint graphs of a map on an object store; empty where it has not."""
-        return "" if self.mirror is None else self.mirror.rest_damage
-
-    @property
     def staging(self) -> Path:
         """Hidden folder on the map's file system, where a writer makes what it renames in."""
         return self.root / ".staging"
@@ -133,8 +128,7 @@ class Store:
     def earth(self, drive: str) -> Earth | None:
         """The georeference of a drive, None where it has none. Raises DamagedDriveError."""
         with reading_drive(drive):
-            about = self.record(drive)
-            return earth_from_record(about["earth"]) if "earth" in about else earth_of_run(self.full_run(drive))
+            return earth_from_record(self.record(drive).get("earth"))
 
     def record(self, drive: str) -> dict[str, Any]:
         """drive.json of a drive. Raises ResultError."""
@@ -369,8 +363,9 @@ def skip_damaged(store: Store, work: Callable[[], T]) -> T:
 
 def damage_warnings(store: Store) -> list[str]:
     """A warning for each damaged drive of a map, with the remedy that fits a map."""
-    dropped = f"{store.joint_damage}: the joint graphs are dropped. Join the drives again: vplog map join {store}"
-    return [dropped] * bool(store.joint_damage) + [
+    why = "" if store.mirror is None else store.mirror.rest_damage
+    dropped = f"{why}: the joint graphs are dropped. Join the drives again: vplog map join {store}"
+    return [dropped] * bool(why) + [
         f"{drive} is damaged and left out: {why.partition('. ')[0].rstrip('.')}. "
         f"Compute it again from its log: vplog batch LOG -o {store}"
         for drive, why in sorted(store.damaged.items())

@@ -28,7 +28,7 @@ import pyarrow.parquet as pq
 from vplog.errors import ResultError
 from vplog.maps.storage import delta_log, objects
 from vplog.maps.storage.contents import Store, skip_damaged
-from vplog.maps.storage.damage import reading_drive
+from vplog.maps.storage.damage import files_of, reading_drive
 from vplog.maps.storage.layout import TABLES
 from vplog.maps.storage.snapshot import store_errors
 from vplog.results import tables
@@ -237,10 +237,9 @@ def _longest(file: dict[str, Any]) -> int:
 
 
 def _made_from(store: Store, drive: str, record: dict[str, Any]) -> str:
-    """A hash of the tables of a drive; in maps of before that have none, of all that the drive was made from."""
-    files = record.get("files", {}) if store.mirror is None else store.mirror.drives[drive]["files"]
-    hashes = [files.get(f"{name}.parquet", {}).get("sha256") for name in TABLES]
-    return key_of(hashes if all(hashes) else record)[:32]
+    """A hash of the tables of a drive."""
+    files = files_of(record) if store.mirror is None else store.mirror.drives[drive]["files"]
+    return key_of([files.get(f"{name}.parquet", {}).get("sha256") for name in TABLES])[:32]
 
 
 def _write_files(
