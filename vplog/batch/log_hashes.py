@@ -9,7 +9,9 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
 from contextlib import suppress
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from pydantic import TypeAdapter
 
 from vplog import logs as all_logs
 from vplog.batch.plan import DriveInput
@@ -33,6 +35,9 @@ _PROGRESS_EVERY_S = 0.2
 """Interval of progress."""
 
 Hashes = dict[str, str]
+_Entry = dict[str, dict[str, str]]
+"""`stat`, the `stat_signature` of a log when it was read, and its `hashes`."""
+_ENTRIES = TypeAdapter(dict[str, _Entry])
 
 
 def known_hashes(logs: Sequence[DriveInput], record: Path, execution: Execution) -> list[Hashes | str]:
@@ -44,16 +49,16 @@ def known_hashes(logs: Sequence[DriveInput], record: Path, execution: Execution)
     progress is in MB read.
     """
     known = _read(record)
-    current: dict[str, dict[str, Any]] = {}
+    current: dict[str, _Entry] = {}
     done, total, stop = [0] * len(logs), [0] * len(logs), Event()
 
     def one(path: Path, number: int, is_log: bool) -> Hashes:
         if isinstance(path, RemotePath):
             return hash_inputs(path)
         name, stat = str(path.absolute()), stat_signature(path)
-        if name in known and known[name]["look"] == stat:
-            current[name] = known[name]
-            return known[name]["hashes"]
+        if (entry := known.get(name, {})).get("stat") == stat and "hashes" in entry:
+            current[name] = entry
+            return entry["hashes"]
 
         def read(count: int) -> None:
             done[number] += count
@@ -65,7 +70,7 @@ def known_hashes(logs: Sequence[DriveInput], record: Path, execution: Execution)
         began, total[number] = time.time(), total[number] + bytes_of(path)
         hashes = hash_inputs(path, read)
         if stat_signature(path) == stat and changed_s(path) < began - _SETTLED_S:
-            current[name] = {"look": stat, "hashes": hashes}
+            current[name] = {"stat": stat, "hashes": hashes}
         return hashes
 
     def of_log(given: DriveInput, number: int) -> Hashes | str:
@@ -102,15 +107,9 @@ def known_hashes(logs: Sequence[DriveInput], record: Path, execution: Execution)
     return answers
 
 
-def _read(record: Path) -> dict[str, dict[str, Any]]:
-    """By log, its `stat` and its `hashes`; nothing where there is no such file, or another thing."""
+def _read(record: Path) -> dict[str, _Entry]:
+    """The entry of each log; nothing where there is no such file, or another thing."""
     try:
-        known = read_run_json(record) if record.stat().st_size <= _MOST_BYTES else {}
-    except (OSError, ResultError):
+        return _ENTRIES.validate_python(read_run_json(record) if record.stat().st_size <= _MOST_BYTES else {})
+    except (OSError, ValueError, ResultError):
         return {}
-
-    def sound(about: Any) -> bool:
-        parts = [about.get("look"), about.get("hashes")] if isinstance(about, dict) else [None]
-        return all(isinstance(part, dict) and all(isinstance(text, str) for text in part.values()) for part in parts)
-
-    return {name: about for name, about in known.items() if sound(about)}

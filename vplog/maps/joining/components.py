@@ -30,7 +30,7 @@ from vplog.graph.build import parts
 from vplog.loops.verify import no_closures
 from vplog.maps.joining.drive_pairs import fetch_inputs
 from vplog.maps.joining.growth import Growth, LostPosesError
-from vplog.maps.joining.join_states import JoinState, write_states
+from vplog.maps.joining.join_states import JoinState, PairState, write_states
 from vplog.maps.joining.joint_graph import (
     pair_record,
     read_drive,
@@ -77,7 +77,7 @@ class Drives:
         """Place of each ID in the order."""
         return {drive: at for at, drive in enumerate(self.names)}
 
-    def counts(self, later: int, pair: dict[str, Any]) -> bool:
+    def counts(self, later: int, pair: PairState) -> bool:
         """Whether the drive that a pair is with is there, before its own, and the one that it was then."""
         at = self.number.get(pair["match"], later)
         return at < later and self.joins[at].member == pair["match_key"]

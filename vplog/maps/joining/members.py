@@ -138,17 +138,6 @@ class CameraTrust:
         """That of every camera, the first one's first."""
         return self, *self.further
 
-    def record(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        more = {"further": [one.record() for one in self.further]} if self.further else {}
-        return {"camera": self.camera, "rotation_share": self.rotation_share, **more}
-
-    @classmethod
-    def of(cls, record: dict[str, Any]) -> CameraTrust:
-        """The camera that a record names. Raises LookupError, TypeError or ValueError where it is damaged."""
-        further = tuple(cls.of(dict(one)) for one in record.get("further", ()))
-        return cls(dict(record["camera"]), float(record["rotation_share"]), further)
-
 
 def camera_trust(member: Member, verify: VerifySettings, execution: Execution) -> CameraTrust:
     """The camera of the log, its rotations compared with the odometry's. Raises LogError where the log is gone."""

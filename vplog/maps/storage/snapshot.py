@@ -32,7 +32,7 @@ from typing_extensions import TypedDict  # as pydantic needs it below Python 3.1
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.storage import objects
 from vplog.maps.storage.damage import UnreachableError
-from vplog.maps.storage.layout import FORMAT
+from vplog.maps.storage.layout import FORMAT, Below
 from vplog.storage.folders import is_below
 from vplog.storage.json_records import has_checksum, with_checksum
 from vplog.storage.parquet_limits import check_version
@@ -86,7 +86,10 @@ class _File(TypedDict):
     rows: NotRequired[StrictInt]
     pack: NotRequired[_Packed]
     """Where a small file of a drive is, if not in its folder."""
-    generation: NotRequired[Generation]
+
+
+class _RestFile(_File):
+    generation: Generation
     """Folder of a file beside drives, MAP/rest/GENERATION/NAME: a random name."""
 
 
@@ -105,7 +108,7 @@ class _Drive(TypedDict):
     record: _Record
     generation: Generation
     """Its files are in MAP/runs/drive=ID/GENERATION, a random name that is never used twice."""
-    files: dict[str, _File]
+    files: dict[Below, _File]
     run: NotRequired[dict[str, Any]]
     """Figures of its run.json."""
     stamps_ns: NotRequired[list[StrictInt] | None]
@@ -120,7 +123,7 @@ class _Layer(TypedDict):
     """Entries that differ from those of the layers below, by name; None: the entry is removed."""
 
     drives: dict[str, _Drive | None]
-    rest: dict[str, _File | None]
+    rest: dict[Below, _RestFile | None]
     """All else that a map's folder has, as what joins its drives."""
 
 
@@ -139,9 +142,9 @@ class _Row(TypedDict):
 class _Snapshot(_Layer):
     library: str | None
     settings: dict[str, Any]
-    libraries: dict[str, dict[str, _File]]
+    libraries: dict[Below, dict[Below, _File]]
     failures: dict[str, dict[str, Any]]
-    copies: dict[str, str | None]
+    copies: dict[Below, Below | None]
     """Objects that are to be copied within the store, by the new name; None: that are to be removed."""
     replaced: dict[str, str]
     """When folders and files that earlier snapshots name were replaced, in UTC."""
@@ -355,18 +358,8 @@ def checked(snapshot: Snapshot, place: RemotePath) -> Snapshot:
 
 
 def _checked(found: dict[str, Any], place: RemotePath) -> dict[str, Any]:
-    """A snapshot or a layer whose names stay within the map. Raises ResultError."""
-    drives = {drive: entry for drive, entry in found["drives"].items() if entry is not None}
-    names = {*found["rest"], *(name for entry in drives.values() for name in entry["files"])}
-    for name in ("copies", "libraries"):
-        names |= found.get(name, {}).keys()
-    names |= {*filter(None, found.get("copies", {}).values())}
-    names |= {name for files in found.get("libraries", {}).values() for name in files}
-    if (
-        not all(map(is_below, names))
-        or any(drive != entry["record"]["drive"] for drive, entry in drives.items())
-        or any(about is not None and "generation" not in about for about in found["rest"].values())
-    ):
+    """A snapshot or a layer whose drives are those of their names. Raises ResultError."""
+    if any(entry is not None and entry["record"]["drive"] != drive for drive, entry in found["drives"].items()):
         raise _no_snapshot(place)
     return found
 
