@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
 from contextlib import suppress
 from pathlib import Path
@@ -22,9 +22,12 @@ from vplog.storage.remote_path import RemotePath
 
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution
+    from vplog.logs import TopicChoice
 
 NAME = ".inputs.json"
 """Name of the record in the map: hidden, as it concerns the logs on this machine, not the map."""
+BESIDE = "beside "
+"""Prefix of the names of files beside a log."""
 _SETTLED_S = 3.0
 """A file written this short a time ago could be written again without a change of its times: some file systems count
 them in steps of two seconds."""
@@ -74,19 +77,13 @@ def known_hashes(logs: Sequence[DriveInput], record: Path, execution: Execution)
         return hashes
 
     def of_log(given: DriveInput, number: int) -> Hashes | str:
-        path, beside = given.log, given.topics.files
         try:
-            found = [one(path, number, True), *(one(file, number, False) for file in beside.values())]
+            log = one(given.log, number, True)
+            return log | hashes_beside(given.topics, lambda file: one(file, number, False))
         except LogError as error:
             return str(error)
         except OSError as error:
-            return f"Cannot read {error.filename or path}: {error.strerror or error}."
-        names = [name if name.startswith("mask") else "" for name in beside]  # several may be called alike
-        return found[0] | {
-            " ".join(filter(None, ("beside", what, name))): text
-            for what, other in zip(names, found[1:], strict=True)
-            for name, text in other.items()
-        }
+            return f"Cannot read {error.filename or given.log}: {error.strerror or error}."
 
     with ThreadPoolExecutor(execution.threads) as pool:
         waiting = [pool.submit(of_log, log, number) for number, log in enumerate(logs)]
@@ -105,6 +102,15 @@ def known_hashes(logs: Sequence[DriveInput], record: Path, execution: Execution)
         with suppress(ResultError):
             write_run_json(record, every)
     return answers
+
+
+def hashes_beside(topics: TopicChoice, hashes_of: Callable[[Path], Hashes]) -> Hashes:
+    """sha256 of the files that topics name beside a log, by BESIDE and their names."""
+    return {
+        f"{BESIDE}{f'{what} ' if what.startswith('mask') else ''}{name}": text  # several masks may be called alike
+        for what, file in topics.files.items()
+        for name, text in hashes_of(file).items()
+    }
 
 
 def _read(record: Path) -> dict[str, _Entry]:
