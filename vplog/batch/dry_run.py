@@ -35,8 +35,8 @@ def dry_run(
 ) -> dict[str, Any]:  # fmt: skip
     """The drives of a batch, which of them it would compute, and bytes, images, CPU hours and cost of these.
 
-    A log whose place, length and times are those of a drive of the map is not read; files beside it are. CPU hours are those of the map's
-    drives for as many images; `cpu_seconds_from` is how many drives say so. Raises VplogError.
+    A log whose place, length and times are those of a drive of the map is not read; files beside it are. CPU hours are
+    those of the map's drives for as many images; `cpu_seconds_from` is how many drives say so. Raises VplogError.
     """
     given = with_topics(inputs, topics)
     with map_store.reading(root) as store, ThreadPoolExecutor(execution.threads) as pool:
