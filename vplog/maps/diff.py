@@ -34,7 +34,7 @@ class _Content:
 
 
 def diff_maps(baseline: Path, run: Path) -> dict[str, Any]:
-    """The differences of the map in a folder from the one in `baseline`, as `vplog.verbs.diff.diff` tells it of runs.
+    """The differences of the map in a folder from the one in `baseline`, in the form of `vplog.verbs.diff.diff`.
 
     Closures are pairs of `DRIVE/STAMP`; `drives` names those gained and lost. The poses of keyframes are compared where
     both maps have the drive, those of one joint frame aligned together. Raises ResultError.

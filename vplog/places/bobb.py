@@ -34,10 +34,10 @@ from vplog.places.matches import (
 from vplog.places.overlap import list_shared
 from vplog.places.self_recognition import misleading_patches
 
-NOBODY = 65_535
-"""The number of no reference, where fewer than J share anything."""
-NOWHERE = 255
-"""The number of no box, where nothing of a window is found."""
+NO_REFERENCE = 65_535
+"""Number in place of a reference, where fewer than J share features with the image."""
+NO_BOX = 255
+"""Number in place of a box, where no feature of a window is found again."""
 _MAP_COLUMNS, _MAP_ROWS = 64, 36
 """Cells of a voting map that is drawn: finer than the patches it sums, 10 px of a 640 x 360 image."""
 
@@ -96,8 +96,8 @@ class BobbSettings(WeighedMatchSettings, RelearnedSettings):
             raise ValueError(
                 f"a box of {self.box_columns} x {self.box_rows} has more than 255 cells; use smaller boxes"
             )
-        if (count := np.prod(self.positions)) > NOWHERE:
-            raise ValueError(f"a box has {count} positions, and {NOWHERE} is the most; use fewer columns or rows")
+        if (count := np.prod(self.positions)) > NO_BOX:
+            raise ValueError(f"a box has {count} positions, and {NO_BOX} is the most; use fewer columns or rows")
         return self
 
     @property
@@ -124,9 +124,10 @@ class BobbSettings(WeighedMatchSettings, RelearnedSettings):
                 f"places.patch_weight has {len(self.patch_weight)} numbers for {len(matcher)} reference images. "
                 "Give one for each, or a single one."
             )
-        if len(matcher) >= NOBODY:
+        if len(matcher) >= NO_REFERENCE:
             raise LibraryError(
-                f"A library may have {NOBODY - 1} reference images, this one {len(matcher)}. Set library.size lower."
+                f"A library may have {NO_REFERENCE - 1} reference images, this one {len(matcher)}. Set library.size "
+                "lower."
             )
 
         def votes(weights: KindWeights) -> Floats:
@@ -172,7 +173,7 @@ def _rarity(explained: Floats, power: float) -> Floats:
 class BobbState(RecordState):
     """A library, indexed when it first describes. Safe to share between threads."""
 
-    record, none = Place, NOBODY
+    record, none = Place, NO_REFERENCE
 
     def __init__(self, settings: BobbSettings, matcher: Matcher, weights: Once[Weights]) -> None:
         super().__init__(settings, matcher.references)
@@ -198,14 +199,14 @@ class BobbState(RecordState):
     def describe(self, features: Features) -> Place:
         """Algorithm 1: the references that explain the features, and a box for each window on each of them."""
         s = self.settings
-        references = np.full(s.references, NOBODY, np.uint16)
+        references = np.full(s.references, NO_REFERENCE, np.uint16)
         weights = np.zeros(s.references, np.uint8)
-        boxes = np.full((s.references, s.boxes), NOWHERE, np.uint8)
+        boxes = np.full((s.references, s.boxes), NO_BOX, np.uint8)
         matches = self.matcher.match(features, (1.0, self.weights().patches))
         for j, (reference, share, here, there, agreed) in enumerate(self._retrieve(matches)):
             references[j], weights[j] = reference, max(round(255 * share**s.share_power), 1)
             boxes[j] = expected_votes.best_boxes(
-                here, there, agreed, self._windows, self._along_y, self._along_x, NOWHERE
+                here, there, agreed, self._windows, self._along_y, self._along_x, NO_BOX
             )
         return Place(references, weights, boxes)
 
@@ -250,12 +251,12 @@ class BobbState(RecordState):
     def boxes(self, place: Place) -> Boxes:
         """The boxes of a place as shares of the reference's sides."""
         s = self.settings
-        used = place.references != NOBODY
+        used = place.references != NO_REFERENCE
         codes = place.boxes[used].astype(np.int64)
         row, column = np.divmod(codes, s.positions[0])
         ends = [column / s.columns, row / s.rows, (column + s.box_columns) / s.columns, (row + s.box_rows) / s.rows]
         corners = np.stack(ends, axis=-1)
-        corners[codes == NOWHERE] = np.nan
+        corners[codes == NO_BOX] = np.nan
         return Boxes(place.references[used].astype(np.int64), corners)
 
     def voting_maps(self, features: Features, references: Sequence[int]) -> list[Floats]:
@@ -303,10 +304,10 @@ class BobbState(RecordState):
     def on_subset(self, column: pa.Array, references: Ints) -> pa.Array:
         """The places of a column by some of the references alone, with the numbers that `subset` gives them."""
         known, weights, boxes = self.checked(from_column(column, self.arrow_type))
-        number = np.full(NOBODY + 1, NOBODY, np.uint16)
+        number = np.full(NO_REFERENCE + 1, NO_REFERENCE, np.uint16)
         number[references] = np.arange(len(references), dtype=np.uint16)
-        gone = number[known] == NOBODY
-        fields = number[known], np.where(gone, 0, weights), np.where(gone[..., None], NOWHERE, boxes)
+        gone = number[known] == NO_REFERENCE
+        fields = number[known], np.where(gone, 0, weights), np.where(gone[..., None], NO_BOX, boxes)
         return to_column(self.arrow_type, iter(fields))
 
     def overlaps(self) -> Bytes:
@@ -327,12 +328,12 @@ class BobbState(RecordState):
             overlap /= s.box_columns * s.box_rows
             return overlap, overlap * weights[rows, ranks] * weights[others, other_ranks]
 
-        return list_shared(np.where(references == NOBODY, -1, references.astype(np.int64)), query, match, compare)
+        return list_shared(np.where(references == NO_REFERENCE, -1, references.astype(np.int64)), query, match, compare)
 
     def evidence(self, query: Place, match: Place) -> str:
         """Kinds of features that the references count which most of the score of two places is of."""
         shared, mine, theirs = np.intersect1d(query.references, match.references, return_indices=True)
-        known = shared != NOBODY
+        known = shared != NO_REFERENCE
         worth = query.weights[mine[known]].astype(np.int64) * match.weights[theirs[known]]
         if not worth.any():
             return ""
@@ -345,6 +346,6 @@ class BobbState(RecordState):
         """Raises LibraryError where there is no such box, too."""
         references, weights, boxes = super().checked(fields)
         positions = np.prod(self.settings.positions)
-        if np.any((boxes >= positions) & (boxes != NOWHERE)):
+        if np.any((boxes >= positions) & (boxes != NO_BOX)):
             raise LibraryError(f"The descriptors name boxes beyond the {positions} that this recogniser knows.")
         return [references, weights, boxes]

@@ -23,14 +23,14 @@ from vplog.execution.execution import Execution
 from vplog.maps.condensation.own_queries import (
     OwnAnswers,
     OwnPlaces,
+    near_another,
     query_own_places,
     read_own_places,
     search_of,
-    shown_by_others,
 )
 from vplog.maps.condensation.redundancy import RemovalCandidates, remove_cross_validated
 from vplog.maps.condensation.references import remove_references
-from vplog.maps.merge import copy_library, put_library
+from vplog.maps.merge import copy_library, copy_run, put_library
 from vplog.maps.search.query import open_map
 from vplog.maps.storage import layout, map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
@@ -58,12 +58,13 @@ class Condensed:
     retained: Bools
     """(N,) places that the new map has."""
     lost: int
-    """Queries that are not answered rightly any more, for want of a place, where they did not choose which."""
+    """Queries that lose their right answer with the places removed, by cross-validation."""
     state: PlaceState
+    """The recogniser with the references that stay."""
     whole: PlaceState
-    """The recogniser of the map as it was."""
+    """The recogniser of the map before."""
     whole_answers: OwnAnswers
-    """Answers of the whole map."""
+    """Answers of the map before."""
 
 
 def condense_map(
@@ -71,7 +72,7 @@ def condense_map(
 ) -> dict[str, Any]:
     """Write the map `target`: the drives of a map with the places and references that still decide something, as long
     as the recall at rank one of the map's own queries falls by no more than `loss`, half of it by references. Returns
-    an account of it.
+    the record of it for JSON.
 
     A place is right within `distance_m` of the query, which None sets by the spacing of places. Raises VplogError, as
     where the target is a map already.
@@ -100,18 +101,18 @@ def condense_places(
     places: OwnPlaces, answers: OwnAnswers, state: PlaceState, distance_m: float, loss: float,
     execution: Execution = Execution(),
 ) -> Condensed:  # fmt: skip
-    """The references that stay, and then the places. One that no other shows is among them, unless it has faded, and
-    one of each drive."""
+    """Choose the references that stay, and then the places: all without another within `distance_m`, unless faded, and
+    at least one of each camera of a drive."""
     posed, whole_answers, small = places.frame >= 0, answers, state
     most_lost = math.floor(loss * int(posed.sum()) + 1e-9)  # .01 of 300 is 3
     if isinstance(state, CodedState):
         places, answers, small = remove_references(places, answers, state, distance_m, most_lost // 2, execution)
     every = np.arange(len(posed))
-    removable, along_m = shown_by_others(places, distance_m) | (posed & answers.faded), np.cumsum(places.steps_m())
+    removable, along_m = near_another(places, distance_m) | (posed & answers.faded), np.cumsum(places.steps_m())
     total = int(removable.sum())
     most_lost -= len(whole_answers.place) - len(answers.place)
-    _, way = np.unique(np.stack([places.drive, places.frame], 1), axis=0, return_inverse=True)  # a camera's of a drive
-    candidates = RemovalCandidates(way.ravel(), along_m, removable, answers.faded)
+    _, track = np.unique(np.stack([places.drive, places.frame], 1), axis=0, return_inverse=True)  # drive and camera
+    candidates = RemovalCandidates(track.ravel(), along_m, removable, answers.faded)
     removal, lost = remove_cross_validated(
         answers.queries, answers.place % 2 == 0, candidates, most_lost,
         lambda done: execution.progress("remove", done, total),
@@ -147,22 +148,15 @@ def _write(store: Store, new: Store, found: Condensed) -> None:
 def _write_drive(store: Store, new: Store, record: Mapping[str, Any], found: Condensed, number: int) -> None:
     drive, made, first = record["drive"], new.staging / f"{os.getpid()}-condense", found.places.first
     retained, library = np.flatnonzero(found.retained[first[number] : first[number + 1]]), found.state.hash
-    other = library != record["library"]
-
-    def copied(_: Path) -> None:
-        shutil.rmtree(made, ignore_errors=True)
-        ignored = shutil.ignore_patterns("drive.json")  # it comes last: what has it is whole
-        what = f"{drive} of {store} to {new}"
-        copy_folder(store.full_run(drive), made, what, copy_function=layout.link, ignore=ignored)
-        if other or len(retained) < store.rows("descriptors", drive):
-            table, column = made / "descriptors.parquet", found.places.columns[number]
-            tables.write_some_descriptors(table, table, retained, column, library)
-        if other:
-            about = {"hash": library, "from": library_of(new.library(library))}
-            account = run_record.read_run_json(made / "run.json")
-            run_record.write_run_json(made / "run.json", {**account, "library": about})
-
-    store.read(drive, copied, ())
+    other, column = library != record["library"], found.places.columns[number]
+    copy_run(store, drive, new, made)
+    if other or len(retained) < len(column):
+        table = made / "descriptors.parquet"
+        tables.write_some_descriptors(table, table, retained, column, library)
+    if other:
+        about = {"hash": library, "from": library_of(new.library(library))}
+        account = run_record.read_run_json(made / "run.json")
+        run_record.write_run_json(made / "run.json", {**account, "library": about})
     named = {"library": library, layout.DESCRIBED_WITH: layout.described_with(dict(record))} if other else {}
     run_record.write_run_json(made / "drive.json", {**record, **named})
     map_store.publish(new, drive, made)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -36,19 +35,16 @@ from vplog.maps.joining.joint_graph import (
     read_drive,
     solution_record,
     solve_drives,
-    write_drive,
-    write_ledgers,
+    write_component,
 )
 from vplog.maps.joining.joint_record import is_whole, read_joint, write_joint
 from vplog.maps.joining.members import Member
 from vplog.maps.storage.damage import DamagedDriveError
-from vplog.maps.storage.layout import folder_name
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline
-from vplog.results import g2o, run_record, tables
+from vplog.results import tables
 from vplog.run.cache.code_hash import code_of
 from vplog.storage.json_records import key_of
-from vplog.storage.scratch import put_in_place
 
 
 @dataclass(frozen=True)
@@ -147,10 +143,8 @@ def groups_of(every: Drives, pair_ledgers: Sequence[PairLedger], pipeline: Pipel
     return found
 
 
-def solve_group(
-    store: Store, group: Group, pipeline: Pipeline, library: str, staging: Path, gone: dict[str, str]
-) -> dict[str, Any]:
-    """Solve a group, and make a folder in `staging` for each component that comes of it.
+def solve_group(store: Store, group: Group, pipeline: Pipeline, library: str, gone: dict[str, str]) -> dict[str, Any]:
+    """Solve a group, and make the folder of each component that comes of it.
 
     Returns the group as joint.json has it: `components`, and the pairs kept `apart` with reasons. Drives whose ledgers
     are damaged are noted in `gone`. Raises GraphError where it cannot be solved, and ResultError where a drive's folder
@@ -165,18 +159,16 @@ def solve_group(
     for members, refined in joined.solved.items():
         names = [group.drives[member] for member in members]
         folder = f"component={key_of({'group': group.key, 'drives': names})[:16]}"
-        made = staging / folder
-        made.mkdir(parents=True, exist_ok=True)
-        g2o.write_g2o(made / "graph.g2o", refined.graph, refined.solution.world_from_body)
-        for name, member in zip(names, members, strict=True):
-            (made / folder_name(name)).mkdir(exist_ok=True)
-            write_drive(made / folder_name(name), "", drives[member], joined.world_from_body[member], header)
+        components.append({"folder": folder, "drives": names})
+        if is_whole(store, folder, names):  # of a join that was killed: it is the same
+            continue
         inside = {pair: ledger for pair, ledger in ledgers.items() if set(pair) <= set(members)}
-        write_ledgers(made / "joins.parquet", [one.keyframes for one in drives], inside, header)
+        rows = [(drives[later].keyframes, drives[earlier].keyframes, one) for (later, earlier), one in inside.items()]
         joins = [pair_record(group.drives[pair[0]], group.drives[pair[1]], one) for pair, one in inside.items()]
         record = {**solution_record(names, joins, refined), "made_from": group.key}
-        run_record.write_run_json(made / "component.json", record)  # last: it is whole
-        components.append({"folder": folder, "drives": names})
+        own = {name: drives[member] for name, member in zip(names, members, strict=True)}
+        poses = {name: joined.world_from_body[member] for name, member in zip(names, members, strict=True)}
+        write_component(store, folder, own, poses, rows, record, header, refined)
     pairs = {at: (pair.later, pair.earlier) for at, pair in enumerate(group.pair_ledgers)}
     apart = _apart_records({pairs[at]: reason for at, reason in sorted(joined.apart.items())})
     return {"key": group.key, "drives": list(group.drives), "components": components, "apart": apart}
@@ -318,22 +310,12 @@ def _is_there(store: Store, component: Mapping[str, Any], checked: bool = False)
 
 
 def _solved(store: Store, group: Group, pipeline: Pipeline, library: str, gone: dict[str, str]) -> dict[str, Any]:
-    staging = store.staging / "joint"
-    shutil.rmtree(staging, ignore_errors=True)
     try:
-        record = solve_group(store, group, pipeline, library, staging, gone)
+        record = solve_group(store, group, pipeline, library, gone)
     except DamagedDriveError:  # the others are solved without it
         raise
     except VplogError as error:  # one group must not take the others along; it is tried again
         return {"key": "", "drives": list(group.drives), "components": [], "apart": [], "reason": str(error)}
     if damaged := [gone[drive] for drive in group.drives if drive in gone]:
         record |= {"key": "", "reason": " ".join(damaged)}
-    for component in record["components"]:
-        place = store.root / "joint" / component["folder"]
-        if is_whole(store, component["folder"], component["drives"]):  # of a join that was killed: it is the same
-            continue
-        place.parent.mkdir(exist_ok=True)
-        shutil.rmtree(place, ignore_errors=True)
-        put_in_place(staging / component["folder"], place)
-    shutil.rmtree(staging, ignore_errors=True)
     return record

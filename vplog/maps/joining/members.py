@@ -111,7 +111,7 @@ def member_of(store: Store, about: dict[str, Any]) -> Member:
 
 
 def opened_log(member: Member, check: bool = False) -> Log:
-    """Raises LogError where it is not there any more or, with `check`, another one."""
+    """The log of a drive. Raises LogError where it is not there any more or, with `check`, has changed."""
     path = stored_log(member.log, f"The log of {member.drive}", "Give it again: vplog batch LOG -o MAP")
     try:
         log, found = logs.open_drive([path], member.topics), hash_inputs(path) if check else {}

@@ -124,7 +124,7 @@ class Mirror:
         self.drives = dict(newest)
         rest, before = self.manifest.now["rest"], self.held
         same = {name: about for name, about in before.items() if rest.get(name) == about}
-        self.held = {name: about for name, about in same.items() if not of_order(name)}
+        self.held = {name: about for name, about in same.items() if not is_join_state(name)}
         for name in self.local_rest():
             verified = name.startswith("joins/") and name.endswith(".parquet")  # which counts
             if name not in self.held and (name in before or name in rest or not (verified or _of_index(name))):
@@ -332,8 +332,8 @@ class Mirror:
         return self.local / "runs" / folder_name(drive)
 
 
-def of_order(name: str) -> bool:
-    """Whether a file says which drives a join has come to."""
+def is_join_state(name: str) -> bool:
+    """Whether a file records how far joins have come: joint.json and joins/states-*."""
     return name == "joint.json" or name.startswith("joins/states-")
 
 

@@ -26,7 +26,7 @@ from vplog.maps.storage.layout import (
     set_drive_id,
     sha256_of,
 )
-from vplog.maps.storage.remote_map import Copies, Mirror, drives_in, of_order, tag_of
+from vplog.maps.storage.remote_map import Copies, Mirror, drives_in, is_join_state, tag_of
 from vplog.maps.storage.snapshot import LostRaceError, Snapshot, now, store_errors
 from vplog.results import run_record, tables
 from vplog.storage.remote_path import RemotePath, names_below, objects_below
@@ -307,8 +307,8 @@ def send_rest(mirror: Mirror) -> None:
     def change(snapshot: Snapshot) -> None:
         check_recent(began)
         contested = set(changes)
-        if any(map(of_order, changes)):  # drives are joined one after the other
-            contested |= set(filter(of_order, snapshot["rest"]))
+        if any(map(is_join_state, changes)):  # drives are joined one after the other
+            contested |= set(filter(is_join_state, snapshot["rest"]))
         for name in contested:
             theirs = snapshot["rest"].get(name)
             if theirs != known.get(name) and (theirs or {}).get("sha256") != hashes.get(name):
