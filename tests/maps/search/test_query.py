@@ -27,7 +27,7 @@ from vplog.maps.search.query import MapQuery, search
 from vplog.maps.search.segment import open_segment
 from vplog.maps.search.sequences import LineSearch, drives_by_votes
 from vplog.maps.storage.map_store import Store
-from vplog.places.bobb import NOWHERE, BobbSettings, BobbState, Place
+from vplog.places.bobb import NO_BOX, BobbSettings, BobbState, Place
 from vplog.places.sequence import SequenceSettings
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class Map:
         length = max(count, 1)
         places = make_places(length, SETTINGS, number if seed is None else seed, LIBRARY, length).rows(slice(count))
         weights, boxes = np.maximum(places.weights // 100 * 100, 100), places.boxes // 20 * 20
-        places = Places(places.references, weights, np.where(boxes < 60, boxes, NOWHERE).astype(np.uint8))
+        places = Places(places.references, weights, np.where(boxes < 60, boxes, NO_BOX).astype(np.uint8))
         self.places[f"drive-{number:09d}"] = places
         write_drive(self.store, number, places, self.state)
 
