@@ -140,7 +140,7 @@ def test_a_map_may_grow_shrink_and_change(made: Map) -> None:
     assert first.path in {part.path for part in small}, "a small drive does not write the large segment again"
     made.take(1)
     made.check()
-    made.put(4, 60, seed=77)  # the same name, the same key, other places
+    made.put(4, 60, seed=77)  # the same name, other places
     made.check()
     made.take(4)
     made.take(2)

@@ -93,7 +93,7 @@ def member_of(store: Store, about: dict[str, Any]) -> Member:
     topics, cameras = account.get("topics"), tuple(camera_topics(account))
     if len(cameras) > 1:
         described = store.run(drive, ["descriptors.parquet", "trajectory.parquet"]) / "descriptors.parquet"
-        cameras = cameras[: int(tables.read_pictures(described)[1].max(initial=0)) + 1]  # an older run has the first
+        cameras = cameras[: int(tables.read_pictures(described)[1].max(initial=0)) + 1]  # a map may describe fewer
     made_from = {
         "inputs": about["inputs"],
         "library": described_with(about),

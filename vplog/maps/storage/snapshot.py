@@ -156,7 +156,8 @@ class _Snapshot(_Layer):
     """Those that files of drives are in, by token."""
 
 
-_ROWS, _LAYER, _SNAPSHOT = TypeAdapter(list[_Row]), TypeAdapter(_Layer), TypeAdapter(_Snapshot)
+_ROWS: TypeAdapter[Any] = TypeAdapter(list[_Row])
+_LAYER, _SNAPSHOT = TypeAdapter(_Layer), TypeAdapter(_Snapshot)
 
 
 def empty() -> Snapshot:
@@ -192,7 +193,10 @@ class Manifest:
                 return
             head = _json(found.data, place)
             check_version(cast("Path", place), head.get("format"), PACKED_FORMAT, head.get("vplog"))
-            rows = _validated(_ROWS, head.get("snapshots", []), place)
+            try:
+                rows = _ROWS.validate_python(head.get("snapshots", []))
+            except ValueError:
+                raise _no_snapshot(place) from None
             if not rows:
                 raise ResultError(f"{place} names no snapshot: it is damaged. Copy it back from a backup.")
             if self.as_of is not None:
@@ -217,9 +221,12 @@ class Manifest:
         if data is None or (len(data), sha256(data).hexdigest()) != (row["bytes"], row["sha256"]):
             raise ResultError(f"{place} is gone, or damaged. Copy it back from a backup.")
         try:
-            return _checked(kind.validate_json(zlib.decompressobj(31).decompress(data, _MOST_BYTES)), place)
+            found = kind.validate_json(zlib.decompressobj(31).decompress(data, _MOST_BYTES))
         except (ValueError, zlib.error):
             raise _no_snapshot(place) from None
+        if any(entry is not None and entry["record"]["drive"] != drive for drive, entry in found["drives"].items()):
+            raise _no_snapshot(place)
+        return found
 
     def commit(self, what: str, change: Callable[[Snapshot], object]) -> None:
         """Make `change` to the newest snapshot; it is called again where another writer comes in between, and may raise
@@ -342,26 +349,6 @@ def _json(data: bytes, place: RemotePath) -> dict[str, Any]:
     if not sound:
         raise ResultError(f"{place} is damaged. Copy it back from a backup.")
     return record
-
-
-def _validated(kind: TypeAdapter[Any], value: Any, place: RemotePath) -> Any:
-    try:
-        return kind.validate_python(value)
-    except ValueError:
-        raise _no_snapshot(place) from None
-
-
-def checked(snapshot: Snapshot, place: RemotePath) -> Snapshot:
-    """A snapshot without layers, as `Manifest.now` has it. Raises ResultError where it is none."""
-    found = _checked(_validated(_SNAPSHOT, {**snapshot, "layers": []}, place), place)
-    return {name: found[name] for name in snapshot}
-
-
-def _checked(found: dict[str, Any], place: RemotePath) -> dict[str, Any]:
-    """A snapshot or a layer whose drives are those of their names. Raises ResultError."""
-    if any(entry is not None and entry["record"]["drive"] != drive for drive, entry in found["drives"].items()):
-        raise _no_snapshot(place)
-    return found
 
 
 def _no_snapshot(place: RemotePath) -> ResultError:
