@@ -156,7 +156,7 @@ class Weights:
 
     @classmethod
     def of(cls, patches: Floats, votes: Floats, popularity: float) -> Weights:
-        """With the votes (L, L) of each reference for the others."""
+        """Weights from the votes (L, L) that the images of references (rows) give the other references."""
         return cls(patches, _rarity(votes / np.maximum(votes.sum(axis=1, keepdims=True), 1e-9), popularity))
 
 
@@ -232,8 +232,8 @@ class BobbState(RecordState):
         return [(reference, explained / found[0][1], *rest) for reference, explained, *rest in found[: s.references]]  # pyrefly: ignore[bad-return]
 
     def agreed(self, matches: Matches, reference: int) -> tuple[Float32s, Float32s, Float32s]:
-        """Where matches with a reference are (E, 2) in the image and (E, 2) in the reference, as shares of the sides,
-        and their weights (E,), those that agree in their motion counting more.
+        """Positions of the matches with a reference, (E, 2) in the image and (E, 2) in the reference, as shares of the
+        sides, and their weights (E,), higher for matches that move as their neighbours do.
 
         An image of the library matches itself in all its features.
         """
@@ -245,7 +245,7 @@ class BobbState(RecordState):
         return here, there, expected_votes.agreement(here, there, weight, s.agreement, s.agreement_floor)
 
     def windows(self, rank: int) -> Floats:
-        """(I, 4) the same windows on the reference of any rank."""
+        """(I, 4) windows x0 y0 x1 y1, the same for references of any rank."""
         return self._windows
 
     def boxes(self, place: Place) -> Boxes:
@@ -311,12 +311,12 @@ class BobbState(RecordState):
         return to_column(self.arrow_type, iter(fields))
 
     def overlaps(self) -> Bytes:
-        """(256, 256) cells that the boxes of two numbers share."""
+        """(256, 256) cells that two boxes share, by their numbers."""
         s = self.settings
         return expected_votes.overlaps(s.positions, s.box_columns, s.box_rows)
 
     def shared(self, places: Sequence[Place], query: Int32s, match: Int32s) -> SharedReferences:
-        """The parts of the score of pairs (C,) of rows of `places`, by reference; equal boxes overlap by 1."""
+        """Contributions of the references to the scores of pairs (C,) of rows of `places`; equal boxes overlap by 1."""
         s = self.settings
         references, weights, boxes = self.arrays(places)
         table = self.overlaps()
@@ -331,7 +331,8 @@ class BobbState(RecordState):
         return list_shared(np.where(references == NO_REFERENCE, -1, references.astype(np.int64)), query, match, compare)
 
     def evidence(self, query: Place, match: Place) -> str:
-        """Kinds of features that the references count which most of the score of two places is of."""
+        """`keypoints`, `patches` or `keypoints and patches`: what contributes most to the score of two places; empty
+        where they share no reference."""
         shared, mine, theirs = np.intersect1d(query.references, match.references, return_indices=True)
         known = shared != NO_REFERENCE
         worth = query.weights[mine[known]].astype(np.int64) * match.weights[theirs[known]]
@@ -343,7 +344,7 @@ class BobbState(RecordState):
         return "keypoints and patches" if 2 * worth[used].sum() > worth.sum() else "keypoints"
 
     def checked(self, fields: Sequence[Any]) -> list[Any]:
-        """Raises LibraryError where there is no such box, too."""
+        """As `RecordState.checked`. Raises LibraryError also for a box beyond the positions on a reference."""
         references, weights, boxes = super().checked(fields)
         positions = np.prod(self.settings.positions)
         if np.any((boxes >= positions) & (boxes != NO_BOX)):

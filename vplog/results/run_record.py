@@ -64,7 +64,7 @@ def read_run_json(path: Path) -> dict[str, Any]:
 
 
 def _run_meant(folder: Path) -> str:
-    """` Did you mean FOLDER?`: the run that a file is in, or the folder with the nearest name."""
+    """` Did you mean FOLDER?`: for a file in a run that run, else the folder with the nearest name."""
     if folder.is_file() and (folder.parent / "run.json").is_file():
         return f" Did you mean {folder.parent}?"
     return nearest_path(folder)

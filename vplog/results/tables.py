@@ -499,8 +499,8 @@ def read_first_camera(path: Path) -> tuple[pa.Array, str]:
 
 
 def on_keyframes(keyframe: Int32s) -> Ints | None:
-    """(N,) the row nearest to each keyframe up to the last that has one, of places (P,) of these keyframes; None where
-    each keyframe is a row of its own."""
+    """(N,) row of the place nearest to each keyframe, of places (P,) at the keyframes `keyframe`, up to the last of
+    these; None where every keyframe has a place."""
     if not len(keyframe) or keyframe[-1] == len(keyframe) - 1:
         return None
     middle = (keyframe[1:].astype(np.int64) + keyframe[:-1]) // 2
@@ -508,7 +508,8 @@ def on_keyframes(keyframe: Int32s) -> Ints | None:
 
 
 def write_some_descriptors(source: Path, path: Path, rows: Ints, descriptors: pa.Array, library: str) -> None:
-    """Some rows of a table of descriptors (N,), by a library of this hash, else as they are. Raises ResultError."""
+    """Write some rows of the table `source` with their descriptors (N,) replaced by those of a library of this hash.
+    Raises ResultError."""
     with reading(source), open_table(source) as file:
         _check_name(source, "descriptors", file.schema_arrow)
         known = ("keyframe", "stamp_ns", "descriptor", "camera")

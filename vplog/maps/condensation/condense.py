@@ -45,7 +45,8 @@ from vplog.storage.scratch import copy_folder
 LOSS = 0.01
 """Loss of recall at rank one of the map's own queries."""
 _SPACINGS = 3.0
-"""Right is within so many times the distance of keyframes that follow each other: 3 m of keyframes a metre apart."""
+"""An answer is right within so many times the median distance of consecutive keyframes: 3 m of keyframes a metre
+apart."""
 
 
 @dataclass(frozen=True, eq=False)

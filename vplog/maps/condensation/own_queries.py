@@ -27,11 +27,12 @@ Search = Callable[[Sequence[Any], int], RankedPlaces]
 """The best places of a map for some views (V,), as many as the number given for each."""
 
 BEST = 16
-"""Places that are looked up for each query at first: 192 bytes, as much as the codes of one."""
+"""Best places that are searched for each query at first: 192 bytes, as much as the codes of one."""
 PASSES = 3
-"""Later drives that come by a place without finding it, after which it has faded: fewer may all have had bad light."""
+"""Later drives that pass a place and do not find it, after which it counts as faded: fewer may all be in bad
+light."""
 HEADING_DEG = 45.0
-"""Drives that come by look the same way within this angle of the whole rotation."""
+"""Largest angle of rotation between the poses of a place and of a later drive that passes it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,7 @@ class OwnPlaces:
     pose: Floats
     """(N, 4, 4) world_from_body."""
     spacing_m: float = 0.0
-    """Median distance of keyframes that follow each other."""
+    """Median distance in m of consecutive keyframes."""
 
     @property
     def first(self) -> Ints:

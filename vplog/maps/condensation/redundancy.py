@@ -61,7 +61,7 @@ class Removal:
     """Places in the order in which they are removed."""
 
     places: Ints
-    """(R,)."""
+    """(R,) places in the order of their removal."""
     lost: Ints
     """(R,) queries that are not answered rightly any more after each."""
 
