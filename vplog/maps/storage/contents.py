@@ -140,7 +140,7 @@ class Store:
 
     def figures(self, drive: str) -> dict[str, Any]:
         """run.json of a drive; of a map on a store its counts, totals and warnings. Raises ResultError."""
-        known = None if self.mirror is None else self.mirror.drives[drive].get("run")
+        known = None if self.mirror is None else self.mirror.drives[drive]["run"]
         return known or run_record.read_run_json(self.file(drive, "run.json"))
 
     @property

@@ -205,7 +205,7 @@ def _missing(
     wanted = {drive: _made_from(store, drive, record) for drive, record in store.drives().items()}
     files = _files(commits)
     stale = {name for name, file in files.items() if not file["drives"].items() <= wanted.items()}
-    small = {name for name, file in files.items() if _longest(file) < _FILE_BYTES / 2}
+    small = {name for name, file in files.items() if all(size < _FILE_BYTES / 2 for size, _ in file["tables"].values())}
     if compact and len(small - stale) > 1:
         stale |= small
     current = {drive for name, file in files.items() if name not in stale for drive in file["drives"]}
@@ -230,10 +230,6 @@ def _missing(
 
 def _drives(files: Mapping[str, dict[str, Any]]) -> dict[str, str]:
     return {drive: made_from for file in files.values() for drive, made_from in file["drives"].items()}
-
-
-def _longest(file: dict[str, Any]) -> int:
-    return max((size for size, _ in file["tables"].values()), default=0)
 
 
 def _made_from(store: Store, drive: str, record: dict[str, Any]) -> str:

@@ -177,14 +177,11 @@ class Mirror:
         packed = {name: about["pack"]["token"] for name, about in files.items() if "pack" in about}
         gone = [f"{place / name} is not there." for name in files.keys() - there.keys() - packed.keys()]
         known = self.manifest.now.get("packs", {})
-        doubtful = [
-            name
-            for name, token in packed.items()
-            if packs.get(token) != _state(known.get(token, {"bytes": 0, "tag": ""}))
-        ]
+        sound = {token for token, about in known.items() if packs.get(token) == (about["bytes"], about["tag"])}
+        doubtful = [name for name, token in packed.items() if token not in sound]
         doubtful += [
             name for name, about in files.items()
-            if name not in packed and there.get(name, "") not in ("", (about["bytes"], about.get("tag")))
+            if name not in packed and there.get(name, "") not in ("", (about["bytes"], about["tag"]))
             and (name in RUN_TABLES or about["bytes"] != there[name][0])
         ]  # fmt: skip
         try:
@@ -339,10 +336,6 @@ def is_join_state(name: str) -> bool:
 
 def _of_index(name: str) -> bool:
     return name.startswith("index/")
-
-
-def _state(about: dict[str, Any]) -> tuple[int, str]:
-    return about["bytes"], about["tag"]
 
 
 def tag_of(meta: Any) -> str:

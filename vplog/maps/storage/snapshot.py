@@ -81,7 +81,7 @@ class _Pack(TypedDict):
 class _File(TypedDict):
     bytes: StrictInt
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-    tag: NotRequired[str]
+    tag: str
     """ETag."""
     rows: NotRequired[StrictInt]
     pack: NotRequired[_Packed]
@@ -109,10 +109,8 @@ class _Drive(TypedDict):
     generation: Generation
     """Its files are in MAP/runs/drive=ID/GENERATION, a random name that is never used twice."""
     files: dict[Below, _File]
-    run: NotRequired[dict[str, Any]]
+    run: dict[str, Any]
     """Figures of its run.json."""
-    stamps_ns: NotRequired[list[StrictInt] | None]
-    """First and last keyframe."""
     packed: NotRequired[str]
     """When files of its folder were put into a pack, in UTC: from then on they are replaced."""
     component: NotRequired[str | None]
