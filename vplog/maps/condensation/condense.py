@@ -51,7 +51,7 @@ apart."""
 
 @dataclass(frozen=True, eq=False)
 class Condensed:
-    """The places of a map that stay, by the references that stay."""
+    """Outcome of a condensation: which places and references of a map stay."""
 
     places: OwnPlaces
     answers: OwnAnswers

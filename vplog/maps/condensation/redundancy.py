@@ -33,7 +33,7 @@ class OwnQueries:
     """Whether places are right answers to a query."""
 
     def some(self, chosen: Bools) -> OwnQueries:
-        """The queries that are `chosen` (Q,), as if there were no others."""
+        """The queries that are `chosen` (Q,) alone."""
         rows: list[int] = np.flatnonzero(chosen).tolist()
         return OwnQueries(
             [self.best[row] for row in rows],

@@ -30,8 +30,8 @@ _AT_ONCE = 64
 
 
 def places_of(store: Store, drive: str, state: PlaceState) -> Sequence[Any]:
-    """The place of each keyframe of a drive, of a condensed map the nearest; with further cameras, then those of their
-    pictures. Raises DamagedDriveError where they are of another recogniser."""
+    """The place of each keyframe of a drive, in a condensed map the nearest that it has; then those of the pictures of
+    further cameras. Raises DamagedDriveError where they are of another recogniser."""
     column, rows_of = read_column(store, drive, state), rows_on_keyframes(store, drive)
     _, nearest = rows_of.get(0, (None, None))
     if nearest is not None and len(rows_of) > 1:  # pictures of further cameras come after those of all keyframes

@@ -74,7 +74,7 @@ class Drives:
         return {drive: at for at, drive in enumerate(self.names)}
 
     def counts(self, later: int, pair: PairState) -> bool:
-        """Whether the drive that a pair is with is there, before its own, and the one that it was then."""
+        """Whether a pair is valid: the drive that `later` was verified against is unchanged and comes before it."""
         at = self.number.get(pair["match"], later)
         return at < later and self.joins[at].member == pair["match_key"]
 

@@ -80,8 +80,9 @@ class Growth:
         known: Iterable[Mapping[str, Any]], stays: Sequence[str],
         pairs: Mapping[tuple[str, str], Callable[[], Closures]],
     ) -> None:  # fmt: skip
-        """`known` are components of joint.json, of whose drives those of `stays` are as they were; `judged` are keys of
-        all that a drive's closures are decided by, and `pairs` read the ledger of each pair as geometry has left it.
+        """`known` are components of joint.json, and `stays` those of their drives that are unchanged. `judged` has, by
+        drive, a hash of all that its closures are decided by; `pairs` read the ledger of each pair after geometric
+        verification, before any joint solve.
         """
         self._store, self._pipeline, self._header, self._judged, self._pairs = store, pipeline, header, judged, pairs
         self.apart: dict[tuple[str, str], str] = {}

@@ -95,7 +95,7 @@ def proposed_in(
 
 
 def with_proposals(known: Candidates, number: int, more: Proposals, pipeline: Pipeline) -> Candidates:
-    """The candidates with those in a drive more.
+    """The candidates with those in one more drive.
 
     `propose.per_query` limits the candidates of a query over all drives, as it does within one: the cost of verifying a
     drive does not grow with the map. Ties go to the drive of lower number, in whatever order they are searched.

@@ -19,10 +19,10 @@ from vplog.storage.parquet_limits import check_version
 
 
 class Component(NamedTuple):
-    """Drives that closures join, as one of them is among them."""
+    """The component of one drive: the drives that closures join with it, and where its own poses are."""
 
     folder: Path
-    """Where the drive's poses are."""
+    """Folder in MAP/joint with the poses of that drive."""
     drives: Sequence[str]
     """The frame is that of the first."""
 

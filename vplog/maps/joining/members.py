@@ -127,7 +127,7 @@ class CameraTrust:
     """The camera of a drive, and how far its calibration is trusted."""
 
     camera: dict[str, Any]
-    """Plain values."""
+    """The camera's record as plain values."""
     rotation_share: float
     """Share of a rotation by which camera and odometry disagree; 0 without calibration."""
     further: tuple[CameraTrust, ...] = ()
@@ -135,7 +135,7 @@ class CameraTrust:
 
     @property
     def each(self) -> tuple[CameraTrust, ...]:
-        """That of every camera, the first one's first."""
+        """All cameras of the drive with their trust, the first camera first."""
         return self, *self.further
 
 

@@ -41,13 +41,13 @@ _LEFT_OVER_S = 86_400.0
 
 @dataclass(frozen=True, eq=False)
 class SegmentView:
-    """A segment as a search uses it."""
+    """A segment, and which of its drives a search takes from it."""
 
     segment: Segment
     path: Path | None
     """None where it is in memory alone."""
     numbers: Int32s
-    """(D,) number of each of its drives in the map; -1 where the map has it no more, or another part has it."""
+    """(D,) number of each of its drives in the map; -1 where the map no longer has it, or another segment has it."""
     stored: StoredFile | None = None
     """Where a map on an object store has it, for other machines."""
 
@@ -57,7 +57,7 @@ class SegmentView:
         return int(np.diff(self.segment.first)[self.numbers >= 0].sum())
 
     def of(self, numbers: Iterable[int]) -> SegmentView:
-        """Without the drives of other numbers."""
+        """The segment with the drives of these numbers alone."""
         return replace(
             self, numbers=np.where(np.isin(self.numbers, np.fromiter(numbers, np.int32)), self.numbers, np.int32(-1))
         )

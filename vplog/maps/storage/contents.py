@@ -74,11 +74,11 @@ class Store:
 
     @property
     def staging(self) -> Path:
-        """Hidden folder on the map's file system, where a writer makes what it renames in."""
+        """Hidden folder on the map's file system, where a writer makes what it then renames into the map."""
         return self.root / ".staging"
 
     def run(self, drive: str, names: Iterable[str] = RUN_TABLES) -> Path:
-        """The run folder; of a map on a store with these of its files."""
+        """The run folder; of a map on an object store a local one, into which these of its files are fetched."""
         if self.mirror is not None:
             self.mirror.fetch(drive, names)
         return self.root / "runs" / folder_name(drive)
@@ -97,7 +97,7 @@ class Store:
             self.mirror.evict(drive)
 
     def library(self, digest: str, names: Collection[str] = ()) -> Path:
-        """The folder of a library; of a map on a store with all of its files, or these."""
+        """The folder of a library; of a map on an object store a local one, into which its files are fetched."""
         if self.mirror is not None:
             self.mirror.library(digest, names)
         return self.root / "libraries" / digest

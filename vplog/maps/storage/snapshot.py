@@ -241,7 +241,7 @@ class Manifest:
         raise ResultError(f"{self.remote} is written to by others without a pause. Run again.")
 
     def _write(self, what: str, wanted: Snapshot) -> bool:
-        """Whether no other writer came first; else the newest snapshot is read."""
+        """Write a snapshot if no other writer came first; else read the newest. Returns whether it was written."""
         layers, drives = self.layers, len(wanted["drives"])
         changed = _difference(wanted, layers)
         if _entries(changed) > _MOST_CHANGES:
