@@ -256,7 +256,7 @@ def write_keyframes(
 
 
 def read_keyframe_covariance(path: Path) -> Floats:
-    """(N, 6, 6) of the keyframes' optimised poses, NaN where not known, as in tables of older versions."""
+    """(N, 6, 6) of the keyframes' optimised poses, NaN where not known."""
     return _matrices(_read(path, "keyframes", KEYFRAMES), "covariance")
 
 
@@ -666,7 +666,7 @@ def read_poses(table: pa.Table, prefix: str) -> Floats:
 
 
 def _values(table: pa.Table, name: str) -> np.ndarray:
-    """A column as an array of its own, which may be written to; whole numbers that an older table lacks are 0."""
+    """A column as an array of its own, which may be written to; whole numbers that are null, as cameras, are 0."""
     column = table[name]
     whole = column.null_count and pa.types.is_integer(column.type)
     return np.array((column.fill_null(0) if whole else column).to_numpy())
