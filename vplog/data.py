@@ -82,9 +82,9 @@ class Odometry:
     drifts: bool = True
     """Not where every pose is measured by itself, as satellite fixes are; `covariance` then is that of increments, and
     known."""
-    breaks: Ints | None = None
-    """Rows whose motion since the row before is not known, as where visual odometry lost its track: the pose is held.
-    None without any."""
+    breaks: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    """(B,) rows whose motion since the row before is not known, as where visual odometry lost its track: the pose is
+    held."""
     metric: bool = True
     """Not where lengths are in a unit of its own, as those of one camera without depth."""
     of_images: bool = False
@@ -486,7 +486,7 @@ class LogInfo:
     warnings: list[str] = field(default_factory=list)
     odometry_frames: list[str] = field(default_factory=list)
     """Names of the frames from the one that stands still to the body; empty where the odometry names none."""
-    skew_ms: dict[str, float] = field(default_factory=dict)
+    clock_offset_ms: dict[str, float] = field(default_factory=dict)
     """Median of log time less header stamp, by topic in use."""
     odometry_sources: list[OdometrySource] = field(default_factory=list)
     """Candidates for the odometry, the best first."""

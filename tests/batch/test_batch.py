@@ -49,6 +49,8 @@ if TYPE_CHECKING:
     from conftest import Said
     from mcap.records import Message
 
+    from vplog.verbs.demo.record import Demo
+
 QUICK = (
     "features.max_features=200", "features.max_megapixels=0.03", "features.min_features=0", "library.size=6",
     "library.seed=1", "places.neighbours=8", "pictures.closures=0", "pictures.megapixels=0", "propose.per_query=1",
@@ -543,7 +545,7 @@ def test_a_manifest_names_tags_which_stay(
 
 
 def test_a_dry_run_writes_nothing_and_reckons_by_the_drives_of_the_map(
-    whole: Path, logs: list[Path], tmp_path: Path, verb: Callable[..., Said]
+    whole: Path, logs: list[Path], drive: Demo, tmp_path: Path, verb: Callable[..., Said]
 ) -> None:
     new, before = Path(shutil.copyfile(logs[0], tmp_path / "new.mcap")), files(whole)
     dry = (*logs, new, tmp_path / "gone.bag", "--dry-run", "--cost-per-cpu-hour", 3600, *OPTIONS)
@@ -556,6 +558,8 @@ def test_a_dry_run_writes_nothing_and_reckons_by_the_drives_of_the_map(
     assert (found["compute"], found["bytes"], found["images"]) == (1, new.stat().st_size, runs[0]["counts"]["frames"])
     assert found["cpu_seconds_per_image"] == pytest.approx(cpu_s / images, abs=1e-3)
     assert found["cost"] == pytest.approx(cpu_s / images * found["images"], abs=0.02)
+    other = verb("batch", logs[0], "--dry-run", "--odometry-file", drive.truth, "-o", whole, "--json", *OPTIONS).json
+    assert other["compute"] == 1, "by a file that is not that of the map"
     root = Path(shutil.copytree(whole, tmp_path / "copy"))
     with map_store.writing(root) as store:
         map_store.annotate(store, "drive", {"log": str(new)})

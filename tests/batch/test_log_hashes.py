@@ -110,7 +110,7 @@ def test_a_log_that_cannot_be_read_is_one_line(logs: dict[str, Path], tmp_path: 
     assert errors == {"gone": f"Cannot read {gone}: No such file or directory."}
 
 
-@pytest.mark.parametrize("damage", ["", "[]", "{", '{"LOG": 3}', '{"LOG": {"look": {"a": 1}, "hashes": {}}}'])
+@pytest.mark.parametrize("damage", ["", "[]", "{", '{"LOG": 3}', '{"LOG": {"stat": {"a": 1}, "hashes": {}}}'])
 def test_a_damaged_record_is_made_anew(logs: dict[str, Path], tmp_path: Path, read: list[str], damage: str) -> None:
     record = tmp_path / ".inputs.json"
     first = asked(logs, record)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
@@ -12,7 +14,6 @@ from tests.pictures import day_and_dusk
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from conftest import Said
 
@@ -52,6 +53,15 @@ def test_pictures_are_put_into_a_map_and_found(pictures: Path, tmp_path: Path, v
     assert verb("map", "info", root, "--check").code == 0
     assert verb("map", "export", root, "-o", tmp_path / "places.parquet").code == 0
     assert pq.read_metadata(tmp_path / "places.parquet").num_rows == FRAMES
+
+
+def test_a_dry_run_sees_that_a_picture_has_changed(pictures: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:
+    folder, root = Path(shutil.copytree(pictures / "dusk", tmp_path / "dusk")), tmp_path / "map"
+    command = ("batch", folder, "-o", root, "--json", *QUICK)
+    assert verb(*command).code == 0
+    assert verb(*command, "--dry-run").json["compute"] == 0
+    shutil.copyfile(folder / "view_1.png", folder / "view_2.png")
+    assert verb(*command, "--dry-run").json["compute"] == 1
 
 
 def test_pictures_are_joined_with_no_drive(

@@ -23,6 +23,7 @@ from vplog.data import Features, Keyframes, Reference
 from vplog.execution.execution import Execution
 from vplog.maps.search.exact import best_places
 from vplog.maps.search.index import update_index
+from vplog.maps.storage.layout import sha256_of
 from vplog.maps.storage.map_store import Store
 from vplog.places.bobb import BobbSettings, BobbState, Place
 from vplog.results import run_record, tables
@@ -99,7 +100,8 @@ def write_drive(store: Store, first: int, places: Places, state: BobbState) -> N
     column = state.to_arrow([Place(*one) for one in zip(places.references, places.weights, places.boxes, strict=True)])
     about = tables.TableMetadata(state.settings.model_dump(mode="json"), state.hash)
     tables.write_descriptors(run / "descriptors.parquet", keyframes, column, about)
-    record = {"drive": drive, "log": drive, "key": drive, "library": state.hash, "inputs": {}}
+    key = sha256_of(run / "descriptors.parquet")
+    record = {"drive": drive, "log": drive, "key": key, "library": state.hash, "inputs": {}}
     run_record.write_run_json(run / "drive.json", record)
 
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from tests.benchmarks.measure import Figure, in_turns, one_thread, seconds
 from vplog.places import expected_votes
-from vplog.places.bobb import NOWHERE, Place
+from vplog.places.bobb import NO_BOX, Place
 from vplog.places.code_search import BLOCK, CodeIndex, build_lists
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ def _another(rng, popularity, some, others):
 
 @numba.njit(cache=True, nogil=True)
 def _anywhere(rng, positions):
-    return np.uint8(NOWHERE if rng.random() < 0.09 else rng.integers(0, positions))
+    return np.uint8(NO_BOX if rng.random() < 0.09 else rng.integers(0, positions))
 
 
 def make_queries(places: Places, count: int, settings: BobbSettings, library: int = LIBRARY) -> list[Place]:

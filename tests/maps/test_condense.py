@@ -24,7 +24,7 @@ from vplog.maps.joining.joint_record import read_joint
 from vplog.maps.search.query import open_map
 from vplog.maps.storage import map_store
 from vplog.maps.storage.map_store import Store
-from vplog.places.bobb import NOBODY
+from vplog.places.bobb import NO_REFERENCE
 from vplog.places.code_search import build_lists
 from vplog.results import tables
 from vplog.results.run_record import write_run_json
@@ -116,8 +116,10 @@ def test_a_drive_not_seen_loses_no_more_than_is_stated() -> None:
 
 def test_references_go_by_how_many_each_place_is_left_with() -> None:
     """The only reference of a place outlasts one that many places name beside others."""
-    references = np.array([[0, 1, 2], [0, 1, 2], [0, 1, NOBODY], [0, 1, NOBODY], [3, NOBODY, NOBODY]], np.uint16)
-    weights = np.where(references == NOBODY, 0, 9).astype(np.uint8)
+    references = np.array(
+        [[0, 1, 2], [0, 1, 2], [0, 1, NO_REFERENCE], [0, 1, NO_REFERENCE], [3, NO_REFERENCE, NO_REFERENCE]], np.uint16
+    )
+    weights = np.where(references == NO_REFERENCE, 0, 9).astype(np.uint8)
     lists = build_lists(references, weights, np.zeros((*references.shape, 1), np.uint8), 5, 2)
     assert removal_order(lists, references_of("abcde")).tolist() == [4, 2, 0, 3, 1]
 

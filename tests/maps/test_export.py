@@ -20,7 +20,7 @@ from tests.results.example import read_map
 from vplog.data import Gps
 from vplog.geometry import geodesy, se3
 from vplog.maps.storage import map_store
-from vplog.results import run_record, tables
+from vplog.results import tables
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -209,16 +209,6 @@ def test_an_export_goes_from_server_to_map(root: Path, verb: Verb, tmp_path: Pat
         server.shutdown()
     assert {one["from"] for one in told["drives"]} == {url}
     assert map_store.Store(other).drives()["far"]["log"] == f"{url}#far"
-
-
-def test_a_drive_of_an_older_map_is_exported_with_its_place_on_earth(root: Path, verb: Verb, tmp_path: Path) -> None:
-    record = root / "runs" / "drive=near" / "drive.json"
-    about = run_record.read_run_json(record)
-    record.write_text(json.dumps({name: about[name] for name in about if name != "earth"}))
-    out, other = tmp_path / "out.parquet", make_map(tmp_path / "other", {"x": 7})
-    verb("map", "export", root, "--format", "geoparquet", "-o", out)
-    verb("map", "merge", out, "-o", other)
-    assert map_store.Store(other).earth("near") is not None
 
 
 def test_files_that_are_no_export_or_of_another_library_are_one_line(root: Path, verb: Verb, tmp_path: Path) -> None:

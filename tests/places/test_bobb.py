@@ -14,7 +14,7 @@ from tests.places.pictures import noisy, nothing, reference
 from vplog.errors import LibraryError
 from vplog.execution.execution import Execution
 from vplog.places import expected_votes
-from vplog.places.bobb import NOBODY, NOWHERE, BobbSettings, BobbState, Place, _rarity
+from vplog.places.bobb import NO_BOX, NO_REFERENCE, BobbSettings, BobbState, Place, _rarity
 from vplog.places.code_search import BLOCK, CodeIndex, build_lists
 from vplog.places.matches import WeighedMatchSettings, _itself, _weigh, index_references, large_enough
 
@@ -66,8 +66,8 @@ def test_without_its_own_image_others_explain_a_reference(references: list[Refer
 
 def test_an_image_without_features_shares_nothing(learned: BobbState, references: list[Reference]) -> None:
     empty = learned.describe(nothing())
-    assert (empty.references == NOBODY).all()
-    assert (empty.boxes == NOWHERE).all()
+    assert (empty.references == NO_REFERENCE).all()
+    assert (empty.boxes == NO_BOX).all()
     index = learned.index([learned.describe(references[0].features), empty])
     assert len(index.query(empty, 5).rows) == 0
     assert index.scores(learned.describe(references[0].features))[1] == 0
@@ -81,7 +81,7 @@ def test_references_stand_by_falling_weight_and_the_best_has_255(
         weights = place.weights.astype(int)
         assert weights[0] in (0, 255)
         assert (np.diff(weights) <= 0).all()
-        used = place.references != NOBODY
+        used = place.references != NO_REFERENCE
         assert (weights[used] > 0).all()
         assert (weights[~used] == 0).all()
 
@@ -219,11 +219,11 @@ def test_search_is_equation_1(seed: int, pairing: str, stop: int) -> None:
     rng = np.random.default_rng(seed)
     count, J, windows, L = 12, 3, 4, 6
     references = np.array([rng.choice(L, J, replace=False) for _ in range(count)], np.uint16)
-    references[rng.random((count, J)) < 0.2] = NOBODY
+    references[rng.random((count, J)) < 0.2] = NO_REFERENCE
     weights = rng.integers(1, 256, (count, J)).astype(np.uint8)
-    weights[references == NOBODY] = 0
+    weights[references == NO_REFERENCE] = 0
     boxes = rng.integers(0, 20, (count, J, windows)).astype(np.uint8)
-    boxes[rng.random(boxes.shape) < 0.1] = NOWHERE
+    boxes[rng.random(boxes.shape) < 0.1] = NO_BOX
     table = expected_votes.overlaps((5, 4), 3, 2)
     lists = build_lists(references, weights, boxes, L, BLOCK)
     index = CodeIndex(lists, table, pairing)  # pyrefly: ignore[bad-argument-type]
@@ -235,7 +235,7 @@ def test_search_is_equation_1(seed: int, pairing: str, stop: int) -> None:
         total = 0.0
         for j in range(J):
             for k in range(J):
-                if references[0, j] == references[m, k] != NOBODY:
+                if references[0, j] == references[m, k] != NO_REFERENCE:
                     cells = table[boxes[0, j][:, None], boxes[m, k][None]] / 6
                     best, same = cells.max(axis=1).mean(), np.diag(cells).mean()
                     alike = {"best": best, "same": same, "both": (best + same) / 2}[pairing]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from vplog.places import code_search, expected_votes
 from vplog.places.code_search import CodeIndex, Place
 
-NOBODY, NOWHERE = 65_535, 255
+NO_REFERENCE, NO_BOX = 65_535, 255
 POSITIONS = 20
 """Boxes of 3 x 2 cells on a grid of 7 x 5."""
 TABLE = expected_votes.overlaps((5, 4), 3, 2)
@@ -41,11 +41,11 @@ class Places(Place):
 def _places(rng: np.random.Generator, count: int, J: int, windows: int, library: int) -> Places:
     """Weights and boxes are few, so that scores tie; some places have fewer references than J, some none."""
     references = rng.permuted(np.tile(np.arange(library), (count, 1)), axis=1)[:, :J].astype(np.uint16)
-    references[np.arange(J) >= rng.integers(0, J + 1, (count, 1))] = NOBODY
+    references[np.arange(J) >= rng.integers(0, J + 1, (count, 1))] = NO_REFERENCE
     weights = rng.choice([1, 80, 255], (count, J)).astype(np.uint8)
-    boxes = rng.choice([0, 1, 7, POSITIONS - 1, NOWHERE], (count, J, windows)).astype(np.uint8)
-    weights[references == NOBODY] = 0
-    boxes[references == NOBODY] = NOWHERE
+    boxes = rng.choice([0, 1, 7, POSITIONS - 1, NO_BOX], (count, J, windows)).astype(np.uint8)
+    weights[references == NO_REFERENCE] = 0
+    boxes[references == NO_REFERENCE] = NO_BOX
     return Places(references, weights, boxes)
 
 
@@ -53,7 +53,7 @@ def _equation_1(query: Places, other: Places, pairing: Pairing) -> np.float32:
     """Eq. (1) with weights: whole numbers to the end, then one division."""
     total = 0
     for j, reference in enumerate(query.references.tolist()):
-        for k in np.flatnonzero((other.references == reference) & (reference != NOBODY)):
+        for k in np.flatnonzero((other.references == reference) & (reference != NO_REFERENCE)):
             cells = TABLE[query.boxes[j][:, None], other.boxes[k][None]].astype(int)
             best, same = int(cells.max(axis=1).sum()), int(np.diag(cells).sum())
             alike = {"best": best, "same": same, "both": best + same}[pairing]
@@ -138,13 +138,13 @@ def test_references_beyond_the_library_and_places_without_any_share_nothing() ->
     rng = np.random.default_rng(6)
     places = _places(rng, 30, J=4, windows=4, library=9)
     known = places.references < 5
-    part = replace(places, references=np.where(known, places.references, NOBODY).astype(np.uint16))
+    part = replace(places, references=np.where(known, places.references, NO_REFERENCE).astype(np.uint16))
     smaller = places.index(5, "both")
     for row in range(30):
         np.testing.assert_array_equal(
             smaller.scores(places.place(row)), part.index(5, "both").scores(places.place(row))
         )
-    nobody = Places(np.full(4, NOBODY, np.uint16), np.zeros(4, np.uint8), np.full((4, 4), NOWHERE, np.uint8))
+    nobody = Places(np.full(4, NO_REFERENCE, np.uint16), np.zeros(4, np.uint8), np.full((4, 4), NO_BOX, np.uint8))
     assert not smaller.scores(nobody).any()
     assert len(smaller.query(nobody, 5).rows) == 0
 
@@ -153,7 +153,7 @@ def test_memory_is_told_to_the_byte() -> None:
     """A reference of a place: two bytes of row, its weight and its share, nine boxes; a place: its length."""
     rng = np.random.default_rng(7)
     places = _places(rng, 500, J=10, windows=9, library=20)
-    used = int((places.references != NOBODY).sum())
+    used = int((places.references != NO_REFERENCE).sum())
     assert places.index(20, "both").nbytes == used * (2 + 1 + 1 + 9) + 500 * 4 + 8 * 20 * 2
 
 

@@ -101,7 +101,7 @@ def test_agreement_counts_equal_bits(rows: list[bytes], query: int) -> None:
     signs = np.array([list(row) for row in rows], np.uint8)
     asked = signs[query % len(signs)]
     none = Place(np.zeros(0, np.uint16), np.zeros(0, np.uint8), np.zeros((0, 9), np.uint8))
-    _, agreement = signs_alone(signs).alike(HybridPlace(**vars(none), signs=asked))
+    _, agreement = signs_alone(signs).similarities(HybridPlace(**vars(none), signs=asked))
     differ = np.unpackbits(signs ^ asked, axis=1).mean(axis=1)
     expected = np.maximum(1 - 2 * differ, 0) * signs.any(axis=1) * asked.any()
     np.testing.assert_allclose(agreement, expected, atol=1e-6)
@@ -111,7 +111,7 @@ def test_a_score_is_both_similarities_in_their_shares(hybrid: HybridState, refer
     places = [hybrid.describe(row.features) for row in references]
     index, boxes = hybrid.index(places), hybrid.bobb.index(places)
     for place in places[:4]:
-        alone, words = index.alike(place)
+        alone, words = index.similarities(place)
         np.testing.assert_array_equal(alone, boxes.scores(place))
         np.testing.assert_allclose(
             index.scores(place), (1 - hybrid.share) * alone + hybrid.share * words, rtol=1e-6, atol=1e-7
@@ -122,7 +122,7 @@ def test_a_score_is_both_similarities_in_their_shares(hybrid: HybridState, refer
 def test_at_a_half_both_vary_alike_between_the_references(hybrid: HybridState, references: list[Reference]) -> None:
     places = [hybrid.describe(row.features) for row in references]
     index = hybrid.index(places)
-    alike = np.array([index.alike(place) for place in places])
+    alike = np.array([index.similarities(place) for place in places])
     boxes, words = (part[~np.eye(len(places), dtype=bool)].std() for part in alike.transpose(1, 0, 2))
     assert (1 - hybrid.share) * boxes == pytest.approx(hybrid.share * words, rel=1e-4)
     for share in (0.0, 1.0):

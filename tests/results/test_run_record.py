@@ -1,4 +1,4 @@
-"""Records hold what they were written with, or say that they do not; settings that are gone stop no reader."""
+"""Records hold what they were written with, or say that they do not."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from tests.results.example import make_run
 from tests.run.test_run_folder import written
-from vplog.errors import ResultError, SettingsError
+from vplog.errors import ResultError
 from vplog.logs import TopicChoice
 from vplog.pipeline import Pipeline
 from vplog.results.run_record import read_finished_run, read_run_json, write_run_json
@@ -20,15 +20,7 @@ from vplog.run.run_folder import staged_run
 from vplog.verbs.resume import resume_request
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
-
-    from conftest import Said
-
-
-def older(settings: dict[str, Any], keep: bool = False) -> dict[str, Any]:
-    """The settings as a vplog had them that knew directions without metres."""
-    return {**settings, "verify": {**settings["verify"], "direction": {"keep": keep, "rounds": 1000}}}
 
 
 def write_run(folder: Path, **changed: Any) -> dict[str, Any]:
@@ -78,22 +70,3 @@ def test_the_request_of_an_unfinished_run_has_a_checksum(tmp_path: Path) -> None
     request.write_text(request.read_text().replace('"rotation_deg": 10.0', '"rotation_deg": 11.0'))
     with pytest.raises(ResultError, match="checksum"):
         resume_request(out)
-
-
-@pytest.mark.parametrize("keep", [False, True])
-def test_a_setting_that_is_gone_and_was_off_stops_no_reader(
-    keep: bool, tmp_path: Path, verb: Callable[..., Said]
-) -> None:
-    """Of a finished run and of one to resume; one that was on cannot be had any more, and is named."""
-    settings = older(Pipeline().model_dump(mode="json"), keep)
-    account = write_run(tmp_path, settings=settings)
-    explained = verb("explain", tmp_path, "--closure", "0", "--no-picture", "--json")
-    (tmp_path / ".cache").mkdir()
-    write_run_json(tmp_path / ".cache" / "run.json", {**account, "finished": False})
-    if keep:
-        assert "direction is no setting" in explained.error
-        with pytest.raises(SettingsError, match="direction is no setting"):
-            resume_request(tmp_path)
-    else:
-        assert explained.json["closure"] == 0
-        assert resume_request(tmp_path).pipeline == Pipeline()

@@ -148,7 +148,7 @@ def test_a_gap_is_bridged(metric: bool) -> None:
     drive = draw(5, metric=metric, gap=(70, 80))
     result = found(drive)
     assert result.bridged == 1
-    assert result.odometry.breaks is not None and not len(result.odometry.breaks)
+    assert not len(result.odometry.breaks)
     assert (
         error_m(result.odometry.odom_from_body, drive.truth)
         < 2.0

@@ -102,7 +102,7 @@ def steps_off(odometry: Odometry) -> tuple[Floats, float]:
 def test_the_body_is_followed_and_steps_are_as_sure_as_their_covariance() -> None:
     odometry = odometry_of(scans())
     assert len(odometry.stamp_ns) == SCANS
-    assert odometry.breaks is not None and not len(odometry.breaks)
+    assert not len(odometry.breaks)
     off, way_m = steps_off(odometry)
     truth = world_from_body((odometry.stamp_ns[[0, -1]] - START_NS) / 1e9)
     end = se3.between(se3.between(*truth), se3.between(*odometry.odom_from_body[[0, -1]]))
@@ -129,7 +129,6 @@ def test_scans_that_match_nothing_are_passed_over_and_a_gap_begins_a_piece() -> 
     drive[12:] = [replace(scan, stamp_ns=scan.stamp_ns + 2 * 10**9) for scan in drive[12:]]
     odometry = odometry_of(drive)
     assert len(odometry.stamp_ns) == SCANS - 2
-    assert odometry.breaks is not None
     assert odometry.breaks.tolist() == [10]
     np.testing.assert_allclose(*odometry.odom_from_body[9:11])
     off, _ = steps_off(replace(odometry, stamp_ns=odometry.stamp_ns[:10], odom_from_body=odometry.odom_from_body[:10]))

@@ -106,7 +106,7 @@ def test_a_street_is_followed_in_a_unit_of_its_own() -> None:
     frames, truth = street()
     odometry = followed(frames)
     assert not odometry.metric
-    assert odometry.breaks is not None and not len(odometry.breaks)
+    assert not len(odometry.breaks)
     rows = np.searchsorted([frame.stamp_ns for frame in frames], odometry.stamp_ns)
     assert len(rows) >= FRAMES - 2
     at, known = odometry.odom_from_body[:, :3, 3], truth[rows, :3, 3]
@@ -142,7 +142,7 @@ def test_it_goes_on_as_another_piece() -> None:
     frames, _ = street()
     dark = [replace(frame, image=np.full_like(frame.image, 90)) for frame in frames]
     odometry = followed(frames[:6] + dark[6:14] + frames[14:])
-    assert odometry.breaks is not None and len(odometry.breaks) == 1
+    assert len(odometry.breaks) == 1
     at = int(odometry.breaks[0])
     np.testing.assert_allclose(odometry.odom_from_body[at - 1], odometry.odom_from_body[at])
 

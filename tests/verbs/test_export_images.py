@@ -22,7 +22,7 @@ from vplog.geometry import se3
 from vplog.loops.structure import points_of, tracks
 from vplog.loops.undistort import project
 from vplog.results import tables
-from vplog.results.colmap import lens
+from vplog.results.colmap import camera_model
 from vplog.results.run_record import read_single_run
 from vplog.verbs.export import export
 
@@ -186,7 +186,7 @@ def test_an_export_replaces_an_export_and_nothing_else(verb: Verb, finished: Pat
 )
 def test_colmap_projects_through_every_lens_as_we_do(model: str, distortion: list[float], expected: str) -> None:
     camera = Camera("c", K, model, np.array(distortion), 320, 200, np.eye(4))
-    name, parameters = lens(camera)
+    name, parameters = camera_model(camera)
     assert name == expected
     points = np.random.default_rng(0).uniform([-0.4, -0.3, 1], [0.4, 0.3, 1], (50, 3))
     theirs = colmap(
@@ -211,7 +211,7 @@ def test_colmap_projects_through_every_lens_as_we_do(model: str, distortion: lis
 )
 def test_a_lens_without_a_model_is_one_line(camera: Camera, message: str) -> None:
     with pytest.raises(ResultError, match=message):
-        lens(camera)
+        camera_model(camera)
 
 
 def test_tracks_join_matches_and_leave_out_what_joins_two_points() -> None:

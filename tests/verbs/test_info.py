@@ -55,7 +55,7 @@ def test_what_is_used_and_as_what(drive: Path) -> None:
     assert record["odometry"]["count"] == record["frames"]["count"] == FRAMES
     assert record["frames"]["rate_hz"] == record["odometry"]["rate_hz"] == 10.0
     assert record["gps"]["count"] == FRAMES - 1  # one message has no fix
-    assert record["skew_ms"]["/odom"] == pytest.approx(7.0)
+    assert record["clock_offset_ms"]["/odom"] == pytest.approx(7.0)
     image = next(topic for topic in record["topics"] if topic["name"] == "/cam/image/compressed")
     assert (image["pixels"], image["width"], image["height"], image["part"]) == ("png", 64, 48, "image")
     json.dumps(plain(record), allow_nan=False)

@@ -62,8 +62,8 @@ def run_batch(
 
     On this machine every job has all threads; over Ray they are the cores of a cluster of this machine. Without
     `library` the map's own is used, or one is built from the first logs. A drive whose worker dies is tried again; one
-    that fails is recorded and stops no other; every log's fate is in the answer. Where joining fails, `join_error` of
-    the answer says why (vplog/maps/joining). Raises VplogError where the map as a whole cannot be written or does not
+    that fails is recorded and stops no other. The answer has the outcome of every log; where joining fails, its
+    `join_error` says why (vplog/maps/joining). Raises VplogError where the map as a whole cannot be written or does not
     fit the library or the settings.
     """
     began, options = time.perf_counter(), options or BatchOptions()
@@ -94,14 +94,14 @@ def run_batch(
         each, concurrency = _divide_cores(workers, options.jobs, len(wanted))
         execution.progress("drives", len(done), len(plan))
         keep = options.join or options.keep_cache
-        like = Task("", "", store.staging, store.library(digest), pipeline, TopicChoice(), each, {}, None, keep)
+        template = Task("", "", store.staging, store.library(digest), pipeline, TopicChoice(), each, {}, None, keep)
         remote = root.url if isinstance(root, RemotePath) else ""
-        like = replace(like, time_s=options.drive_timeout_s, memory_mb=options.drive_memory_mb, remote=remote)
-        tasks = _tasks(store, wanted, like, longest_first=concurrency > 1)
+        template = replace(template, time_s=options.drive_timeout_s, memory_mb=options.drive_memory_mb, remote=remote)
+        tasks = _tasks(store, wanted, template, longest_first=concurrency > 1)
         places = None
         is_alone = len(known.keys() | {one.drive for one in plan}) < 2
         if options.join and tasks and not is_alone:  # while this process would only wait
-            places = background.submit(load_places, like.library, pipeline, execution)
+            places = background.submit(load_places, template.library, pipeline, execution)
         try:
             for ended in as_completed(workers, tasks, options):
                 found = done[ended[0].drive] = _publish(store, *ended)
@@ -198,14 +198,14 @@ def _clear_caches(store: Store) -> None:
 
 
 def _join(store: Store, *how: Any) -> tuple[dict[str, Any] | None, str]:
-    """The record of joining the map, or why it failed: the fates of drives are not lost for that."""
+    """The record of joining the map, or why it failed: the outcomes of drives are not lost with it."""
     try:
         return join_drives(store, *how), ""
     except (VplogError, OSError) as error:
         return None, str(error)
 
 
-def _tasks(store: Store, wanted: Sequence[PlannedDrive], like: Task, longest_first: bool) -> list[Task]:
+def _tasks(store: Store, wanted: Sequence[PlannedDrive], template: Task, longest_first: bool) -> list[Task]:
     """A task for each drive that is to be computed.
 
     With `longest_first` none of the long drives is begun when all others are done.
@@ -214,8 +214,8 @@ def _tasks(store: Store, wanted: Sequence[PlannedDrive], like: Task, longest_fir
     order = sorted(wanted, key=lambda one: -sizes[one.drive]) if longest_first else wanted
     return [
         replace(
-            like, drive=one.drive, log=one.given.url, topics=one.given.topics, record=one.record,
-            cache=_cache(store, one.drive), folder=like.folder / f"{os.getpid()}-{number}",
+            template, drive=one.drive, log=one.given.url, topics=one.given.topics, record=one.record,
+            cache=_cache(store, one.drive), folder=template.folder / f"{os.getpid()}-{number}",
             in_parts=len(wanted) == 1 or 2 * sizes[one.drive] > sum(sizes.values()),
         )
         for number, one in enumerate(order)

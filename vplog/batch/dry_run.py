@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vplog import logs
+from vplog.batch.log_hashes import BESIDE, hashes_beside
 from vplog.batch.plan import DriveInput, PlannedDrive, common_record, plan_drives, with_topics
 from vplog.batch.worker import made_by
 from vplog.errors import ResultError, VplogError
@@ -20,7 +21,7 @@ from vplog.pipeline import Pipeline
 from vplog.places.library_files import read_library_record
 from vplog.results import run_record
 from vplog.run.provenance import stat_of
-from vplog.storage.input_hashes import bytes_of, files_of
+from vplog.storage.input_hashes import bytes_of, files_of, hash_inputs
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.urls import shown
 
@@ -34,8 +35,8 @@ def dry_run(
 ) -> dict[str, Any]:  # fmt: skip
     """The drives of a batch, which of them it would compute, and bytes, images, CPU hours and cost of these.
 
-    A log whose place, length and times are those of a drive of the map counts as read. CPU hours are those of the map's
-    drives for as many images; `cpu_seconds_from` is how many drives say so. Raises VplogError.
+    A log whose place, length and times are those of a drive of the map is not read; files beside it are. CPU hours are
+    those of the map's drives for as many images; `cpu_seconds_from` is how many drives say so. Raises VplogError.
     """
     given = with_topics(inputs, topics)
     with map_store.reading(root) as store, ThreadPoolExecutor(execution.threads) as pool:
@@ -67,13 +68,17 @@ def dry_run(
 
 
 def _hashes(store: Store, drives: dict[str, str], given: DriveInput) -> dict[str, str] | str:
-    """Hashes of the files of a log, where it is as it was when its drive was computed; why it is no log."""
+    """Hashes of the files of a log and of those beside it, where the log is as it was when its drive was computed; why
+    it is no log."""
     try:
         logs.check(given.log)
         if drive := drives.get(shown(given.url)):
             known = run_record.read_run_json(store.file(drive, "run.json")).get("log_stat")
-            if known is None or known == stat_of(files_of(given.log)):
-                return store.record(drive)["inputs"]
+            if known == stat_of(files_of(given.log)):
+                own = {
+                    name: text for name, text in store.record(drive)["inputs"].items() if not name.startswith(BESIDE)
+                }
+                return own | hashes_beside(given.topics, hash_inputs)
     except ResultError:  # it is damaged, and computed again
         pass
     except VplogError as error:

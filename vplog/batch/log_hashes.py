@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
 from contextlib import suppress
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from pydantic import TypeAdapter
 
 from vplog import logs as all_logs
 from vplog.batch.plan import DriveInput
@@ -20,9 +22,12 @@ from vplog.storage.remote_path import RemotePath
 
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution
+    from vplog.logs import TopicChoice
 
 NAME = ".inputs.json"
 """Name of the record in the map: hidden, as it concerns the logs on this machine, not the map."""
+BESIDE = "beside "
+"""Prefix of the names of files beside a log."""
 _SETTLED_S = 3.0
 """A file written this short a time ago could be written again without a change of its times: some file systems count
 them in steps of two seconds."""
@@ -33,6 +38,9 @@ _PROGRESS_EVERY_S = 0.2
 """Interval of progress."""
 
 Hashes = dict[str, str]
+_Entry = dict[str, dict[str, str]]
+"""`stat`, the `stat_signature` of a log when it was read, and its `hashes`."""
+_ENTRIES = TypeAdapter(dict[str, _Entry])
 
 
 def known_hashes(logs: Sequence[DriveInput], record: Path, execution: Execution) -> list[Hashes | str]:
@@ -44,16 +52,16 @@ def known_hashes(logs: Sequence[DriveInput], record: Path, execution: Execution)
     progress is in MB read.
     """
     known = _read(record)
-    current: dict[str, dict[str, Any]] = {}
+    current: dict[str, _Entry] = {}
     done, total, stop = [0] * len(logs), [0] * len(logs), Event()
 
     def one(path: Path, number: int, is_log: bool) -> Hashes:
         if isinstance(path, RemotePath):
             return hash_inputs(path)
         name, stat = str(path.absolute()), stat_signature(path)
-        if name in known and known[name]["look"] == stat:
-            current[name] = known[name]
-            return known[name]["hashes"]
+        if (entry := known.get(name, {})).get("stat") == stat and "hashes" in entry:
+            current[name] = entry
+            return entry["hashes"]
 
         def read(count: int) -> None:
             done[number] += count
@@ -65,23 +73,17 @@ def known_hashes(logs: Sequence[DriveInput], record: Path, execution: Execution)
         began, total[number] = time.time(), total[number] + bytes_of(path)
         hashes = hash_inputs(path, read)
         if stat_signature(path) == stat and changed_s(path) < began - _SETTLED_S:
-            current[name] = {"look": stat, "hashes": hashes}
+            current[name] = {"stat": stat, "hashes": hashes}
         return hashes
 
     def of_log(given: DriveInput, number: int) -> Hashes | str:
-        path, beside = given.log, given.topics.files
         try:
-            found = [one(path, number, True), *(one(file, number, False) for file in beside.values())]
+            log = one(given.log, number, True)
+            return log | hashes_beside(given.topics, lambda file: one(file, number, False))
         except LogError as error:
             return str(error)
         except OSError as error:
-            return f"Cannot read {error.filename or path}: {error.strerror or error}."
-        names = [name if name.startswith("mask") else "" for name in beside]  # several may be called alike
-        return found[0] | {
-            " ".join(filter(None, ("beside", what, name))): text
-            for what, other in zip(names, found[1:], strict=True)
-            for name, text in other.items()
-        }
+            return f"Cannot read {error.filename or given.log}: {error.strerror or error}."
 
     with ThreadPoolExecutor(execution.threads) as pool:
         waiting = [pool.submit(of_log, log, number) for number, log in enumerate(logs)]
@@ -102,15 +104,18 @@ def known_hashes(logs: Sequence[DriveInput], record: Path, execution: Execution)
     return answers
 
 
-def _read(record: Path) -> dict[str, dict[str, Any]]:
-    """By log, its `stat` and its `hashes`; nothing where there is no such file, or another thing."""
+def hashes_beside(topics: TopicChoice, hashes_of: Callable[[Path], Hashes]) -> Hashes:
+    """sha256 of the files that topics name beside a log, by BESIDE and their names."""
+    return {
+        f"{BESIDE}{f'{what} ' if what.startswith('mask') else ''}{name}": text  # several masks may be called alike
+        for what, file in topics.files.items()
+        for name, text in hashes_of(file).items()
+    }
+
+
+def _read(record: Path) -> dict[str, _Entry]:
+    """The entry of each log; nothing where there is no such file, or another thing."""
     try:
-        known = read_run_json(record) if record.stat().st_size <= _MOST_BYTES else {}
-    except (OSError, ResultError):
+        return _ENTRIES.validate_python(read_run_json(record) if record.stat().st_size <= _MOST_BYTES else {})
+    except (OSError, ValueError, ResultError):
         return {}
-
-    def sound(about: Any) -> bool:
-        parts = [about.get("look"), about.get("hashes")] if isinstance(about, dict) else [None]
-        return all(isinstance(part, dict) and all(isinstance(text, str) for text in part.values()) for part in parts)
-
-    return {name: about for name, about in known.items() if sound(about)}

@@ -17,8 +17,8 @@ from vplog.batch.plan import DriveInput
 from vplog.batch.worker import DriveState
 from vplog.errors import LogError, SettingsError
 from vplog.execution.execution import Execution
+from vplog.logs.image_folder import natural_order
 from vplog.maps.import_places import PLACES_ONLY
-from vplog.maps.merge import natural_order
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import skip_damaged
 from vplog.maps.storage.damage import reading_drive
@@ -51,7 +51,7 @@ def redescribe_map(
         _bring_caches(store.root, target)
     outcomes, missing, joined, join_error = [], damaged, None, ""
     inputs = dict[str, DriveInput]()
-    for drive in natural_order(drives):
+    for drive in sorted(drives, key=natural_order):
         log = drives[drive]["log"]
         try:
             if PLACES_ONLY in drives[drive]:

@@ -198,6 +198,7 @@ def _write_pictures(task: Task, path: Path, log: Log, execution: Execution) -> d
     rows, names = np.searchsorted(log.stamps(), stamps).tolist(), log.file_names() or []
     account = {
         "log": task.record["log"],
+        "log_stat": provenance.stat_of([path]),
         "inputs": hash_inputs(path),
         "topics": task.topics.model_dump(mode="json"),
         "library": {"hash": state.hash, "from": provenance.library_of(task.library)},

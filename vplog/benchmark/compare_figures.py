@@ -12,6 +12,7 @@ from vplog.benchmark.answers import file_stem
 from vplog.data import Bytes, Float32s, Floats, Ints
 from vplog.evaluate.open_set import reliability_of_matches
 from vplog.evaluate.retrieval import Ranks, Reliability, average_precision, precision_recall, recall_at
+from vplog.places.vocabulary import spread_rows
 from vplog.run.figures.canvas import as_text, saved_figure
 from vplog.storage.image_file import decode_image
 
@@ -86,19 +87,19 @@ class Figures:
                 )  # fmt: skip
                 sides = (picture(self.query, query), picture(self.map, given), picture(self.map, right))
                 for one, text, image in zip(axes, texts, sides, strict=False):
-                    one.set_title(as_text(_end(text)), fontsize=7, y=1.0)  # nothing to look for its place among
+                    one.set_title(as_text(_shortened(text)), fontsize=7, y=1.0)  # nothing to look for its place among
                     one.axis("off")
                     if image is not None:
                         one.imshow(image, cmap="gray", vmin=0, vmax=255)
 
 
-def _end(text: str, most: int = 44) -> str:
-    """The end of a long title, where names differ."""
+def _shortened(text: str, most: int = 44) -> str:
+    """A long title without its middle: names differ towards their end."""
     return text if len(text) <= most else f"{text[: most // 3]}...{text[-(2 * most // 3 - 3) :]}"
 
 
 def picture(traversal: Traversal, row: int) -> Bytes | None:
-    """The small grey picture of a frame; None for no row."""
+    """The small grey picture (H, W) of a frame; None where `row` is negative."""
     return None if row < 0 else np.asarray(decode_image(traversal.store.picture(row)), np.uint8)
 
 
@@ -108,13 +109,13 @@ def queries_shown(ranks: Ranks) -> Ints:
     answered = ranks.top_row >= 0
     if not ranks.positive.any():
         rows = np.flatnonzero(answered)
-        return rows[np.unique(np.linspace(0, len(rows) - 1, min(_SHOWN, len(rows))).astype(int))]
+        return rows[spread_rows(len(rows), _SHOWN)]
     # among rows of equal score the first may be right, and counts by halves
     wrong = np.flatnonzero(answered & (ranks.top_true <= 0.5) & (ranks.top_row != ranks.true_row))
     wrong = wrong[np.argsort(-ranks.top_score[wrong], kind="stable")]
-    missed, nowhere = wrong[ranks.positive[wrong]], wrong[~ranks.positive[wrong]]
-    few = min(len(nowhere), max(_SHOWN // 3, _SHOWN - len(missed)))
-    return np.concatenate([missed[: _SHOWN - few], nowhere[:few]])
+    missed, unmatched = wrong[ranks.positive[wrong]], wrong[~ranks.positive[wrong]]
+    few = min(len(unmatched), max(_SHOWN // 3, _SHOWN - len(missed)))
+    return np.concatenate([missed[: _SHOWN - few], unmatched[:few]])
 
 
 def reduced(scores: Float32s) -> Floats:

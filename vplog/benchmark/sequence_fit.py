@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vplog.places.vocabulary import spread_rows
+
 if TYPE_CHECKING:
     from vplog.evaluate.pairs import Pairs
     from vplog.places.sequence import SequenceSettings
@@ -25,7 +27,7 @@ def sequence_warning(pairs: Pairs, settings: SequenceSettings, has_truth: bool) 
     if not has_truth:
         return [f"{length} assumes that query and map advance alike, frame by frame; only a truth checks that."]
     queries = np.flatnonzero(pairs.positive)
-    queries = queries[np.unique(np.linspace(0, len(queries) - 1, min(_TRIED, len(queries))).astype(int))]
+    queries = queries[spread_rows(len(queries), _TRIED)]
     shares = np.array(
         [share for query in queries.tolist() if (share := _on_a_line(pairs, query, settings)) is not None]
     )

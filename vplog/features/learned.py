@@ -81,7 +81,8 @@ class OnnxFeatureSettings(NetworkSettings):
         )
 
     def _paired(self, points: NDArray[Any], descriptors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """(N, 2) and (N, D)."""
+        """Points (N, 2) and descriptors (N, D), which a network may give as (D, N). Raises LibraryError for other
+        shapes or types, and values that are not finite."""
         if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
             raise self._wrong("points", points)
         if descriptors.ndim == 2 and len(descriptors) != len(points):

@@ -61,8 +61,6 @@ def edge_covariance(
 
 def broken_edges(odometry: Odometry, keyframe_stamp_ns: Ints) -> Ints:
     """Edges, by the row of their earlier keyframe, within which the odometry breaks."""
-    if odometry.breaks is None or not len(odometry.breaks):
-        return np.zeros(0, np.int64)
     edges = np.searchsorted(keyframe_stamp_ns, odometry.stamp_ns[odometry.breaks], "left") - 1
     return np.unique(edges[(edges >= 0) & (edges < len(keyframe_stamp_ns) - 1)])
 

@@ -1,7 +1,7 @@
 """Clock steps of header stamps, found against the log times and removed.
 
 The log time is late by the transport but steady: between two messages of a topic both should advance alike, and their
-difference, the skew, stays at one level.
+difference, the offset, stays at one level.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _LEAST_RUN = 5
 STEP_PERIODS = 3
 """A step back is at least so many periods of the topic: less is within what messages come out of order by."""
 _LEVEL = 30
-"""Messages before and behind a step by which the skew is known: a burst is over by then."""
+"""Messages before and behind a step by which the offset is known: a burst is over by then."""
 LEAST_STEP_NS = 128_000_000
 """ns; a smaller offset NTP slews, a larger one it steps (RFC 5905, STEPT)."""
 GAP_NS = 10**9
@@ -43,7 +43,7 @@ _MOST_CLOCKS = 20
 class Clock:
     """The clock of a topic's header stamps, by the log times, and the time its stamps cover."""
 
-    skew_ns: int
+    offset_ns: int
     """Log time less header stamp, the median."""
     first_ns: int
     last_ns: int
@@ -57,21 +57,21 @@ class AlignedStamps:
     """(M,) in file order."""
     valid: np.ndarray
     """(M,) bool, false for outliers, whose time is not known."""
-    skew_ns: int
-    """Skew of the clock that all are on."""
+    offset_ns: int
+    """Offset of the clock that all are on."""
     jumps_ns: list[int]
     """By how much the header's clock was set each time; the stamps behind are shifted back by as much."""
     log_jumps: int
     """Times that the recorder's clock was set; the stamps are right without it."""
     unclear_ns: list[int]
-    """By how much the skew changes over gaps, where the clock may have been set or the messages be later since."""
+    """By how much the offset changes over gaps, where the clock may have been set or the messages be later since."""
     counts: dict[int, int]
-    """Messages by the skew of the clock that they came on."""
+    """Messages by the offset of the clock that they came on."""
 
 
 def align_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None) -> AlignedStamps | None:
     """The header stamps without jumps of their clock; None where they follow no clock. Both (M,) in ns, M >= 1. Of
-    several clocks, `reference_ns` is the skew of the one to end on; None takes that of most messages."""
+    several clocks, `reference_ns` is the offset of the one to end on; None takes that of most messages."""
     step, log_step = np.diff(header_ns), np.diff(log_ns)
     period = float(np.median(np.minimum(np.abs(step), np.abs(log_step)))) if len(step) else 0.0
     jump_ns = max(LEAST_JUMP_NS, _PERIODS * period)
@@ -84,17 +84,17 @@ def align_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None) 
     for run, clock in zip(runs, clocks, strict=True):
         if clock is not None:
             counts[clock] += run.stop - run.start
-    chosen = max(counts, key=lambda skew: (counts[skew], -skew))
+    chosen = max(counts, key=lambda offset: (counts[offset], -offset))
     if reference_ns is not None and len(counts) > 1:
-        near = min(counts, key=lambda skew: (abs(skew - reference_ns), skew))
+        near = min(counts, key=lambda offset: (abs(offset - reference_ns), offset))
         chosen = near if abs(near - reference_ns) <= limit else reference_ns
     stamp_ns, valid = header_ns.copy(), np.zeros(len(header_ns), bool)
     for number, run in enumerate(runs):
-        skew = _skew_of(int(np.median(log_ns[run] - header_ns[run])), clocks, number, limit)
-        if skew is not None:
-            shifted = [int(extreme) + skew - chosen for extreme in (header_ns[run].min(), header_ns[run].max())]
+        offset = _offset_of(int(np.median(log_ns[run] - header_ns[run])), clocks, number, limit)
+        if offset is not None:
+            shifted = [int(extreme) + offset - chosen for extreme in (header_ns[run].min(), header_ns[run].max())]
             valid[run] = min(shifted) >= 0 and max(shifted) < 2**63
-            stamp_ns[run] += skew - chosen if valid[run.start] else 0
+            stamp_ns[run] += offset - chosen if valid[run.start] else 0
     order = [clock for clock in clocks if clock is not None]
     jumps = [before - behind for before, behind in pairwise(order) if before != behind]
     log_jumps = _log_jumps(header_ns, log_ns, jump_ns)
@@ -115,20 +115,20 @@ def _runs(header_ns: Ints, log_ns: Ints, least_ns: float) -> tuple[list[slice], 
 def _levels(
     header_ns: Ints, log_ns: Ints, least_ns: float
 ) -> tuple[list[slice], list[int | None], float, list[int]] | None:
-    """Runs of messages between steps of `least_ns` or more, the skew of the clock that each is on (None of runs too
-    short to show one), half the least step, and the ns by which the skew changes over gaps by no more than messages may
-    be late; None where the skew stays at no level. The clock of a run is another than that before where the skew stays
-    at another level, by more than it varies."""
+    """Runs of messages between steps of `least_ns` or more, the offset of the clock that each is on (None of runs too
+    short to show one), half the least step, and the ns by which the offset changes over gaps by no more than messages
+    may be late; None where the offset stays at no level. The clock of a run is another than that before where the
+    offset stays at another level, by more than it varies."""
     runs, gaps = _runs(header_ns, log_ns, least_ns)
-    skew, lengths = log_ns - header_ns, [run.stop - run.start for run in runs]
+    offset, lengths = log_ns - header_ns, [run.stop - run.start for run in runs]
     least = min(_LEAST_RUN, max(lengths))
-    if least_ns < LEAST_JUMP_NS and sum(length for length in lengths if length < least) * _SHORT > len(skew):
+    if least_ns < LEAST_JUMP_NS and sum(length for length in lengths if length < least) * _SHORT > len(offset):
         return None
     levels: list[list[Ints]] = []
     sizes, unclear = [2 * max(LEAST_JUMP_NS, least_ns)], []
     place: list[int | None] = []
     for run in runs:
-        own = skew[run]
+        own = offset[run]
         if len(own) < least:
             place.append(None)
             continue
@@ -153,15 +153,15 @@ def _levels(
 
 
 def _change(before_ns: Ints, behind_ns: Ints) -> float:
-    """By how much the median of the skew changes; 0 where it varies by as much."""
+    """By how much the median of the offset changes; 0 where it varies by as much."""
     low, level, high = np.transpose([np.quantile(window, (0.1, 0.5, 0.9)) for window in (before_ns, behind_ns)])
     change = float(level[1] - level[0])
     return change if abs(change) > 2 * float((high - low).max()) else 0.0
 
 
-def _skew_of(own: int, clocks: list[int | None], number: int, limit: float) -> int | None:
-    """The skew that a run is shifted by: that of its clock, or of a neighbouring one that it is late on; its own where
-    the clock was set before and behind it; None for outliers."""
+def _offset_of(own: int, clocks: list[int | None], number: int, limit: float) -> int | None:
+    """The offset that a run is shifted by: that of its clock, or of a neighbouring one that it is late on; its own
+    where the clock was set before and behind it; None for outliers."""
     clock = clocks[number]
     if clock is not None:
         return clock

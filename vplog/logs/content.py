@@ -49,7 +49,7 @@ class LogContent:
     """Frame, stamps (K,), and (K, 6) rates in rad/s and accelerations in m/s^2 of the IMU beside images that give the
     odometry."""
     tree: FrameTree
-    skew_ms: dict[str, float]
+    clock_offset_ms: dict[str, float]
     """By topic: log time less header stamp, the median."""
     chosen: Selection
     """With the source that the odometry was taken from."""
@@ -147,6 +147,6 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     right_calibration = next(iter(read.calibrations(chosen.right_info, "right", notes)), None)
     return LogContent(
         stamp_ns, places, read.images["image"].stream, rows, scan_ns, scan_places, companions, calibrations,
-        right_calibration, odometry, frames, gps, imu, tree, read.skew_ms(), chosen, [source for source, _ in sources],
-        rates_hz,
+        right_calibration, odometry, frames, gps, imu, tree, read.clock_offset_ms(), chosen,
+        [source for source, _ in sources], rates_hz,
     )  # fmt: skip

@@ -232,9 +232,9 @@ class TopicCollector:
             track.set_xyz()
         return [*(stamps for _, stamps in self.stamps()), *self._others.values(), *self.dynamic.stamps()]
 
-    def skew_ms(self) -> dict[str, float]:
+    def clock_offset_ms(self) -> dict[str, float]:
         """Log time less header stamp of each topic whose stamps follow a clock, the median."""
-        return {topic: skew / 1e6 for topic, stamps in self.stamps() if (skew := stamps.skew_ns()) is not None}
+        return {topic: offset / 1e6 for topic, stamps in self.stamps() if (offset := stamps.offset_ns()) is not None}
 
     def rates_hz(self) -> dict[Channel, float | None]:
         """Messages a second of each topic that was read, by its own times."""

@@ -61,8 +61,9 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def natural_order(name: str) -> tuple:
-    """Sorts `2.png` before `10.png`."""
-    return tuple((int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", name))
+    """Key that sorts `2.png` before `10.png`, whatever the length of a number."""
+    parts = ((part.lstrip("0"), part.isdecimal()) for part in re.split(r"([0-9]+)", name))
+    return tuple((len(part), part) if number else (-1, part) for part, number in parts)
 
 
 def stamps_of(names: list[str]) -> list[int] | None:

@@ -84,7 +84,7 @@ class RecordedLog:
         end_ns = max((int(track.stamp_ns[-1]) for track in tracks), default=self._contents.end_ns)
         return LogInfo(
             str(self._path), self._kind, start_ns, end_ns, self._contents.messages, topics, self.warnings,
-            [frame for frame in content.frames if frame], content.skew_ms, content.sources, self._truth_name,
+            [frame for frame in content.frames if frame], content.clock_offset_ms, content.sources, self._truth_name,
         )  # fmt: skip
 
     def _topic(self, channel: Channel, count: int, others: list[str]) -> Topic:

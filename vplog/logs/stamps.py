@@ -66,10 +66,10 @@ class Stamps:
         self.header_ns.extend(header_ns)
         self.log_ns.extend([min(time_ns, _LAST_NS) for time_ns in log_ns])
 
-    def skew_ns(self) -> int | None:
+    def offset_ns(self) -> int | None:
         """Log time less header stamp, the median; None where the header stamps follow no clock."""
         found = self._aligned()
-        return found.skew_ns if found is not None and found.valid.any() else None
+        return found.offset_ns if found is not None and found.valid.any() else None
 
     def positions(self) -> Ints:
         """(M,) where the messages lie among all of the file, in its order."""
@@ -81,7 +81,7 @@ class Stamps:
         self.log_ns, self._found = array("q", (np.minimum(log_ns, _LAST_NS - by_ns) + by_ns).tolist()), None
 
     def clocks(self) -> dict[int, int]:
-        """Messages by the skew of the clock that they came on; several where it was set."""
+        """Messages by the offset of the clock that they came on; several where it was set."""
         found = self._aligned()
         return {} if found is None else found.counts
 
@@ -112,7 +112,7 @@ class Stamps:
         _lose("no_stamp", topic, ~stamped, log_ns, notes)
         if why := _no_clock(header_ns[rows], log_ns[rows]):
             return self._by_log_times(topic, notes, why)
-        common_ns = self.common.skew_ns if self.common else None
+        common_ns = self.common.offset_ns if self.common else None
         found = align_clock(header_ns[rows], log_ns[rows], common_ns)
         if found is None:
             return self._by_log_times(topic, notes, "has header stamps that follow no clock")
@@ -130,7 +130,7 @@ class Stamps:
             )
         _lose("stray_stamp", topic, ~found.valid, log_ns[rows], notes)
         rows, stamp_ns = rows[found.valid], found.stamp_ns[found.valid]
-        stamp_ns = _on_common(stamp_ns, found.skew_ns, self.common, topic, notes)
+        stamp_ns = _on_common(stamp_ns, found.offset_ns, self.common, topic, notes)
         return _in_order(topic, notes, stamp_ns, rows, log_ns)
 
     def _by_log_times(self, topic: str, notes: Notes, why: str) -> tuple[Ints, Ints]:
@@ -175,24 +175,24 @@ def set_common_clock(topics: Iterable[Stamps]) -> None:
     pooled: dict[int, int] = {}
     steady = [one for one in topics if len(one.clocks()) == 1]
     for one in steady or topics:  # a clock that was set is moved to one that was not
-        for skew, count in sorted(one.clocks().items()):
-            known = next((other for other in pooled if abs(other - skew) <= LEAST_JUMP_NS), skew)
+        for offset, count in sorted(one.clocks().items()):
+            known = next((other for other in pooled if abs(other - offset) <= LEAST_JUMP_NS), offset)
             pooled[known] = pooled.get(known, 0) + count
     if not pooled:
         return
-    skew_ns = max(pooled, key=lambda skew: (pooled[skew], -skew))
-    covered = [one for one in topics if any(abs(skew - skew_ns) <= LEAST_JUMP_NS for skew in one.clocks())]
-    log_ns = [int(ns) - skew_ns for one in covered for ns in (min(one.log_ns), max(one.log_ns))]
+    offset_ns = max(pooled, key=lambda offset: (pooled[offset], -offset))
+    covered = [one for one in topics if any(abs(offset - offset_ns) <= LEAST_JUMP_NS for offset in one.clocks())]
+    log_ns = [int(ns) - offset_ns for one in covered for ns in (min(one.log_ns), max(one.log_ns))]
     for one in topics:
-        one.common = Clock(skew_ns, min(log_ns), max(log_ns))
+        one.common = Clock(offset_ns, min(log_ns), max(log_ns))
 
 
-def _on_common(stamp_ns: Ints, skew_ns: int, common: Clock | None, topic: str, notes: Notes) -> Ints:
+def _on_common(stamp_ns: Ints, offset_ns: int, common: Clock | None, topic: str, notes: Notes) -> Ints:
     """Stamps of another clock than the common one moved to it by the log times, where they cover no time of it; where
     they do, they may be right and only recorded late."""
-    if common is None or not len(stamp_ns) or abs(skew_ns - common.skew_ns) <= LATE_NS:
+    if common is None or not len(stamp_ns) or abs(offset_ns - common.offset_ns) <= LATE_NS:
         return stamp_ns
-    shift = skew_ns - common.skew_ns
+    shift = offset_ns - common.offset_ns
     first_ns, last_ns = int(stamp_ns.min()), int(stamp_ns.max())
     apart = first_ns > common.last_ns or last_ns < common.first_ns
     if not apart or first_ns + shift < 0 or last_ns + shift > _LAST_NS:

@@ -202,57 +202,78 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     _check_mask_topics(candidates, choice)
     candidates = sorted(candidates, key=lambda c: (-c.count, c.channel))
     usable, pick = [c for c in candidates if c.count], partial(_pick, candidates, choice, log)
-
-    def as_image(c: Candidate) -> tuple:
-        info = _calibration(c, usable)
-        sixteen_bits = c.encoding.startswith("16UC1")  # a thermal camera comes behind one that sees
-        is_right, backward = _partner(c, usable, back=True) is not None, bool(_BACKWARD.search(c.channel.topic))
-        return not c.supported, sixteen_bits, not (info and info.calibrated), is_right, backward
-
-    image = pick("image", "depth", as_image)
+    image = pick("image", "depth", lambda c: _image_order(c, usable))
     for topic in choice.cameras or ():
         _pick(candidates, choice.of_camera(topic), log, "image", "depth")  # raises where it is not there
-    depth = calibration = right = right_info = None
-    if image is not None:
-        if choice.depth is not None or not choice.right:
-            depth = pick("depth", "image", lambda c: (c.frame != image.frame, -_shared(c, image)), image)
-        right = pick("right", image=image) if choice.right is not None else _partner(image, usable)
-        if right is not None and depth is not None:
-            if choice.right and choice.depth:
-                raise LogError(
-                    f"{log}: depth comes from {choice.depth} or from the pair {image.channel.topic} and "
-                    f"{choice.right}, not both. Leave out --depth-topic or --right-topic."
-                )
-            right = None
-        if choice.calibration_file is None:
-            right_info = _calibration(right, usable) if right is not None else None
-            calibration = _calibration(image, usable) if choice.camera_info is None else pick("camera_info")
+    found = {"image": image} | ({} if image is None else _of_image(image, usable, choice, log, pick))
     if image is not None and choice.mask is None:
         choice = choice.model_copy(update={"mask": choice.mask_topics.get(image.channel.topic)})
-    mask = _pick(candidates, choice, log, "mask", "depth", image=image) if choice.mask else None
-    requested_name = choice.odometry if choice.odometry_file is None else ""
-    clouds = [c for c in usable if c.role == "lidar"]
-    scanned = [c for c in clouds if c.channel.topic == requested_name]
-    named = bool(scanned) or (requested_name in SOURCES and all(c.channel.topic != requested_name for c in candidates))
-    kind = "lidar" if scanned else "" if requested_name is None else requested_name if named else "topic"
-    requested = pick("odometry", "tf") if requested_name and not named else None
+    if choice.mask:
+        found["mask"] = _pick(candidates, choice, log, "mask", "depth", image=image)
+    kind = _odometry_kind(candidates, choice)
+    requested = pick("odometry", "tf") if kind == "topic" and choice.odometry_file is None and choice.odometry else None
     geometry = {c.channel: factors for c in candidates if (factors := _geometry(c, choice))}
     sources = _sources(usable, kind, requested, geometry)
     turned = kind == "twist" or all(short_type(c.channel.type) in (*TWISTS, *GEOMETRY) for c in sources)
-    computed = image is not None and choice.odometry_file is None and (kind == "visual" or not (sources or kind))
-    imu = pick("imu") if (sources and turned) or computed else None
-    gps = pick("gps", key=lambda c: short_type(c.channel.type) == NMEA)
-    lidar = None
+    visual = image is not None and choice.odometry_file is None and (kind == "visual" or not (sources or kind))
+    found["odometry"], found["imu"] = requested, pick("imu") if (sources and turned) or visual else None
+    found["gps"] = pick("gps", key=lambda c: short_type(c.channel.type) == NMEA)
     if kind == "lidar" or (not kind and all(c.role == "tf" for c in sources)):
-        lidar = min(scanned or clouds, key=lambda c: bool(_NO_LIDAR.search(c.channel.topic)), default=None)
-    each = zip(_PARTS, (image, depth, calibration, requested, gps, right, right_info, imu, mask, lidar), strict=True)
-    found = {part: c.channel for part, c in each if c is not None}
+        found["lidar"] = _lidar(usable, choice)
     static = tuple(sorted(c.channel for c in candidates if c.role == "tf_static"))
     moving = tuple(c.channel for c in usable if c.role == "tf")
     tf = moving if not static or any(c.role == "tf" for c in sources) else ()
+    channels = {part: c.channel for part, c in found.items() if c is not None}
     return Selection(
-        **found, sources=tuple(c.channel for c in sources), tf_static=static, tf=tf, kind=kind, geometry=geometry
+        **channels, sources=tuple(c.channel for c in sources), tf_static=static, tf=tf, kind=kind, geometry=geometry
     )
+
+
+def _image_order(c: Candidate, usable: list[Candidate]) -> tuple[bool, ...]:
+    """Sorts the image topics: those that decode and are calibrated first, left before right, forward before back."""
+    info = _calibration(c, usable)
+    sixteen_bits = c.encoding.startswith("16UC1")  # a thermal camera comes behind one that sees
+    is_right, backward = _partner(c, usable, back=True) is not None, bool(_BACKWARD.search(c.channel.topic))
+    return not c.supported, sixteen_bits, not (info and info.calibrated), is_right, backward
+
+
+def _of_image(
+    image: Candidate, usable: list[Candidate], choice: TopicChoice, log: str, pick: Callable[..., Candidate | None]
+) -> dict[str, Candidate | None]:
+    """Depth or right images of a camera, and its calibrations. Raises LogError where both are named."""
+    depth = None
+    if choice.depth is not None or not choice.right:
+        depth = pick("depth", "image", lambda c: (c.frame != image.frame, -_shared(c, image)), image)
+    right = pick("right", image=image) if choice.right is not None else _partner(image, usable)
+    if right is not None and depth is not None:
+        if choice.right and choice.depth:
+            raise LogError(
+                f"{log}: depth comes from {choice.depth} or from the pair {image.channel.topic} and {choice.right}, "
+                "not both. Leave out --depth-topic or --right-topic."
+            )
+        right = None
+    if choice.calibration_file is not None:
+        return {"depth": depth, "right": right}
+    right_info = _calibration(right, usable) if right is not None else None
+    info = _calibration(image, usable) if choice.camera_info is None else pick("camera_info")
+    return {"depth": depth, "right": right, "right_info": right_info, "camera_info": info}
+
+
+def _odometry_kind(candidates: list[Candidate], choice: TopicChoice) -> str:
+    """`Selection.kind`: the one of SOURCES that is requested, `topic` of a topic or a file, empty without a request."""
+    if choice.odometry is None and choice.odometry_file is None:
+        return ""
+    named = [c for c in candidates if c.channel.topic == choice.odometry]
+    if any(c.role == "lidar" and c.count for c in named):
+        return "lidar"
+    return choice.odometry if choice.odometry in SOURCES and not named else "topic"
+
+
+def _lidar(usable: list[Candidate], choice: TopicChoice) -> Candidate | None:
+    """The lidar requested as odometry, else the one with most scans that is no depth camera by its name."""
+    clouds = [c for c in usable if c.role == "lidar"]
+    requested = [c for c in clouds if c.channel.topic == choice.odometry]
+    return min(requested or clouds, key=lambda c: bool(_NO_LIDAR.search(c.channel.topic)), default=None)
 
 
 def further_cameras(

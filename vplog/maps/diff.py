@@ -34,7 +34,7 @@ class _Content:
 
 
 def diff_maps(baseline: Path, run: Path) -> dict[str, Any]:
-    """The differences of the map in a folder from the one in `baseline`, as `vplog.verbs.diff.diff` tells it of runs.
+    """The differences of the map in a folder from the one in `baseline`, in the form of `vplog.verbs.diff.diff`.
 
     Closures are pairs of `DRIVE/STAMP`; `drives` names those gained and lost. The poses of keyframes are compared where
     both maps have the drive, those of one joint frame aligned together. Raises ResultError.
@@ -77,8 +77,7 @@ def _content(store: Store) -> _Content:
     own = len(closures)
     for component in dict.fromkeys(one.folder.name for one in joint.values()):
         path = store.root / "joint" / component / "joins.parquet"
-        if store.mirror is not None:
-            store.mirror.rest([path.relative_to(store.root).as_posix()])
+        store.fetch_beside([path.relative_to(store.root).as_posix()])
         for (query, match), ledger in tables.read_joins(path).items():
             closures |= _pairs(ledger, query, match, stamps)
     frame = {drive: joint[drive].drives[0] if drive in joint else drive for drive in abouts}

@@ -130,7 +130,7 @@ class DriveBounds:
         return within, [f"Not searched: {without}"] if unplaced else []
 
     def near(self, number: int, radius_m: float) -> NDArray[np.bool_]:
-        """(N,) which drives may be so near to one; those without a place on earth may be, and all to one of these."""
+        """(N,) which drives may be within `radius_m` of one. Drives without a georeference may be near to any."""
         south, west, north, east = self._bounds[number].tolist()
         if math.isnan(south):
             return np.ones(len(self.names), bool)

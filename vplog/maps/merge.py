@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import Any
 
 from vplog.errors import LibraryError, ResultError, SettingsError, nearest_path
 from vplog.execution.execution import Execution
+from vplog.logs.image_folder import natural_order
 from vplog.maps.import_places import PLACES_ONLY, drives_of_file, import_places_of
 from vplog.maps.joining.drive_pairs import DRIVE_FILES
 from vplog.maps.storage import layout, map_store
@@ -29,8 +29,8 @@ from vplog.storage.scratch import copy_folder
 def merge_maps(
     sources: Sequence[Path], target: Path, execution: Execution = Execution(), chosen: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Take the drives of maps, or those `chosen`, into `target`, which is made where it is not there; the fate of each.
-    Of a file that `vplog map export` wrote it takes the places, if the target has their library or gets it.
+    """Take the drives of maps, or those `chosen`, into `target`, which is made where it is not there; the outcome for
+    each. Of a file that `vplog map export` wrote it takes the places, if the target has their library or gets it.
 
     Maps in the order given, the drives of each in order of their IDs. One whose log is in the map already, by its
     content, is left out; one whose ID is taken gets a number. Each is in whole or not at all, so a merge that was
@@ -54,7 +54,7 @@ def merge_maps(
                 continue
             _, drives = map_store.common_library(source)
             copy_library(store, source, library)
-            for drive in natural_order(drives.keys() & set(chosen) if chosen else drives):
+            for drive in sorted(drives.keys() & set(chosen) if chosen else drives, key=natural_order):
                 taken = _merge_drive(store, source, drives[drive], known, by_content)
                 outcomes += [] if taken is None else [taken]
                 execution.progress(f"merge {number} of {len(sources)}", len(outcomes), len(outcomes))
@@ -109,7 +109,9 @@ def _check_chosen(sources: Sequence[Store | Path], chosen: Sequence[str]) -> Non
         else:
             known |= source.drives().keys() | source.damaged.keys()
     if unknown := [drive for drive in chosen if drive not in known]:
-        raise SettingsError(f"No map given has a drive {unknown[0]!r}. Drives: {', '.join(natural_order(known))}.")
+        raise SettingsError(
+            f"No map given has a drive {unknown[0]!r}. Drives: {', '.join(sorted(known, key=natural_order))}."
+        )
 
 
 def copy_library(store: Store, other: Store, library: str) -> None:
@@ -132,7 +134,7 @@ def put_library(store: Store, made: Path, library: str, settings: dict[str, Any]
 def _merge_drive(
     store: Store, other: Store, record: dict[str, Any], known: dict[str, dict[str, Any]], by_content: dict[str, str]
 ) -> dict[str, Any] | None:
-    """Take one drive; its fate, None where it is damaged. A whole one replaces its places alone. `known` and
+    """Take one drive; the outcome, None where it is damaged. A whole one replaces its places alone. `known` and
     `by_content` are the drives of the target, and those that come."""
     drive = record["drive"]
     entry = {"from": str(other), "drive": drive, "as": drive, "log": record["log"]}
@@ -148,14 +150,7 @@ def _merge_drive(
         other.damaged[drive] = wrong[0]
         return None
     taken, made = same or layout.free_name(drive, record["log"], known), store.staging / f"{os.getpid()}-merge"
-
-    def copied(_: Path) -> None:
-        shutil.rmtree(made, ignore_errors=True)
-        ignored = shutil.ignore_patterns("drive.json")  # it comes last: what has it is whole
-        what = f"{drive} of {other} to {store}"
-        copy_folder(other.full_run(drive), made, what, copy_function=layout.link, ignore=ignored)
-
-    other.read(drive, copied, ())
+    copy_run(other, drive, store, made)
     if taken != drive:
         layout.set_drive_id(made / "keyframes.parquet", taken)
     _link_join_inputs(other, drive, store, taken)  # what has a drive.json is put in by the next writer
@@ -167,6 +162,19 @@ def _merge_drive(
     other.evict(drive)
     known[taken], by_content[_content(record)] = record, taken
     return {**entry, "as": taken, "state": "taken"}
+
+
+def copy_run(store: Store, drive: str, new: Store, made: Path) -> None:
+    """Make a copy of a drive's run folder, of links where there may be, in the staging of a new map. Raises
+    ResultError."""
+
+    def copied(_: Path) -> None:
+        shutil.rmtree(made, ignore_errors=True)
+        ignored = shutil.ignore_patterns("drive.json")  # it comes last: what has it is whole
+        what = f"{drive} of {store} to {new}"
+        copy_folder(store.full_run(drive), made, what, copy_function=layout.link, ignore=ignored)
+
+    store.read(drive, copied, ())
 
 
 def _link_join_inputs(other: Store, drive: str, store: Store, taken: str) -> None:
@@ -186,7 +194,7 @@ def _link_join_inputs(other: Store, drive: str, store: Store, taken: str) -> Non
 def _merge_places(
     store: Store, source: Path, known: dict[str, dict[str, Any]], by_content: dict[str, str], chosen: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Take the places of an exported file; the fate of each drive. More places of a drive replace fewer."""
+    """Take the places of an exported file; the outcome for each drive. More places of a drive replace fewer."""
     outcomes, wanted, counts = [], dict[str, str](), places_by_drive(source)
     for drive, record in drives_of_file(source).items():
         if chosen and drive not in chosen:
@@ -212,13 +220,3 @@ def _content(record: dict[str, Any]) -> str:
         return canonical_json([record["inputs"], record.get("topics")])
     own = ("earth", "key", "drive", "format", "files")
     return canonical_json({name: value for name, value in record.items() if name not in own})
-
-
-def natural_order(drives: Iterable[str]) -> list[str]:
-    """IDs in natural order: drive, drive-2, drive-10."""
-
-    def numbered(drive: str) -> tuple[str, int]:
-        named = re.fullmatch(r"(.+)-(\d{1,9})", drive)
-        return (named[1], int(named[2])) if named else (drive, 1)
-
-    return sorted(drives, key=numbered)

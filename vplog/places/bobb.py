@@ -34,10 +34,10 @@ from vplog.places.matches import (
 from vplog.places.overlap import list_shared
 from vplog.places.self_recognition import misleading_patches
 
-NOBODY = 65_535
-"""The number of no reference, where fewer than J share anything."""
-NOWHERE = 255
-"""The number of no box, where nothing of a window is found."""
+NO_REFERENCE = 65_535
+"""Number in place of a reference, where fewer than J share features with the image."""
+NO_BOX = 255
+"""Number in place of a box, where no feature of a window is found again."""
 _MAP_COLUMNS, _MAP_ROWS = 64, 36
 """Cells of a voting map that is drawn: finer than the patches it sums, 10 px of a 640 x 360 image."""
 
@@ -96,8 +96,8 @@ class BobbSettings(WeighedMatchSettings, RelearnedSettings):
             raise ValueError(
                 f"a box of {self.box_columns} x {self.box_rows} has more than 255 cells; use smaller boxes"
             )
-        if (count := np.prod(self.positions)) > NOWHERE:
-            raise ValueError(f"a box has {count} positions, and {NOWHERE} is the most; use fewer columns or rows")
+        if (count := np.prod(self.positions)) > NO_BOX:
+            raise ValueError(f"a box has {count} positions, and {NO_BOX} is the most; use fewer columns or rows")
         return self
 
     @property
@@ -124,9 +124,10 @@ class BobbSettings(WeighedMatchSettings, RelearnedSettings):
                 f"places.patch_weight has {len(self.patch_weight)} numbers for {len(matcher)} reference images. "
                 "Give one for each, or a single one."
             )
-        if len(matcher) >= NOBODY:
+        if len(matcher) >= NO_REFERENCE:
             raise LibraryError(
-                f"A library may have {NOBODY - 1} reference images, this one {len(matcher)}. Set library.size lower."
+                f"A library may have {NO_REFERENCE - 1} reference images, this one {len(matcher)}. Set library.size "
+                "lower."
             )
 
         def votes(weights: KindWeights) -> Floats:
@@ -155,7 +156,7 @@ class Weights:
 
     @classmethod
     def of(cls, patches: Floats, votes: Floats, popularity: float) -> Weights:
-        """With the votes (L, L) of each reference for the others."""
+        """Weights from the votes (L, L) that the images of references (rows) give the other references."""
         return cls(patches, _rarity(votes / np.maximum(votes.sum(axis=1, keepdims=True), 1e-9), popularity))
 
 
@@ -172,7 +173,7 @@ def _rarity(explained: Floats, power: float) -> Floats:
 class BobbState(RecordState):
     """A library, indexed when it first describes. Safe to share between threads."""
 
-    record, none = Place, NOBODY
+    record, none = Place, NO_REFERENCE
 
     def __init__(self, settings: BobbSettings, matcher: Matcher, weights: Once[Weights]) -> None:
         super().__init__(settings, matcher.references)
@@ -198,14 +199,14 @@ class BobbState(RecordState):
     def describe(self, features: Features) -> Place:
         """Algorithm 1: the references that explain the features, and a box for each window on each of them."""
         s = self.settings
-        references = np.full(s.references, NOBODY, np.uint16)
+        references = np.full(s.references, NO_REFERENCE, np.uint16)
         weights = np.zeros(s.references, np.uint8)
-        boxes = np.full((s.references, s.boxes), NOWHERE, np.uint8)
+        boxes = np.full((s.references, s.boxes), NO_BOX, np.uint8)
         matches = self.matcher.match(features, (1.0, self.weights().patches))
         for j, (reference, share, here, there, agreed) in enumerate(self._retrieve(matches)):
             references[j], weights[j] = reference, max(round(255 * share**s.share_power), 1)
             boxes[j] = expected_votes.best_boxes(
-                here, there, agreed, self._windows, self._along_y, self._along_x, NOWHERE
+                here, there, agreed, self._windows, self._along_y, self._along_x, NO_BOX
             )
         return Place(references, weights, boxes)
 
@@ -231,8 +232,8 @@ class BobbState(RecordState):
         return [(reference, explained / found[0][1], *rest) for reference, explained, *rest in found[: s.references]]  # pyrefly: ignore[bad-return]
 
     def agreed(self, matches: Matches, reference: int) -> tuple[Float32s, Float32s, Float32s]:
-        """Where matches with a reference are (E, 2) in the image and (E, 2) in the reference, as shares of the sides,
-        and their weights (E,), those that agree in their motion counting more.
+        """Positions of the matches with a reference, (E, 2) in the image and (E, 2) in the reference, as shares of the
+        sides, and their weights (E,), higher for matches that move as their neighbours do.
 
         An image of the library matches itself in all its features.
         """
@@ -244,18 +245,18 @@ class BobbState(RecordState):
         return here, there, expected_votes.agreement(here, there, weight, s.agreement, s.agreement_floor)
 
     def windows(self, rank: int) -> Floats:
-        """(I, 4) the same windows on the reference of any rank."""
+        """(I, 4) windows x0 y0 x1 y1, the same for references of any rank."""
         return self._windows
 
     def boxes(self, place: Place) -> Boxes:
         """The boxes of a place as shares of the reference's sides."""
         s = self.settings
-        used = place.references != NOBODY
+        used = place.references != NO_REFERENCE
         codes = place.boxes[used].astype(np.int64)
         row, column = np.divmod(codes, s.positions[0])
         ends = [column / s.columns, row / s.rows, (column + s.box_columns) / s.columns, (row + s.box_rows) / s.rows]
         corners = np.stack(ends, axis=-1)
-        corners[codes == NOWHERE] = np.nan
+        corners[codes == NO_BOX] = np.nan
         return Boxes(place.references[used].astype(np.int64), corners)
 
     def voting_maps(self, features: Features, references: Sequence[int]) -> list[Floats]:
@@ -303,19 +304,19 @@ class BobbState(RecordState):
     def on_subset(self, column: pa.Array, references: Ints) -> pa.Array:
         """The places of a column by some of the references alone, with the numbers that `subset` gives them."""
         known, weights, boxes = self.checked(from_column(column, self.arrow_type))
-        number = np.full(NOBODY + 1, NOBODY, np.uint16)
+        number = np.full(NO_REFERENCE + 1, NO_REFERENCE, np.uint16)
         number[references] = np.arange(len(references), dtype=np.uint16)
-        gone = number[known] == NOBODY
-        fields = number[known], np.where(gone, 0, weights), np.where(gone[..., None], NOWHERE, boxes)
+        gone = number[known] == NO_REFERENCE
+        fields = number[known], np.where(gone, 0, weights), np.where(gone[..., None], NO_BOX, boxes)
         return to_column(self.arrow_type, iter(fields))
 
     def overlaps(self) -> Bytes:
-        """(256, 256) cells that the boxes of two numbers share."""
+        """(256, 256) cells that two boxes share, by their numbers."""
         s = self.settings
         return expected_votes.overlaps(s.positions, s.box_columns, s.box_rows)
 
     def shared(self, places: Sequence[Place], query: Int32s, match: Int32s) -> SharedReferences:
-        """The parts of the score of pairs (C,) of rows of `places`, by reference; equal boxes overlap by 1."""
+        """Contributions of the references to the scores of pairs (C,) of rows of `places`; equal boxes overlap by 1."""
         s = self.settings
         references, weights, boxes = self.arrays(places)
         table = self.overlaps()
@@ -327,12 +328,13 @@ class BobbState(RecordState):
             overlap /= s.box_columns * s.box_rows
             return overlap, overlap * weights[rows, ranks] * weights[others, other_ranks]
 
-        return list_shared(np.where(references == NOBODY, -1, references.astype(np.int64)), query, match, compare)
+        return list_shared(np.where(references == NO_REFERENCE, -1, references.astype(np.int64)), query, match, compare)
 
     def evidence(self, query: Place, match: Place) -> str:
-        """Kinds of features that the references count which most of the score of two places is of."""
+        """`keypoints`, `patches` or `keypoints and patches`: what contributes most to the score of two places; empty
+        where they share no reference."""
         shared, mine, theirs = np.intersect1d(query.references, match.references, return_indices=True)
-        known = shared != NOBODY
+        known = shared != NO_REFERENCE
         worth = query.weights[mine[known]].astype(np.int64) * match.weights[theirs[known]]
         if not worth.any():
             return ""
@@ -342,9 +344,9 @@ class BobbState(RecordState):
         return "keypoints and patches" if 2 * worth[used].sum() > worth.sum() else "keypoints"
 
     def checked(self, fields: Sequence[Any]) -> list[Any]:
-        """Raises LibraryError where there is no such box, too."""
+        """As `RecordState.checked`. Raises LibraryError also for a box beyond the positions on a reference."""
         references, weights, boxes = super().checked(fields)
         positions = np.prod(self.settings.positions)
-        if np.any((boxes >= positions) & (boxes != NOWHERE)):
+        if np.any((boxes >= positions) & (boxes != NO_BOX)):
             raise LibraryError(f"The descriptors name boxes beyond the {positions} that this recogniser knows.")
         return [references, weights, boxes]

@@ -180,7 +180,7 @@ class PaperBobbState(RecordState):
         return BoxIndex(references, boxes, len(self.library), self.settings.grid)
 
     def shared(self, places: Sequence[BoxPlace], query: Int32s, match: Int32s) -> SharedReferences:
-        """The parts of Eq. (1) of pairs (C,) of rows of `places`, by reference; equal boxes overlap by 1."""
+        """Contributions of the references to Eq. (1) of pairs (C,) of rows of `places`; equal boxes overlap by 1."""
         references, boxes = (part.astype(np.int64) for part in self.arrays(places))
 
         def compare(rows: Ints, ranks: Ints, others: Ints, other_ranks: Ints) -> tuple[Floats, Floats]:
@@ -193,7 +193,7 @@ class PaperBobbState(RecordState):
         return list_shared(references, query, match, compare)
 
     def checked(self, fields: Sequence[Any]) -> list[Any]:
-        """Raises LibraryError where a box is beyond the grid, too."""
+        """As `RecordState.checked`. Raises LibraryError also for a box beyond the grid."""
         references, boxes = super().checked(fields)
         grid = self.settings.grid
         if len(boxes) and boxes.max() > grid:

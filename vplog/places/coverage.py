@@ -226,19 +226,20 @@ def explained_share(
 
 @numba.njit(cache=True, nogil=True)
 def _beyond_chance(here, there, feature, value):
-    """Features whose matches keep their arrangement, less the most that do with the matches shifted on; at least 0."""
+    """Features with geometrically consistent matches, less the most among permuted matches (chance); at least 0."""
     m = feature.shape[0]
     if m < 2:
         return 0
     pairings, chance = min(_PAIRINGS, m - 1), 0
     for n in range(pairings):
-        chance = max(chance, _arranged(here, there, feature, value, (n + 1) * m // (pairings + 1)))
-    return max(_arranged(here, there, feature, value, 0) - chance, 0)
+        chance = max(chance, _consistent(here, there, feature, value, (n + 1) * m // (pairings + 1)))
+    return max(_consistent(here, there, feature, value, 0) - chance, 0)
 
 
 @numba.njit(cache=True, nogil=True)
-def _arranged(here, there, feature, value, shift):
-    """Features with a match that another match near it agrees with; match a is paired with the place of a + shift."""
+def _consistent(here, there, feature, value, shift):
+    """Features with a match that moves as another match near it does; match a gets the position of a + shift in the
+    reference, so that a shift other than 0 permutes the matches."""
     m = feature.shape[0]
     count, last = 0, -1
     for a in range(m):

@@ -17,9 +17,7 @@ def box_sums(cells: int, patches: int, box: int) -> Floats:
     """(P, cells): votes that a match in a cell gives to each of the P = cells - box + 1 boxes along one side."""
     middle = (np.arange(cells) + 0.5) / cells
     kernel = (1.0 - np.abs(middle[:, None] - middle)) ** (patches - 1)
-    inside = np.zeros((cells - box + 1, cells))
-    for position in range(len(inside)):
-        inside[position, position : position + box] = 1.0
+    inside = np.tri(cells - box + 1, cells, box - 1) - np.tri(cells - box + 1, cells, -1)
     return inside @ kernel
 
 

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from vplog.data import Bools, Floats, Int32s, Ints, Reference
@@ -272,11 +274,6 @@ def _log_sum(logs: Floats, chosen: Bools) -> Floats:
 
 def _even_odds(logs: Floats, new_places: int) -> float:
     """The log likelihood of a new place at which its probabilities against `logs` sum to `new_places`."""
-    low, high = logs.min() - 50.0, logs.max() + 50.0  # e^-50 is nothing beside 1
-    for _ in range(60):  # halvings: to the last bit of a sum that grows with the answer
-        middle = (low + high) / 2
-        if np.exp(-np.logaddexp(0, logs - middle)).sum() < new_places:
-            low = middle
-        else:
-            high = middle
-    return float((low + high) / 2)
+    ends = logs.min() - 50.0, logs.max() + 50.0  # e^-50 is nothing beside 1
+    found: Any = scipy.optimize.bisect(lambda middle: scipy.special.expit(middle - logs).sum() - new_places, *ends)
+    return found

@@ -231,7 +231,7 @@ class HybridState(ReferencesState):
 
     def evidence(self, query: HybridPlace, match: HybridPlace) -> str:
         """`words` where their signs are more of the score of two places than the boxes."""
-        boxes, words = self.index([match]).alike(query)
+        boxes, words = self.index([match]).similarities(query)
         if self.share * words[0] > (1 - self.share) * boxes[0]:
             return "words"
         return self.bobb.evidence(query, match)
@@ -254,14 +254,14 @@ class HybridIndex:
     def __len__(self) -> int:
         return len(self._boxes)
 
-    def alike(self, descriptor: HybridPlace, stop: int | None = None) -> tuple[Float32s, Float32s]:
+    def similarities(self, descriptor: HybridPlace, stop: int | None = None) -> tuple[Float32s, Float32s]:
         """(stop,) BoBB's score, and agreement of the signs 0..1: 0 where half of them or fewer are equal."""
         boxes = self._boxes.scores(descriptor, stop)
         return boxes, _agreement(self._signs[: len(boxes)], descriptor.signs)
 
     def scores(self, descriptor: HybridPlace, stop: int | None = None) -> Float32s:
         """(stop,) 0..1: both similarities in their shares; 1 is equal."""
-        boxes, words = self.alike(descriptor, stop)
+        boxes, words = self.similarities(descriptor, stop)
         return ((1 - self._share) * boxes + self._share * words).astype(np.float32)
 
     def query(self, descriptor: HybridPlace, k: int, stop: int | None = None) -> Ranking:
@@ -280,7 +280,7 @@ def _balance(index: HybridIndex, places: Sequence[HybridPlace], share: float) ->
 
     With fewer references than it takes to tell how they vary, `share` itself.
     """
-    alike = np.array([index.alike(place) for place in places])
+    alike = np.array([index.similarities(place) for place in places])
     pairs = alike.transpose(1, 0, 2)[:, ~np.eye(len(places), dtype=bool)].astype(np.float64)
     boxes, words = pairs.std(axis=1).tolist() if pairs.size else (0.0, 0.0)
     if min(boxes, words) <= 0.0:

@@ -74,12 +74,8 @@ class ReferencesState:
     def __init__(self, settings: Any, references: list[Reference]) -> None:
         self.settings, self.references = settings, references
 
-    @property
-    def hash(self) -> str:
-        return self._hash
-
     @cached_property
-    def _hash(self) -> str:
+    def hash(self) -> str:
         return references_hash(self.references, self.settings)
 
     def save(self, folder: Path) -> None:

@@ -72,7 +72,7 @@ class VectorsState(VectorState):
     arrow_type: pa.FixedSizeListType  # pyrefly: ignore[bad-override]
 
     @cached_property
-    def _hash(self) -> str:
+    def hash(self) -> str:
         content = self.settings.model or self._content
         about = f"{references_hash(self.references, self.settings)} {content} {self.tables[0].dimensions}"
         return hashlib.sha256(about.encode()).hexdigest()

@@ -34,11 +34,7 @@ def views_of(
     LibraryError where stored descriptors are not those of the log.
     """
     if isinstance(state, StoredState):
-        return Views(state.stored(log, stamp_ns, query), _same, _same)
+        return Views(state.stored(log, stamp_ns, query), lambda one: one, lambda one: one)
     if isinstance(state, FrameState):
         return Views(log.frames(stamp_ns), lambda encoded: masked(encoded.decode(state.colour)), state.describe_frame)
     return Views(range(len(stamp_ns)), features, state.describe)
-
-
-def _same(descriptor: Any) -> Any:
-    return descriptor

@@ -38,27 +38,27 @@ class PosedImages:
     """(P, 3) colours of the points."""
 
 
-def lens(camera: Camera) -> tuple[str, dict[str, float]]:
-    """COLMAP's name of a camera's model, and its parameters in that order. Raises ResultError where it has none."""
+def camera_model(camera: Camera) -> tuple[str, dict[str, float]]:
+    """COLMAP's camera model and its parameters, in COLMAP's order and px. Raises ResultError where it has none."""
     K = camera.matrix
     if K is None:
         raise ResultError(f"Camera {camera.name} is not calibrated, so its images have no place. Give a calibration.")
     if abs(K[0, 1]) > 1e-9 * K[0, 0]:
         raise ResultError(f"Camera {camera.name} has skewed axes, which COLMAP has no model for. Rectify the images.")
     pinhole = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2] + 0.5, "cy": K[1, 2] + 0.5}
-    bent = np.trim_zeros(np.asarray(camera.distortion, np.float64), "b").tolist()
+    coefficients = np.trim_zeros(np.asarray(camera.distortion, np.float64), "b").tolist()
     if camera.distortion_model == "equidistant":
         return "OPENCV_FISHEYE", pinhole | dict(
-            zip(("k1", "k2", "k3", "k4"), [*bent, 0.0, 0.0, 0.0, 0.0], strict=False)
+            zip(("k1", "k2", "k3", "k4"), [*coefficients, 0.0, 0.0, 0.0, 0.0], strict=False)
         )
-    if not bent or camera.distortion_model == "none":
+    if not coefficients or camera.distortion_model == "none":
         return "PINHOLE", pinhole
-    if len(bent) > len(_OPENCV):
+    if len(coefficients) > len(_OPENCV):
         raise ResultError(
             f"Camera {camera.name} has coefficients of a thin prism, which COLMAP has no model for. Rectify the images."
         )
-    model, count = ("OPENCV", 4) if len(bent) <= 4 else ("FULL_OPENCV", 8)
-    return model, pinhole | dict(zip(_OPENCV[:count], [*bent, *[0.0] * 8], strict=False))
+    model, count = ("OPENCV", 4) if len(coefficients) <= 4 else ("FULL_OPENCV", 8)
+    return model, pinhole | dict(zip(_OPENCV[:count], [*coefficients, *[0.0] * 8], strict=False))
 
 
 def write_colmap(folder: Path, images: PosedImages) -> list[Path]:
@@ -67,7 +67,7 @@ def write_colmap(folder: Path, images: PosedImages) -> list[Path]:
         "cameras.txt": [
             f"{number + 1} {model} {camera.width} {camera.height} {' '.join(repr(float(v)) for v in values.values())}"
             for number, camera in enumerate(images.cameras)
-            for model, values in [lens(camera)]
+            for model, values in [camera_model(camera)]
         ],
         "images.txt": _images(images),
         "points3D.txt": _points(images),
@@ -125,7 +125,7 @@ def write_nerfstudio(folder: Path, images: PosedImages) -> list[Path]:
 
 def _intrinsics(camera: Camera) -> dict[str, Any]:
     """Fields of transforms.json about a camera. Raises ResultError where it has none for it."""
-    model, parameters = lens(camera)
+    model, parameters = camera_model(camera)
     if model == "FULL_OPENCV" and any(parameters[name] for name in ("k4", "k5", "k6")):
         raise ResultError(
             f"Camera {camera.name} has a rational polynomial, which nerfstudio has no model for. Export colmap."

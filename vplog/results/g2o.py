@@ -189,7 +189,7 @@ def _id(path: Path, line: int, word: str) -> int:
 
 
 def _ids(path: Path, lines: _Lines, named: int) -> Ints:
-    """(L, named)."""
+    """(L, named) ids; `named` is how many a line names: 1 of a vertex, 2 of an edge."""
     text = "".join(lines.ids)
     if not text or (text.isascii() and text.isdigit() and max(map(len, lines.ids)) < 19):  # 18 digits fit for sure
         return np.array(list(map(int, lines.ids)), np.int64).reshape(-1, named)

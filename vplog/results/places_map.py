@@ -66,7 +66,7 @@ class DrivePlaces:
     """(P, 3) longitude and latitude in degrees and altitude in m; None where not known."""
 
     def of(self, rows: Ints) -> DrivePlaces:
-        """Some of them."""
+        """The places of these rows."""
         return replace(
             self, keyframe=self.keyframe[rows], stamp_ns=self.stamp_ns[rows],
             world_from_body=self.world_from_body[rows], descriptors=self.descriptors.take(pa.array(rows)),
@@ -237,15 +237,15 @@ def read_drives(path: Path, kind: pa.DataType) -> Iterator[DrivePlaces]:
 
 @contextmanager
 def _opened(path: Path, columns: list[str]) -> Iterator[pq.ParquetFile]:
-    """A file of places that takes no more memory than it may, with its drives as numbers. Raises ValueError where these
-    columns would take more."""
+    """A file of places whose drives are dictionary encoded. Raises ValueError where these columns would take more
+    memory than a file may."""
     with open_table(path, read_dictionary=["drive"]) as file:
         check_size(path, file, columns)
         yield file
 
 
 def _stretches(table: pa.Table) -> Iterator[tuple[str, pa.Table]]:
-    """Rows of one drive after the other."""
+    """Each run of consecutive rows of one drive: its name and its rows. Raises ValueError for rows without a drive."""
     drives = table["drive"].combine_chunks()
     if drives.null_count:
         raise ValueError("There are places of no drive.")
@@ -278,7 +278,7 @@ def names_of(folders: Sequence[Path]) -> list[str]:
 
 
 def _flattened(column: pa.Array) -> pa.Table:
-    """A column for every part of a descriptor, those of a structure in a structure with a dot between."""
+    """A column for every leaf of a descriptor, nested ones with dotted names."""
     table = pa.table({"descriptor": column})
     while any(pa.types.is_struct(part.type) for part in table.schema):
         table = table.flatten()
@@ -286,19 +286,19 @@ def _flattened(column: pa.Array) -> pa.Table:
 
 
 def _parts(kind: pa.DataType) -> list[tuple[str, pa.DataType]]:
-    """Name and type of every part of a descriptor."""
+    """Dotted name and type of every leaf of a descriptor."""
     return [(part.name, part.type) for part in _flattened(pa.array([], kind)).schema]
 
 
 def _joined(kind: pa.DataType, columns: Any) -> pa.Array:
-    """A descriptor of its parts, taken one after the other."""
+    """The descriptors from their leaves, an iterator in the order of `_parts`."""
     if not pa.types.is_struct(kind):
         return next(columns)
     return pa.StructArray.from_arrays([_joined(part.type, columns) for part in kind], fields=list(kind))
 
 
 def _is_bytes(kind: pa.DataType) -> bool:
-    """Whether a part is a list of so many numbers that stand side by side in memory."""
+    """Whether a leaf is a fixed-size list of numbers, which is stored as bytes."""
     return pa.types.is_fixed_size_list(kind) and pa.types.is_primitive(kind.value_type)
 
 

@@ -57,6 +57,6 @@ def camera_pictures(folder: Path, camera: int) -> CameraPictures:
 
 
 def camera_topics(record: dict[str, Any]) -> list[str]:
-    """The topics of a run's cameras by its run.json, the first one's first; of an older run one without a name."""
+    """The topics of a run's cameras by its run.json, the first one's first; one without a name where it names none."""
     names = record.get("cameras")
     return list(map(str, names)) if isinstance(names, list) and names else [""]

@@ -42,8 +42,8 @@ def is_ours(path: Path) -> bool:
 
 
 def read_run_json(path: Path) -> dict[str, Any]:
-    """A record of a run or a map, without its checksum and without retired settings. Raises ResultError where the file
-    is missing, is no JSON object or does not have its checksum, and NewerError where it is of a newer version."""
+    """A record of a run or a map, without its checksum. Raises ResultError where the file is missing, is no JSON object
+    or does not have its checksum, and NewerError where it is of a newer version."""
     try:
         check_file(path)
         record = _sound_json(path.read_text(encoding="utf-8"))
@@ -60,30 +60,14 @@ def read_run_json(path: Path) -> dict[str, Any]:
         raise ResultError(f"{path} is damaged: its checksum does not match. Copy it back from a backup, or run again.")
     if type(version := record.get("format")) is int:
         check_version(path, version, FORMAT, record.get("vplog"))
-    _drop_retired(record.get("settings"))
     return record
 
 
 def _run_meant(folder: Path) -> str:
-    """` Did you mean FOLDER?`: the run that a file is in, or the folder with the nearest name."""
+    """` Did you mean FOLDER?`: for a file in a run that run, else the folder with the nearest name."""
     if folder.is_file() and (folder.parent / "run.json").is_file():
         return f" Did you mean {folder.parent}?"
     return nearest_path(folder)
-
-
-def _drop_retired(settings: Any) -> None:
-    """Remove from a tree of settings those that are gone: `verify.direction` where it was off, those of the back end
-    that the evidence has replaced."""
-    if not isinstance(settings, dict):
-        return
-    settings.pop("cross_check", None)
-    verify, refine = settings.get("verify"), settings.get("refine")
-    if isinstance(refine, dict):
-        for name in ("least_redundancy", "most_change", "closure_significance"):
-            refine.pop(name, None)
-    direction = verify.get("direction") if isinstance(verify, dict) else None
-    if isinstance(verify, dict) and isinstance(direction, dict) and direction.get("keep") is False:
-        del verify["direction"]
 
 
 def _sound_json(text: str) -> Any:

@@ -86,7 +86,8 @@ def _locked(out: Path, wait: bool = False) -> Iterator[None]:
 
 
 def _has(lock: TextIO, path: Path, wait: bool) -> bool:
-    """Lock a file; whether it is still the one at `path`. Raises SettingsError where another process has it."""
+    """Lock an open file; whether it is still the one at `path`. Raises SettingsError where another process holds the
+    lock."""
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         return os.path.samestat(os.fstat(lock.fileno()), path.stat())

@@ -256,7 +256,7 @@ def write_keyframes(
 
 
 def read_keyframe_covariance(path: Path) -> Floats:
-    """(N, 6, 6) of the keyframes' optimised poses, NaN where not known, as in tables of older versions."""
+    """(N, 6, 6) of the keyframes' optimised poses, NaN where not known."""
     return _matrices(_read(path, "keyframes", KEYFRAMES), "covariance")
 
 
@@ -499,8 +499,8 @@ def read_first_camera(path: Path) -> tuple[pa.Array, str]:
 
 
 def on_keyframes(keyframe: Int32s) -> Ints | None:
-    """(N,) the row nearest to each keyframe up to the last that has one, of places (P,) of these keyframes; None where
-    each keyframe is a row of its own."""
+    """(N,) row of the place nearest to each keyframe, of places (P,) at the keyframes `keyframe`, up to the last of
+    these; None where every keyframe has a place."""
     if not len(keyframe) or keyframe[-1] == len(keyframe) - 1:
         return None
     middle = (keyframe[1:].astype(np.int64) + keyframe[:-1]) // 2
@@ -508,7 +508,8 @@ def on_keyframes(keyframe: Int32s) -> Ints | None:
 
 
 def write_some_descriptors(source: Path, path: Path, rows: Ints, descriptors: pa.Array, library: str) -> None:
-    """Some rows of a table of descriptors (N,), by a library of this hash, else as they are. Raises ResultError."""
+    """Write some rows of the table `source` with their descriptors (N,) replaced by those of a library of this hash.
+    Raises ResultError."""
     with reading(source), open_table(source) as file:
         _check_name(source, "descriptors", file.schema_arrow)
         known = ("keyframe", "stamp_ns", "descriptor", "camera")
@@ -665,7 +666,7 @@ def read_poses(table: pa.Table, prefix: str) -> Floats:
 
 
 def _values(table: pa.Table, name: str) -> np.ndarray:
-    """A column as an array of its own, which may be written to; whole numbers that an older table lacks are 0."""
+    """A column as an array of its own, which may be written to; whole numbers that are null, as cameras, are 0."""
     column = table[name]
     whole = column.null_count and pa.types.is_integer(column.type)
     return np.array((column.fill_null(0) if whole else column).to_numpy())

@@ -263,7 +263,7 @@ def _unknown(stamp_ns: np.ndarray) -> Odometry:
 
 def _is_unknown(odometry: Odometry) -> bool:
     """Whether it is `_unknown`."""
-    return not odometry.metric and odometry.breaks is not None and len(odometry.breaks) == len(odometry.stamp_ns) - 1
+    return not odometry.metric and len(odometry.breaks) == len(odometry.stamp_ns) - 1
 
 
 def _decoded(log: Log, stamp_ns: np.ndarray, execution: Execution) -> Iterator[Frame]:
@@ -284,7 +284,7 @@ def _log_breaks(what: str, odometry: Odometry, stamp_ns: np.ndarray, of: str) ->
     if lost := len(stamp_ns) - len(odometry.stamp_ns):
         _log.warning("%s lost its track in %d of %d %s.", what, lost, len(stamp_ns), of)
     breaks = odometry.breaks
-    if breaks is None or not len(breaks):
+    if not len(breaks):
         return
     seconds = (odometry.stamp_ns[breaks] - stamp_ns[0]) / 1e9
     named = ", ".join(f"{second:.1f} s" for second in seconds[:_NAMED].tolist())

@@ -9,8 +9,8 @@ from pathlib import PurePath
 from typing import Any
 
 CHECKSUM = "record_sha256"
-"""Field of a record: sha256 of `canonical_json` of all others. One without it is taken as it is: an older vplog or an
-editor wrote it."""
+"""Field of a record: sha256 of `canonical_json` of all others. One without it is taken as it is: an editor
+wrote it."""
 
 
 def with_checksum(record: dict[str, Any]) -> dict[str, Any]:

@@ -176,7 +176,7 @@ def sync(path: Path) -> None:
 
 
 def files_in(folder: Path) -> list[str]:
-    """Names of all files in a folder and below it, in order; hidden ones are nobody's result."""
+    """Names of all files in a folder and below it, in order; without hidden ones."""
     return [name for name in regular_files(folder) if not any(part.startswith(".") for part in name.split("/"))]
 
 

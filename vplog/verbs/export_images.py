@@ -48,7 +48,7 @@ def export_images(
     pipeline, closures = recorded_pipeline(folder, record), tables.read_closures(folder / "closures.parquet")
     cameras = _cameras(folder, record, topics, log)
     for one in cameras:
-        colmap.lens(one.camera)  # before the long part
+        colmap.camera_model(one.camera)  # before the long part
     number = np.repeat(np.arange(len(cameras)), [len(one.stamp_ns) for one in cameras])
     of_image = [cameras[one].camera for one in number.tolist()]
     with staged(out, lambda: _export_in(out)) as made, scratch("features") as place:

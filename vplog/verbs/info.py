@@ -231,11 +231,7 @@ def _check_moves(drive: str, frames: list[Frame], camera: Camera, problems: list
     """Note a camera that stands: one that is tracked through most of these frames and gives no second keyframe. Where
     they are too far apart to be tracked it moves, or only the whole drive tells."""
     odometry = visual_odometry(map(masked, frames), camera)
-    if (
-        odometry is None
-        or len(odometry.stamp_ns) <= len(frames) / 2
-        or (odometry.breaks is not None and len(odometry.breaks))
-    ):
+    if odometry is None or len(odometry.stamp_ns) <= len(frames) / 2 or len(odometry.breaks):
         return
     keyframes, _ = select_keyframes(drive, odometry.stamp_ns, odometry, KeyframeSettings())
     if len(keyframes.stamp_ns) < 2:
@@ -429,9 +425,9 @@ def preflight_lines(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
     if found["truth"]:
         yield "truth", f"{found['truth']}; vplog evaluate OUT --truth auto compares with it"
     yield "scale", f"{found['scale']['source']}: {found['scale']['why']}"
-    if any(found["skew_ms"].values()):  # none of data sets, which nothing recorded
-        skews = ", ".join(f"{topic} {skew:.1f}" for topic, skew in found["skew_ms"].items())
-        yield "skew", f"log time less header stamp, ms: {skews}"
+    if any(found["clock_offset_ms"].values()):  # none of data sets, which nothing recorded
+        offsets = ", ".join(f"{topic} {offset:.1f}" for topic, offset in found["clock_offset_ms"].items())
+        yield "offset", f"log time less header stamp, ms: {offsets}"
 
 
 def write_page(path: Path, found: Preflight) -> None:

@@ -25,9 +25,9 @@ from vplog.maps.search.exact import RankedPlaces, best_places, no_answers
 from vplog.maps.search.index import update_index
 from vplog.maps.search.query import MapQuery, search
 from vplog.maps.search.segment import open_segment
-from vplog.maps.search.sequences import LineSearch, drives_by_credit
+from vplog.maps.search.sequences import LineSearch, drives_by_votes
 from vplog.maps.storage.map_store import Store
-from vplog.places.bobb import NOWHERE, BobbSettings, BobbState, Place
+from vplog.places.bobb import NO_BOX, BobbSettings, BobbState, Place
 from vplog.places.sequence import SequenceSettings
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class Map:
         length = max(count, 1)
         places = make_places(length, SETTINGS, number if seed is None else seed, LIBRARY, length).rows(slice(count))
         weights, boxes = np.maximum(places.weights // 100 * 100, 100), places.boxes // 20 * 20
-        places = Places(places.references, weights, np.where(boxes < 60, boxes, NOWHERE).astype(np.uint8))
+        places = Places(places.references, weights, np.where(boxes < 60, boxes, NO_BOX).astype(np.uint8))
         self.places[f"drive-{number:09d}"] = places
         write_drive(self.store, number, places, self.state)
 
@@ -140,7 +140,7 @@ def test_a_map_may_grow_shrink_and_change(made: Map) -> None:
     assert first.path in {part.path for part in small}, "a small drive does not write the large segment again"
     made.take(1)
     made.check()
-    made.put(4, 60, seed=77)  # the same name, the same key, other places
+    made.put(4, 60, seed=77)  # the same name, other places
     made.check()
     made.take(4)
     made.take(2)
@@ -292,12 +292,12 @@ def test_a_drive_is_likely_by_how_far_it_stands_out() -> None:
     drive = np.array([[2, 3, 4], [2, 3, 5], [7, 2, 3], [2, 4, 5], [2, 3, 4]], np.int32)
     score = np.array([[0.3, 0.2, 0.2], [0.3, 0.2, 0.2], [0.9, 0.3, 0.2], [0.3, 0.2, 0.2], [0.3, 0.2, 0.2]], np.float32)
     none = np.zeros((5, 3), np.int32)
-    found = drives_by_credit(RankedPlaces(drive, none, score, none), 5)
+    found = drives_by_votes(RankedPlaces(drive, none, score, none), 5)
     assert {2, 7} <= set(found.tolist())
-    assert len(drives_by_credit(no_answers(0, 3), 5)) == 0
+    assert len(drives_by_votes(no_answers(0, 3), 5)) == 0
     many = np.arange(50, dtype=np.int32)[None]
     falling = np.linspace(1, 0.1, 50, dtype=np.float32)[None]
-    assert drives_by_credit(RankedPlaces(many, many, falling, many), 5).tolist() == list(range(8))
+    assert drives_by_votes(RankedPlaces(many, many, falling, many), 5).tolist() == list(range(8))
 
 
 def test_a_segment_of_another_version_is_not_called_damaged(made: Map) -> None:

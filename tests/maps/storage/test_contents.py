@@ -13,8 +13,7 @@ import pytest
 from tests.benchmarks.scale import made_up_library, write_drive
 from tests.benchmarks.search import make_places
 from tests.maps.runs import LIBRARY, PLACES, make_map
-from vplog.batch.batch import settings_for
-from vplog.errors import ResultError, SettingsError
+from vplog.errors import ResultError
 from vplog.maps.joining.joint_record import read_joint, write_joint
 from vplog.maps.search.index import update_index
 from vplog.maps.storage import map_store
@@ -22,7 +21,6 @@ from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import damaged_files
 from vplog.maps.storage.layout import drive_record, set_drive_id
 from vplog.maps.storage.map_store import Store, folder_name
-from vplog.pipeline import load_pipeline
 from vplog.places.bobb import BobbSettings
 from vplog.results import run_record
 
@@ -235,17 +233,6 @@ def test_what_another_program_calls_a_map_is_none(root: Path, verb: Verb, tmp_pa
     assert (tmp_path / "map.json").read_text() == '{"mine": 1}'
 
 
-def test_a_map_without_hashes_is_read(root: Path, verb: Verb, tmp_path: Path) -> None:
-    """As an older vplog wrote it."""
-    here = copied(root, tmp_path / "map")
-    for path in here.glob("runs/*/drive.json"):
-        record = run_record.read_run_json(path)
-        path.write_text(json.dumps({key: value for key, value in record.items() if key not in ("files", "format")}))
-    assert [one["drive"] for one in verb("map", "info", here, "--check", "--json").json["drives"]] == sorted(DRIVES)
-    (here / "runs" / folder_name("walk") / "descriptors.parquet").unlink()
-    assert list(verb("map", "info", here, "--json").json["damaged"]) == ["walk"]
-
-
 def test_the_check_reads_what_joins_drives_too(root: Path, verb: Verb, tmp_path: Path) -> None:
     here = copied(root, tmp_path / "map")
     path = here / "joins" / folder_name("walk") / "match=ride.parquet"
@@ -276,20 +263,6 @@ def test_a_damaged_head_is_written_again_from_the_drives(tmp_path: Path) -> None
     path.unlink()
     with pytest.raises(ResultError, match="is not a map"):
         store.recovered_head()
-
-
-def test_a_setting_that_is_gone_and_was_off_stops_no_old_map(tmp_path: Path) -> None:
-    """A map holds every setting of the vplog that made it."""
-    store = Store(make_map(tmp_path / "map", {"walk": 1}))
-    settings = load_pipeline("default").model_dump(mode="json")
-    for keep in (False, True):
-        old = {**settings, "verify": {**settings["verify"], "direction": {"keep": keep, "rounds": 1000}}}
-        store.write_head(map_store.Head(LIBRARY, old))
-        if keep:
-            with pytest.raises(SettingsError, match="direction"):
-                settings_for(store.root)
-        else:
-            assert settings_for(store.root) == load_pipeline("default")
 
 
 @pytest.mark.parametrize("settings", [None, "", "[]", "[" * 10**6])

@@ -655,7 +655,7 @@ def test_a_damaged_joint_record_stops_no_writer(root: Any, verb: Callable[..., S
     with map_store.writing(root) as store:
         assert store.mirror is not None
         store.mirror.rest()
-        assert "poses.parquet" in store.joint_damage
+        assert "poses.parquet" in store.mirror.rest_damage
         assert "map join" in damage_warnings(store)[0]
     assert rest_of(root) == {"joins/drive=one/joins.parquet": "{}"}
     assert not any(name.startswith(("joint", "joins/drive=two")) for name in names(root))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,14 +23,14 @@ from vplog.execution.execution import Execution
 from vplog.maps.condensation.own_queries import (
     OwnAnswers,
     OwnPlaces,
+    near_another,
     query_own_places,
     read_own_places,
     search_of,
-    shown_by_others,
 )
 from vplog.maps.condensation.redundancy import RemovalCandidates, remove_cross_validated
 from vplog.maps.condensation.references import remove_references
-from vplog.maps.merge import copy_library, put_library
+from vplog.maps.merge import copy_library, copy_run, put_library
 from vplog.maps.search.query import open_map
 from vplog.maps.storage import layout, map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
@@ -45,12 +45,13 @@ from vplog.storage.scratch import copy_folder
 LOSS = 0.01
 """Loss of recall at rank one of the map's own queries."""
 _SPACINGS = 3.0
-"""Right is within so many times the distance of keyframes that follow each other: 3 m of keyframes a metre apart."""
+"""An answer is right within so many times the median distance of consecutive keyframes: 3 m of keyframes a metre
+apart."""
 
 
 @dataclass(frozen=True, eq=False)
 class Condensed:
-    """The places of a map that stay, by the references that stay."""
+    """Outcome of a condensation: which places and references of a map stay."""
 
     places: OwnPlaces
     answers: OwnAnswers
@@ -58,12 +59,13 @@ class Condensed:
     retained: Bools
     """(N,) places that the new map has."""
     lost: int
-    """Queries that are not answered rightly any more, for want of a place, where they did not choose which."""
+    """Queries that lose their right answer with the places removed, by cross-validation."""
     state: PlaceState
+    """The recogniser with the references that stay."""
     whole: PlaceState
-    """The recogniser of the map as it was."""
+    """The recogniser of the map before."""
     whole_answers: OwnAnswers
-    """Answers of the whole map."""
+    """Answers of the map before."""
 
 
 def condense_map(
@@ -71,7 +73,7 @@ def condense_map(
 ) -> dict[str, Any]:
     """Write the map `target`: the drives of a map with the places and references that still decide something, as long
     as the recall at rank one of the map's own queries falls by no more than `loss`, half of it by references. Returns
-    an account of it.
+    the record of it for JSON.
 
     A place is right within `distance_m` of the query, which None sets by the spacing of places. Raises VplogError, as
     where the target is a map already.
@@ -100,18 +102,18 @@ def condense_places(
     places: OwnPlaces, answers: OwnAnswers, state: PlaceState, distance_m: float, loss: float,
     execution: Execution = Execution(),
 ) -> Condensed:  # fmt: skip
-    """The references that stay, and then the places. One that no other shows is among them, unless it has faded, and
-    one of each drive."""
+    """Choose the references that stay, and then the places: all without another within `distance_m`, unless faded, and
+    at least one of each camera of a drive."""
     posed, whole_answers, small = places.frame >= 0, answers, state
     most_lost = math.floor(loss * int(posed.sum()) + 1e-9)  # .01 of 300 is 3
     if isinstance(state, CodedState):
         places, answers, small = remove_references(places, answers, state, distance_m, most_lost // 2, execution)
     every = np.arange(len(posed))
-    removable, along_m = shown_by_others(places, distance_m) | (posed & answers.faded), np.cumsum(places.steps_m())
+    removable, along_m = near_another(places, distance_m) | (posed & answers.faded), np.cumsum(places.steps_m())
     total = int(removable.sum())
     most_lost -= len(whole_answers.place) - len(answers.place)
-    _, way = np.unique(np.stack([places.drive, places.frame], 1), axis=0, return_inverse=True)  # a camera's of a drive
-    candidates = RemovalCandidates(way.ravel(), along_m, removable, answers.faded)
+    _, track = np.unique(np.stack([places.drive, places.frame], 1), axis=0, return_inverse=True)  # drive and camera
+    candidates = RemovalCandidates(track.ravel(), along_m, removable, answers.faded)
     removal, lost = remove_cross_validated(
         answers.queries, answers.place % 2 == 0, candidates, most_lost,
         lambda done: execution.progress("remove", done, total),
@@ -139,32 +141,23 @@ def _write(store: Store, new: Store, found: Condensed) -> None:
         store.mirror.rest()
     for name in ("joins", "joint"):  # they name the drives by keys that they still have
         if (store.root / name).is_dir():
-            copy_folder(store.root / name, new.root / name, f"{name} of {store} to {new}", **_LINKED)
+            copy_folder(store.root / name, new.root / name, f"{name} of {store} to {new}", copy_function=layout.link)
     if (store.root / "joint.json").is_file():
         layout.link(store.root / "joint.json", new.root / "joint.json")
-
-
-_LINKED: dict[str, Callable[..., Any]] = {"copy_function": layout.link}
 
 
 def _write_drive(store: Store, new: Store, record: Mapping[str, Any], found: Condensed, number: int) -> None:
     drive, made, first = record["drive"], new.staging / f"{os.getpid()}-condense", found.places.first
     retained, library = np.flatnonzero(found.retained[first[number] : first[number + 1]]), found.state.hash
-    other = library != record["library"]
-
-    def copied(_: Path) -> None:
-        shutil.rmtree(made, ignore_errors=True)
-        ignored = shutil.ignore_patterns("drive.json")  # it comes last: what has it is whole
-        copy_folder(store.full_run(drive), made, f"{drive} of {store} to {new}", ignore=ignored, **_LINKED)
-        if other or len(retained) < store.rows("descriptors", drive):
-            table, column = made / "descriptors.parquet", found.places.columns[number]
-            tables.write_some_descriptors(table, table, retained, column, library)
-        if other:
-            about = {"hash": library, "from": library_of(new.library(library))}
-            account = run_record.read_run_json(made / "run.json")
-            run_record.write_run_json(made / "run.json", {**account, "library": about})
-
-    store.read(drive, copied, ())
+    other, column = library != record["library"], found.places.columns[number]
+    copy_run(store, drive, new, made)
+    if other or len(retained) < len(column):
+        table = made / "descriptors.parquet"
+        tables.write_some_descriptors(table, table, retained, column, library)
+    if other:
+        about = {"hash": library, "from": library_of(new.library(library))}
+        account = run_record.read_run_json(made / "run.json")
+        run_record.write_run_json(made / "run.json", {**account, "library": about})
     named = {"library": library, layout.DESCRIBED_WITH: layout.described_with(dict(record))} if other else {}
     run_record.write_run_json(made / "drive.json", {**record, **named})
     map_store.publish(new, drive, made)

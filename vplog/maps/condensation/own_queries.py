@@ -24,14 +24,15 @@ from vplog.maps.storage.map_store import Store
 from vplog.stages import CodedState, PlaceState, index_of_part
 
 Search = Callable[[Sequence[Any], int], RankedPlaces]
-"""The best so many places for each view."""
+"""The best places of a map for some views (V,), as many as the number given for each."""
 
 BEST = 16
-"""Places that are looked up for each query at first: 192 bytes, as much as the codes of one."""
+"""Best places that are searched for each query at first: 192 bytes, as much as the codes of one."""
 PASSES = 3
-"""Later drives that come by a place without finding it, after which it has faded: fewer may all have had bad light."""
+"""Later drives that pass a place and do not find it, after which it counts as faded: fewer may all be in bad
+light."""
 HEADING_DEG = 45.0
-"""Drives that come by look the same way within this angle of the whole rotation."""
+"""Largest angle of rotation between the poses of a place and of a later drive that passes it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +48,12 @@ class OwnPlaces:
     drive: Ints
     """(N,) number of the drive."""
     frame: Ints
-    """(N,) number of the frame that the pose is in, which drives share that closures join; -1 without a pose."""
+    """(N,) number of the coordinate frame of the pose and the camera: drives that closures join share a frame; -1
+    without a pose."""
     pose: Floats
     """(N, 4, 4) world_from_body."""
     spacing_m: float = 0.0
-    """Median distance of keyframes that follow each other."""
+    """Median distance in m of consecutive keyframes."""
 
     @property
     def first(self) -> Ints:
@@ -154,8 +156,8 @@ def query_own_places(
     first, same = places.first, places.same_place(distance_m)
     matched, best = np.zeros(len(places.drive), np.bool_), dict[int, Ranking]()
 
-    def looked_for(rows: Ints, top: int) -> list[Ranking]:
-        """The best of all other places for rows of one drive."""
+    def ranked_others(rows: Ints, top: int) -> list[Ranking]:
+        """The best of all other places for each of some rows of one drive."""
         number = int(places.drive[rows[0]])
         column = places.columns[number].take(pa.array(rows - first[number]))
         found, known = search(state.from_arrow(column), min(top + 1, len(places.drive))), []
@@ -169,7 +171,7 @@ def query_own_places(
     for number in execution.counted("query", range(len(places.drives)), len(places.drives)):
         rows = np.arange(first[number], first[number + 1])
         rows = rows[places.frame[rows] >= 0]
-        for row, found in zip(rows.tolist(), looked_for(rows, BEST) if len(rows) else [], strict=True):
+        for row, found in zip(rows.tolist(), ranked_others(rows, BEST) if len(rows) else [], strict=True):
             right = same(row, found.rows)
             matched[found.rows[right & (places.drive[found.rows] < number)]] = True
             if right[:1].any():
@@ -177,13 +179,13 @@ def query_own_places(
     place = np.array(sorted(best), np.int64)
     queries = OwnQueries(
         [best[row] for row in place.tolist()],
-        lambda query, top: looked_for(place[query : query + 1], top)[0],
+        lambda query, top: ranked_others(place[query : query + 1], top)[0],
         lambda query, others: same(int(place[query]), others),
     )
     return OwnAnswers(place, queries, (later_passes(places, distance_m) >= PASSES) & ~matched)
 
 
-def shown_by_others(places: OwnPlaces, distance_m: float) -> Bools:
+def near_another(places: OwnPlaces, distance_m: float) -> Bools:
     """(N,) places with another within the distance."""
     found = np.zeros(len(places.drive), np.bool_)
     for frame in np.unique(places.frame[places.frame >= 0]).tolist():

@@ -30,10 +30,10 @@ class OwnQueries:
     deeper: Callable[[int, int], Ranking]
     """The best so many places of a query; fewer where no more share anything with it."""
     right: Callable[[int, Int32s | Ints], Bools]
-    """Whether places show that of a query."""
+    """Whether places are right answers to a query."""
 
     def some(self, chosen: Bools) -> OwnQueries:
-        """The queries that are `chosen` (Q,), as if there were no others."""
+        """The queries that are `chosen` (Q,) alone."""
         rows: list[int] = np.flatnonzero(chosen).tolist()
         return OwnQueries(
             [self.best[row] for row in rows],
@@ -61,7 +61,7 @@ class Removal:
     """Places in the order in which they are removed."""
 
     places: Ints
-    """(R,)."""
+    """(R,) places in the order of their removal."""
     lost: Ints
     """(R,) queries that are not answered rightly any more after each."""
 
@@ -183,11 +183,13 @@ def remove_cross_validated(
     most_lost: int,
     progress: Callable[[int], None] = lambda _: None,
 ) -> tuple[Removal, int]:
-    """Remove as many places (N,) as cost at most so many of the queries (Q,), and how many these cost.
+    """Remove as many places (N,) as cost at most `most_lost` of the queries (Q,) their right answer; the removal, and
+    how many it costs.
 
-    Queries that choose what goes lose hardly any of their own answers by it, and a drive that the map has not seen
-    does. So how many go is decided by the queries of one fold (Q,) on what those of the other choose, both ways round;
-    which ones, by all. Both folds are to be everywhere: where none chooses, more goes.
+    Queries by which places are chosen lose hardly any of their own answers, unlike a new drive's. So the number of
+    places is decided by twofold cross-validation: the queries of one `fold` (Q,) judge what those of the other choose,
+    both ways round. The places are chosen by all. Both folds must be spread over the map: more is removed where none
+    chooses.
     """
     losses = list[Ints]()
     for choosing in (fold, ~fold):
@@ -208,8 +210,8 @@ def remove_redundant(
     judges: OwnQueries | None = None,
     most: int | None = None,
 ) -> Removal:
-    """Remove places as long as at most so many queries are lost: of `judges`, which have no say in what goes, where
-    these are given. Of each drive one place stays. No more than `most` go."""
+    """Remove places as long as at most `most_lost` queries lose their right answer: those of `judges`, where given,
+    which do not take part in the choice. One place of each drive stays. At most `most` places are removed."""
     drive = places.drive
     remaining = _Remaining(queries, np.ones(len(drive), np.bool_))
     judging = remaining if judges is None else _Remaining(judges, np.ones(len(drive), np.bool_))

@@ -14,7 +14,7 @@ from vplog.maps.geo_bounds import DriveBounds
 from vplog.maps.joining.inter_session import Candidates, PlacesByCamera, candidates_among
 from vplog.maps.search.exact import best_places
 from vplog.maps.search.index import read_column, rows_on_keyframes, update_index
-from vplog.maps.search.sequences import PLACES_A_VIEW, drive_credits
+from vplog.maps.search.sequences import PLACES_A_VIEW, drive_votes
 from vplog.maps.storage.damage import reading_drive
 from vplog.stages import CodedState, PlaceState
 
@@ -30,8 +30,8 @@ _AT_ONCE = 64
 
 
 def places_of(store: Store, drive: str, state: PlaceState) -> Sequence[Any]:
-    """The place of each keyframe of a drive, of a condensed map the nearest; with further cameras, then those of their
-    pictures. Raises DamagedDriveError where they are of another recogniser."""
+    """The place of each keyframe of a drive, in a condensed map the nearest that it has; then those of the pictures of
+    further cameras. Raises DamagedDriveError where they are of another recogniser."""
     column, rows_of = read_column(store, drive, state), rows_on_keyframes(store, drive)
     _, nearest = rows_of.get(0, (None, None))
     if nearest is not None and len(rows_of) > 1:  # pictures of further cameras come after those of all keyframes
@@ -67,11 +67,11 @@ def drives_to_search(
     pipeline: Pipeline, execution: Execution = Execution(),
 ) -> dict[int, Collection[int]]:  # fmt: skip
     """For each drive of `later`, places by number, the drives of a lower number that it is searched in: those that may
-    be near, and where these are many the ones that hold most of what is like its views, each view for itself, by the
-    map's index. Near may be what is not known, by satellites, to be `join.apart_m` away.
+    be near, and where these are many the ones with most votes of its single views, by the map's index. A drive may be
+    near unless both have GPS bounds that are more than `join.apart_m` apart.
 
-    So what a drive more costs grows as a query of the map does, not with its drives. Maps of recognisers without an
-    index are searched drive by drive.
+    So the cost of a further drive grows as that of a query of the map, not with the number of drives. Maps of
+    recognisers without an index are searched drive by drive.
     """
     most, bounds = _CHOICE * pipeline.join.most_drives, DriveBounds(drives)
     near = {number: np.flatnonzero(bounds.near(number, pipeline.join.apart_m)[:number]) for number in later}
@@ -82,11 +82,11 @@ def drives_to_search(
     for number, views in later.items():
         if len(near[number]) <= most:
             continue
-        asked = np.full(len(drives) + 1, -1, np.int32)  # the last stands for drives that are in no part
-        asked[near[number]] = near[number]
-        before = [replace(part, numbers=asked[part.numbers]) for part in parts]
-        _, drive, credit = drive_credits(best_places(before, state, views, PLACES_A_VIEW, execution))
-        like = np.bincount(drive, credit, number)
+        numbers = np.full(len(drives) + 1, -1, np.int32)  # the last stands for drives that are in no part
+        numbers[near[number]] = near[number]
+        before = [replace(part, numbers=numbers[part.numbers]) for part in parts]
+        _, drive, votes = drive_votes(best_places(before, state, views, PLACES_A_VIEW, execution))
+        like = np.bincount(drive, votes, number)
         best = np.lexsort((np.arange(number), -like))[:most]
         searched[number] = np.sort(best[like[best] > 0]).tolist()
     return searched

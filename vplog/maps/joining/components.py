@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -30,25 +29,22 @@ from vplog.graph.build import parts
 from vplog.loops.verify import no_closures
 from vplog.maps.joining.drive_pairs import fetch_inputs
 from vplog.maps.joining.growth import Growth, LostPosesError
-from vplog.maps.joining.join_states import JoinState, write_states
+from vplog.maps.joining.join_states import JoinState, PairState, write_states
 from vplog.maps.joining.joint_graph import (
     pair_record,
     read_drive,
     solution_record,
     solve_drives,
-    write_drive,
-    write_ledgers,
+    write_component,
 )
 from vplog.maps.joining.joint_record import is_whole, read_joint, write_joint
 from vplog.maps.joining.members import Member
 from vplog.maps.storage.damage import DamagedDriveError
-from vplog.maps.storage.layout import folder_name
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline
-from vplog.results import g2o, run_record, tables
+from vplog.results import tables
 from vplog.run.cache.code_hash import code_of
 from vplog.storage.json_records import key_of
-from vplog.storage.scratch import put_in_place
 
 
 @dataclass(frozen=True)
@@ -77,8 +73,8 @@ class Drives:
         """Place of each ID in the order."""
         return {drive: at for at, drive in enumerate(self.names)}
 
-    def counts(self, later: int, pair: dict[str, Any]) -> bool:
-        """Whether the drive that a pair is with is there, before its own, and the one that it was then."""
+    def counts(self, later: int, pair: PairState) -> bool:
+        """Whether a pair is valid: the drive that `later` was verified against is unchanged and comes before it."""
         at = self.number.get(pair["match"], later)
         return at < later and self.joins[at].member == pair["match_key"]
 
@@ -147,10 +143,8 @@ def groups_of(every: Drives, pair_ledgers: Sequence[PairLedger], pipeline: Pipel
     return found
 
 
-def solve_group(
-    store: Store, group: Group, pipeline: Pipeline, library: str, staging: Path, gone: dict[str, str]
-) -> dict[str, Any]:
-    """Solve a group, and make a folder in `staging` for each component that comes of it.
+def solve_group(store: Store, group: Group, pipeline: Pipeline, library: str, gone: dict[str, str]) -> dict[str, Any]:
+    """Solve a group, and make the folder of each component that comes of it.
 
     Returns the group as joint.json has it: `components`, and the pairs kept `apart` with reasons. Drives whose ledgers
     are damaged are noted in `gone`. Raises GraphError where it cannot be solved, and ResultError where a drive's folder
@@ -165,23 +159,24 @@ def solve_group(
     for members, refined in joined.solved.items():
         names = [group.drives[member] for member in members]
         folder = f"component={key_of({'group': group.key, 'drives': names})[:16]}"
-        made = staging / folder
-        made.mkdir(parents=True, exist_ok=True)
-        g2o.write_g2o(made / "graph.g2o", refined.graph, refined.solution.world_from_body)
-        for name, member in zip(names, members, strict=True):
-            (made / folder_name(name)).mkdir(exist_ok=True)
-            write_drive(made / folder_name(name), "", drives[member], joined.world_from_body[member], header)
+        components.append({"folder": folder, "drives": names})
+        if is_whole(store, folder, names):  # of a join that was killed: it is the same
+            continue
         inside = {pair: ledger for pair, ledger in ledgers.items() if set(pair) <= set(members)}
-        write_ledgers(made / "joins.parquet", [one.keyframes for one in drives], inside, header)
+        rows = [(drives[later].keyframes, drives[earlier].keyframes, one) for (later, earlier), one in inside.items()]
         joins = [pair_record(group.drives[pair[0]], group.drives[pair[1]], one) for pair, one in inside.items()]
         record = {**solution_record(names, joins, refined), "made_from": group.key}
-        run_record.write_run_json(made / "component.json", record)  # last: it is whole
-        components.append({"folder": folder, "drives": names})
-    pairs = [(group.pair_ledgers[pair], reason) for pair, reason in sorted(joined.apart.items())]
-    apart = [
-        {"query_drive": pair.later, "match_drive": pair.earlier, "reason": reason.strip()} for pair, reason in pairs
-    ]
+        own = {name: drives[member] for name, member in zip(names, members, strict=True)}
+        poses = {name: joined.world_from_body[member] for name, member in zip(names, members, strict=True)}
+        write_component(store, folder, own, poses, rows, record, header, refined)
+    pairs = {at: (pair.later, pair.earlier) for at, pair in enumerate(group.pair_ledgers)}
+    apart = _apart_records({pairs[at]: reason for at, reason in sorted(joined.apart.items())})
     return {"key": group.key, "drives": list(group.drives), "components": components, "apart": apart}
+
+
+def _apart_records(apart: Mapping[tuple[str, str], str]) -> list[dict[str, str]]:
+    """The pairs of drives, later and earlier one, that their closures do not join, as joint.json has them."""
+    return [{"query_drive": a, "match_drive": b, "reason": reason.strip()} for (a, b), reason in apart.items()]
 
 
 def _ledger(store: Store, entry: PairLedger, gone: dict[str, str]) -> Closures:
@@ -275,12 +270,9 @@ def _grown(
             break
         except LostPosesError as error:
             lost.add(error.drive)
-    apart = [
-        {"query_drive": later, "match_drive": earlier, "reason": why.strip()}
-        for (later, earlier), why in growth.apart.items()
-    ]
     key = "" if growth.failed or damaged else group.key  # tried again
-    record = {"key": key, "drives": list(group.drives), "components": growth.records(), "apart": apart}
+    record = {"key": key, "drives": list(group.drives), "components": growth.records()}
+    record["apart"] = _apart_records(growth.apart)
     if growth.reasons or damaged:
         record["reason"] = " ".join([*growth.reasons, *damaged.values()])
     gone |= damaged
@@ -318,22 +310,12 @@ def _is_there(store: Store, component: Mapping[str, Any], checked: bool = False)
 
 
 def _solved(store: Store, group: Group, pipeline: Pipeline, library: str, gone: dict[str, str]) -> dict[str, Any]:
-    staging = store.staging / "joint"
-    shutil.rmtree(staging, ignore_errors=True)
     try:
-        record = solve_group(store, group, pipeline, library, staging, gone)
+        record = solve_group(store, group, pipeline, library, gone)
     except DamagedDriveError:  # the others are solved without it
         raise
     except VplogError as error:  # one group must not take the others along; it is tried again
         return {"key": "", "drives": list(group.drives), "components": [], "apart": [], "reason": str(error)}
     if damaged := [gone[drive] for drive in group.drives if drive in gone]:
         record |= {"key": "", "reason": " ".join(damaged)}
-    for component in record["components"]:
-        place = store.root / "joint" / component["folder"]
-        if is_whole(store, component["folder"], component["drives"]):  # of a join that was killed: it is the same
-            continue
-        place.parent.mkdir(exist_ok=True)
-        shutil.rmtree(place, ignore_errors=True)
-        put_in_place(staging / component["folder"], place)
-    shutil.rmtree(staging, ignore_errors=True)
     return record

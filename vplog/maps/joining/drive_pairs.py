@@ -13,9 +13,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from pydantic import TypeAdapter
 
 from vplog.data import SharedReferences
 from vplog.errors import ResultError
@@ -39,6 +41,7 @@ _CODE = ("vplog.maps.joining.inter_session", "vplog.features.extraction", "vplog
 less than another search of all drives is worth, and drive.json has them."""
 DRIVE_FILES = ("camera.json", "features.parquet")
 """Files that depend on the drive alone, not on its name or the other drives."""
+_CAMERA_TRUST = TypeAdapter(CameraTrust)
 _SEARCH = "vplog.maps.joining.candidate_drives"
 """The module that chooses the drives that one is searched in."""
 
@@ -63,7 +66,7 @@ class PairTask:
         """sha256 over all that the ledger depends on."""
         proposed = [getattr(self.proposals, name).tolist() for name in ("query", "match", "rank", "score", "support")]
         members = [
-            [one.drive, one.key, camera.record()]
+            [one.drive, one.key, asdict(camera)]
             for one, camera in ((self.later, self.later_camera), (self.earlier, self.earlier_camera))
         ]
         return key_of({"members": members, "proposed": proposed, **depends(self.pipeline)})
@@ -140,15 +143,15 @@ def known_camera(store: Store, member: Member, pipeline: Pipeline) -> CameraTrus
     if record.get("made_from") != _camera_key(member, pipeline):
         return None
     try:
-        known = CameraTrust.of(record)
-    except (LookupError, TypeError, ValueError, AttributeError):
+        known = _CAMERA_TRUST.validate_python(record)
+    except ValueError:
         return None
     return known if len(known.each) == len(member.cameras) else None
 
 
 def put_camera(store: Store, member: Member, pipeline: Pipeline, camera: CameraTrust) -> None:
     """Store the camera of a drive. Raises ResultError."""
-    record = {"drive": member.drive, **camera.record(), "made_from": _camera_key(member, pipeline)}
+    record = {"drive": member.drive, **asdict(camera), "made_from": _camera_key(member, pipeline)}
     run_record.write_run_json(folder_of(store, member.drive) / "camera.json", record)
 
 

@@ -8,9 +8,9 @@ what they were: its entry in `judged`.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,16 +29,14 @@ from vplog.maps.joining.joint_graph import (
     verified,
     verified_closures,
     with_solve,
-    write_drive,
-    write_ledgers,
+    write_component,
 )
 from vplog.maps.joining.joint_record import fetch_poses, is_whole
 from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.layout import folder_name
 from vplog.maps.storage.map_store import Store
-from vplog.results import run_record, tables
+from vplog.results import tables
 from vplog.storage.json_records import key_of
-from vplog.storage.scratch import put_in_place
 
 if TYPE_CHECKING:
     from vplog.pipeline import Pipeline
@@ -75,15 +73,16 @@ class Part:
 
 
 class Growth:
-    """The components of a group of drives, drive after drive."""
+    """The components of a group of drives, to which drives are added one by one."""
 
     def __init__(
         self, store: Store, pipeline: Pipeline, header: tables.TableMetadata, judged: Mapping[str, str],
         known: Iterable[Mapping[str, Any]], stays: Sequence[str],
         pairs: Mapping[tuple[str, str], Callable[[], Closures]],
     ) -> None:  # fmt: skip
-        """`known` are components of joint.json, of whose drives those of `stays` are as they were; `judged` are keys of
-        all that a drive's closures are decided by, and `pairs` read the ledger of each pair as geometry has left it.
+        """`known` are components of joint.json, and `stays` those of their drives that are unchanged. `judged` has, by
+        drive, a hash of all that its closures are decided by; `pairs` read the ledger of each pair after geometric
+        verification, before any joint solve.
         """
         self._store, self._pipeline, self._header, self._judged, self._pairs = store, pipeline, header, judged, pairs
         self.apart: dict[tuple[str, str], str] = {}
@@ -234,25 +233,16 @@ class Growth:
     ) -> str:  # fmt: skip
         """Write a folder of MAP/joint for these drives, and return its name."""
         name = f"component={key_of(made_from)[:16]}"
-        made, place = self._store.staging / "joint" / name, self._store.root / "joint" / name
         if is_whole(self._store, name, list(poses)):  # of a join that was killed; its name says that it is the same
             return name
-        shutil.rmtree(made, ignore_errors=True)
         drives = {drive: known.get(drive) or self._drive(drive) for drive in poses}
-        for drive, one in drives.items():
-            (made / folder_name(drive)).mkdir(parents=True)
-            write_drive(made / folder_name(drive), "", one, poses[drive], self._header)
-        ends = {one: None for pair in ledgers for one in pair}
-        number = {drive: at for at, drive in enumerate(ends)}
-        numbered = {(number[later], number[earlier]): one for (later, earlier), one in ledgers.items()}
-        write_ledgers(made / "joins.parquet", [self._keyframes(one)[0] for one in ends], numbered, self._header)
+        keyframes = {one: self._keyframes(one)[0] for one in set(chain.from_iterable(ledgers))}
+        rows = [(keyframes[later], keyframes[earlier], one) for (later, earlier), one in ledgers.items()]
         record = {"drives": list(poses), "joins": [pair_record(*pair, one) for pair, one in ledgers.items()]}
         if refined is not None:
             record = solution_record(list(poses), [], refined)
-        run_record.write_run_json(made / "component.json", {**record, "made_from": key_of(made_from)})
-        place.parent.mkdir(exist_ok=True)
-        shutil.rmtree(place, ignore_errors=True)
-        put_in_place(made, place)
+        about = {**record, "made_from": key_of(made_from)}
+        write_component(self._store, name, drives, poses, rows, about, self._header)
         return name
 
     def _drive(self, drive: str) -> SolvedDrive:

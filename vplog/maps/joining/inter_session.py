@@ -62,8 +62,9 @@ def _cameras(places: Sequence[Any]) -> list[slice]:
 def proposed_by_cameras(
     later: Sequence[Any], earlier: Sequence[Any], state: PlaceState, pipeline: Pipeline, execution: Execution
 ) -> tuple[Proposals, Proposals]:
-    """The candidates of the places `later` among those of one drive, of the same cameras and of any two others: between
-    these places of a way may come in either order, and a score of single views is none of a line of them."""
+    """The candidates of the places `later` among those of one drive: between pictures of the same camera, and between
+    those of different ones. The latter are ranked view by view, since two cameras may pass the places of a road in
+    opposite order; their scores do not compare with those of sequences."""
     same, crossed = [propose([], ProposeSettings())], [propose([], ProposeSettings())]
     alone = pipeline.model_copy(update={"sequence": VIEW_BY_VIEW})
     others_of = {m: others for m, others in enumerate(_cameras(earlier)) if others.start < others.stop}
@@ -94,7 +95,7 @@ def proposed_in(
 
 
 def with_proposals(known: Candidates, number: int, more: Proposals, pipeline: Pipeline) -> Candidates:
-    """The candidates with those in a drive more.
+    """The candidates with those in one more drive.
 
     `propose.per_query` limits the candidates of a query over all drives, as it does within one: the cost of verifying a
     drive does not grow with the map. Ties go to the drive of lower number, in whatever order they are searched.
@@ -147,6 +148,7 @@ def candidates_among(
 
 
 def _with_crossed(same: Candidates, crossed: Candidates) -> Candidates:
+    """Candidates of the same and of different cameras together, by query."""
     drive, every = np.concatenate([same.drive, crossed.drive]), joined([same.proposals, crossed.proposals])
     order = np.argsort(every.query, kind="stable")
     return Candidates(drive[order], every.rows(order))
@@ -196,7 +198,7 @@ def closures_between(
     execution: Execution,
     fetch: Callable[[Int32s, Int32s], None] = lambda *_: None,
 ) -> Closures:
-    """The ledger of the candidates of one drive's keyframes (queries) in another (matches), those that are verified.
+    """The ledger of the verified candidates of one drive's keyframes (queries) in another (matches).
 
     The best candidates of the highest-scoring queries come first. Where geometry confirms none of them, the drives
     share no place; else the best of each other query follows, and then all candidates of the queries around confirmed
@@ -227,10 +229,12 @@ def closures_between(
             others[best] = False
             verify_rows(np.flatnonzero(others))
     ledger = merged([ledger for _, ledger in verified], [rows for rows, _ in verified])
-    return _rated(ledger, later, earlier, pipeline.false_rate, execution) if evidence(ledger).any() else ledger
+    return (
+        _with_false_rate(ledger, later, earlier, pipeline.false_rate, execution) if evidence(ledger).any() else ledger
+    )
 
 
-def _rated(
+def _with_false_rate(
     ledger: Closures, later: Drive, earlier: Drive, settings: FalseRateSettings, execution: Execution
 ) -> Closures:
     """The ledger with `p_false`, and without what is likelier to be false than `settings.rate`."""

@@ -65,7 +65,7 @@ class _Work:
 
 
 def load_places(library: Path, pipeline: Pipeline, execution: Execution = Execution()) -> PlaceState:
-    """The map's library as `join` compares places by it: what can be done while the drives are still computed.
+    """The map's library, by which `join` compares places: it can be loaded while drives are still computed.
 
     The code hashes that joins depend on are read along, once. Raises LibraryError.
     """
@@ -192,8 +192,9 @@ def read_drives(store: Store, urls: Mapping[str, str]) -> Drives:
 
 
 def _out_of_date(store: Store, drives: Drives, pipeline: Pipeline) -> list[int]:
-    """Numbers of the drives that are to be searched: a drive that is gone has taken candidates that others might have.
-    Of many drives no ledger is read for that: one that is damaged is made again once it was needed."""
+    """Numbers of the drives whose candidates are to be searched again: new and changed ones, and those with a pair
+    whose other drive was removed, as that took candidates from others. Of more drives than `join.judged_anew` no ledger
+    is read for that: a damaged one is made again when a solve needs it."""
     made_from = drive_pairs.search_key(pipeline)
     new = [
         at
@@ -223,7 +224,8 @@ def _search(work: _Work, places: Callable[[], PlaceState] | None) -> list[DriveP
 
 
 def _verify(work: _Work, wanted: Sequence[DrivePair]) -> tuple[int, dict[tuple[str, str], str]]:
-    """Store the ledgers that are not there yet; how many those were, and why others could not be made, by drives."""
+    """Compute and store the ledgers that are missing; their number, and why others failed, by later and earlier
+    drive."""
     store, drives, progress = work.store, work.drives, work.execution.progress
     names = [(drives.names[one.later], drives.names[one.earlier]) for one in wanted]
     drive_pairs.fetch_inputs(store, names, [drives.names[at] for at in _paired(work, wanted)])

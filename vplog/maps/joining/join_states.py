@@ -7,9 +7,14 @@ So a join reads one file for hundreds of drives, and new drives touch the last o
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Collection, Iterable
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Annotated, NotRequired
+
+from pydantic import AfterValidator, TypeAdapter
+from typing_extensions import TypedDict  # as pydantic needs it below Python 3.12
 
 from vplog.errors import ResultError
 from vplog.storage.compressed_json import read_compressed, write_compressed
@@ -20,7 +25,23 @@ if TYPE_CHECKING:
 STATES = "states-"
 _OF_EACH = 512
 """Positions of a file: with 30 pairs a drive it has some 5 MB, a tenth of that compressed."""
-_PAIR = {"match": str, "match_key": str, "candidates": int, "verified": int, "ledger": str}
+_Text = Annotated[str, AfterValidator(sys.intern)]
+"""A text that many states have, in memory once."""
+
+
+class PairState(TypedDict):
+    """A drive that another one was verified against."""
+
+    match: _Text
+    match_key: _Text
+    """`Member.key` of that drive."""
+    candidates: int
+    verified: int
+    """Candidates that geometry confirmed."""
+    ledger: str
+    """Key of the ledger; empty where the pair was left out."""
+    reason: NotRequired[str]
+    """Why it was left out."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +57,9 @@ class JoinState:
     """Key of that in its drive.json; empty where it is not known."""
     gps: bool = False
     """Whether it was solved with GPS factors."""
-    made_from: str = ""
+    made_from: _Text = ""
     """sha256 over what the pairs depend on, beside the drives before it; empty as long as they are not all there."""
-    pairs: tuple[dict[str, Any], ...] = ()
-    """`match`, `match_key` (the drive's), `candidates`, `verified`, and `ledger`, its key, empty where it is
-    left out; `reason` then says why."""
+    pairs: tuple[PairState, ...] = ()
 
     def why_apart(self, library: str, made_by: str) -> str:
         """Why it is joined with no other, by the libraries of the map and of the drive; empty where it may be."""
@@ -57,19 +76,18 @@ class JoinState:
         return ""
 
 
+_STATES = TypeAdapter(list[JoinState])
+
+
 def read_states(store: Store, drives: Collection[str]) -> dict[str, JoinState]:
     """The states that are known of these drives; of a damaged file none."""
     files = sorted(f"joins/{name}" for name in store.names_beside("joins") if name.startswith(STATES))
     store.fetch_beside(files)
-    found, text = dict[str, JoinState](), dict[str, str]()
+    found = dict[str, JoinState]()
     for name in files:
-        try:
-            rows = read_compressed(store.root / name)
-        except ResultError:
-            continue
-        for row in rows if isinstance(rows, list) else ():
-            if (state := _state(row, text)) is not None and state.drive in drives:
-                found[state.drive] = state
+        with suppress(ResultError, ValueError):
+            states = _STATES.validate_python(read_compressed(store.root / name))
+            found |= {state.drive: state for state in states if state.drive in drives}
     return found
 
 
@@ -82,23 +100,3 @@ def write_states(store: Store, states: Iterable[JoinState], changed: Collection[
         if any(one.drive in changed for one in inside):
             rows = [asdict(one) for one in sorted(inside, key=lambda one: (one.position, one.drive))]
             write_compressed(store.root / "joins" / f"{STATES}{number:05d}.json.gz", rows)
-
-
-def _state(row: Any, text: dict[str, str]) -> JoinState | None:
-    """A state by its record, equal texts as one; None where it is none, without pairs where these are damaged."""
-    try:
-        own = JoinState(row["drive"], row["position"], row["member"], row.get("key", ""), row.get("gps", False))
-        made_from, pairs = row["made_from"], row["pairs"]
-    except (KeyError, TypeError, AttributeError):
-        return None
-    kinds = {"drive": str, "position": int, "member": str, "key": str, "gps": bool}
-    if any(not isinstance(getattr(own, name), kind) for name, kind in kinds.items()) or not isinstance(made_from, str):
-        return None
-    if not isinstance(pairs, list) or any(
-        not isinstance(pair, dict) or any(not isinstance(pair.get(name), kind) for name, kind in _PAIR.items())
-        for pair in pairs
-    ):
-        return own
-    for pair in pairs:
-        pair |= {name: text.setdefault(pair[name], pair[name]) for name in ("match", "match_key")}
-    return replace(own, made_from=text.setdefault(made_from, made_from), pairs=tuple(pairs))

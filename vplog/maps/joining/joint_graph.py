@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,10 +17,13 @@ from vplog.graph.correct_trajectory import correct_trajectory
 from vplog.graph.refine import Refined, about_odometry
 from vplog.loops.false_rate import log_odds_false
 from vplog.maps.storage.damage import reading_drive
-from vplog.results import tables
+from vplog.maps.storage.layout import folder_name
+from vplog.results import g2o, run_record, tables
 from vplog.run.back_end import by_odometry
+from vplog.storage.scratch import put_in_place
 
 if TYPE_CHECKING:
+    from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
 
     Ledgers = Mapping[tuple[int, int], Closures]
@@ -104,10 +108,25 @@ def solution_record(drives: Sequence[str], joins: Sequence[dict[str, Any]], refi
     }
 
 
-def write_ledgers(path: Path, drives: Sequence[Keyframes], ledgers: Ledgers, header: tables.TableMetadata) -> None:
-    """The table of the candidates of all pairs."""
-    rows = [(drives[later], drives[earlier], ledger) for (later, earlier), ledger in ledgers.items()]
-    tables.write_joins(path, rows, header)
+def write_component(
+    store: Store, name: str, drives: Mapping[str, SolvedDrive], poses: Mapping[str, Floats],
+    ledgers: Sequence[tuple[Keyframes, Keyframes, Closures]], record: dict[str, Any], header: tables.TableMetadata,
+    refined: Refined | None = None,
+) -> None:  # fmt: skip
+    """A folder of MAP/joint: the tables of drives at these poses (N, 4, 4) each, the ledgers between them, and the
+    graph where it was solved as a whole. Raises ResultError."""
+    made, place = store.staging / "joint" / name, store.root / "joint" / name
+    shutil.rmtree(made, ignore_errors=True)
+    for drive, one in drives.items():
+        (made / folder_name(drive)).mkdir(parents=True)
+        write_drive(made / folder_name(drive), "", one, poses[drive], header)
+    if refined is not None:
+        g2o.write_g2o(made / "graph.g2o", refined.graph, refined.solution.world_from_body)
+    tables.write_joins(made / "joins.parquet", ledgers, header)
+    run_record.write_run_json(made / "component.json", record)
+    place.parent.mkdir(exist_ok=True)
+    shutil.rmtree(place, ignore_errors=True)
+    put_in_place(made, place)
 
 
 def write_drive(
@@ -122,7 +141,7 @@ def write_drive(
 
 
 def verified(ledger: Closures) -> Ints:
-    """Rows of the closures that geometry has verified, whatever a solve has said of them since."""
+    """Rows of the closures that geometry has verified, whatever a later solve made of them."""
     return np.flatnonzero(ledger.accepted | np.isfinite(ledger.weight))
 
 

@@ -4,25 +4,43 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NotRequired
+
+from pydantic import TypeAdapter
+from typing_extensions import TypedDict  # as pydantic needs it below Python 3.12
 
 from vplog.data import Floats
 from vplog.errors import ResultError
 from vplog.maps.storage.damage import damaged_table, reading_drive
-from vplog.maps.storage.layout import folder_name, write_changed
+from vplog.maps.storage.layout import Below, folder_name, write_changed
 from vplog.maps.storage.map_store import Store
 from vplog.results import run_record, tables
-from vplog.storage.folders import is_below
 from vplog.storage.parquet_limits import check_version
 
 
 class Component(NamedTuple):
-    """Drives that closures join, as one of them is among them."""
+    """The component of one drive: the drives that closures join with it, and where its own poses are."""
 
     folder: Path
-    """Where the drive's poses are."""
+    """Folder in MAP/joint with the poses of that drive."""
     drives: Sequence[str]
     """The frame is that of the first."""
+
+
+class _Component(TypedDict):
+    folder: Below
+    """In MAP/joint, of the last solve of the whole."""
+    drives: list[str]
+    grown: NotRequired[dict[str, Below]]
+    """Folders of the drives that came or moved since."""
+
+
+class _Group(TypedDict):
+    key: str
+    components: list[_Component]
+
+
+_GROUPS = TypeAdapter(list[_Group])
 
 
 def read_joint(root: Path) -> dict[str, Any]:
@@ -37,30 +55,12 @@ def read_joint(root: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     record = run_record.read_run_json(path)
-    groups = record.get("groups")
-    sound = isinstance(groups, list) and all(
-        isinstance(group, dict)
-        and isinstance(group.get("key"), str)
-        and isinstance(group.get("components"), list)
-        and all(map(_is_component, group["components"]))
-        for group in groups
-    )
     check_version(path, record.get("format"), run_record.FORMAT)
-    if not sound:
-        raise ResultError(f"{path} is damaged. Write it again: vplog map join {root}")
+    try:
+        _GROUPS.validate_python(record.get("groups"))
+    except ValueError:
+        raise ResultError(f"{path} is damaged. Write it again: vplog map join {root}") from None
     return record
-
-
-def _is_component(record: Any) -> bool:
-    if not isinstance(record, dict):
-        return False
-    drives, grown = record.get("drives"), record.get("grown", {})
-    return (
-        isinstance(drives, list)
-        and all(isinstance(one, str) for one in drives)
-        and isinstance(grown, dict)
-        and all(map(is_below, (record.get("folder"), *grown.values())))
-    )
 
 
 def is_whole(store: Store, folder: str, drives: Sequence[str]) -> bool:
@@ -85,8 +85,7 @@ def fetch_poses(store: Store, folders: Mapping[str, str]) -> None:
 def components_in(store: Store) -> list[dict[str, Any]] | None:
     """The components that count: `folder` in MAP/joint and `drives`, in order of their first drives; None where nothing
     was joined yet. Raises ResultError where the record is damaged."""
-    if store.mirror is not None:
-        store.mirror.rest(["joint.json"])
+    store.fetch_beside(["joint.json"])
     groups = read_joint(store.root).get("groups")
     return groups and [component for group in groups for component in group["components"]]
 
@@ -106,8 +105,7 @@ def keyframe_poses(store: Store, joint: Mapping[str, Component], drive: str) -> 
         with reading_drive(drive):
             return tables.read_keyframes(store.file(drive, "keyframes.parquet"))[1]
     path = joint[drive].folder / folder_name(drive) / "keyframes.parquet"
-    if store.mirror is not None:
-        store.mirror.rest([path.relative_to(store.root).as_posix()])
+    store.fetch_beside([path.relative_to(store.root).as_posix()])
     try:
         return tables.read_keyframes(path)[1]
     except ResultError:

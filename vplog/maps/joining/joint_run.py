@@ -24,7 +24,7 @@ from vplog.maps.joining.inter_session import (
     closures_by_cameras,
     likely_pairs,
 )
-from vplog.maps.joining.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive, write_ledgers
+from vplog.maps.joining.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive
 from vplog.pipeline import Pipeline, Run
 from vplog.pipeline import run as run_alone
 from vplog.results import g2o, run_record, tables
@@ -101,7 +101,9 @@ def run_joint(
             joined, ledgers = solve_drives([drive_run.solved for drive_run in drives], ledgers, pipeline)
         with watch.stage("write"):
             header = tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash)
-            write_ledgers(made / "joins.parquet", [one.solved.keyframes for one in drives], ledgers, header)
+            keyframes = [one.solved.keyframes for one in drives]
+            rows = [(keyframes[later], keyframes[earlier], one) for (later, earlier), one in ledgers.items()]
+            tables.write_joins(made / "joins.parquet", rows, header)
             _write_maps(made, drives, joined, header)
         record = {
             **head,

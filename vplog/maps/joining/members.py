@@ -93,7 +93,7 @@ def member_of(store: Store, about: dict[str, Any]) -> Member:
     topics, cameras = account.get("topics"), tuple(camera_topics(account))
     if len(cameras) > 1:
         described = store.run(drive, ["descriptors.parquet", "trajectory.parquet"]) / "descriptors.parquet"
-        cameras = cameras[: int(tables.read_pictures(described)[1].max(initial=0)) + 1]  # an older run has the first
+        cameras = cameras[: int(tables.read_pictures(described)[1].max(initial=0)) + 1]  # a map may describe fewer
     made_from = {
         "inputs": about["inputs"],
         "library": described_with(about),
@@ -111,7 +111,7 @@ def member_of(store: Store, about: dict[str, Any]) -> Member:
 
 
 def opened_log(member: Member, check: bool = False) -> Log:
-    """Raises LogError where it is not there any more or, with `check`, another one."""
+    """The log of a drive. Raises LogError where it is not there any more or, with `check`, has changed."""
     path = stored_log(member.log, f"The log of {member.drive}", "Give it again: vplog batch LOG -o MAP")
     try:
         log, found = logs.open_drive([path], member.topics), hash_inputs(path) if check else {}
@@ -127,7 +127,7 @@ class CameraTrust:
     """The camera of a drive, and how far its calibration is trusted."""
 
     camera: dict[str, Any]
-    """Plain values."""
+    """The camera's record as plain values."""
     rotation_share: float
     """Share of a rotation by which camera and odometry disagree; 0 without calibration."""
     further: tuple[CameraTrust, ...] = ()
@@ -135,19 +135,8 @@ class CameraTrust:
 
     @property
     def each(self) -> tuple[CameraTrust, ...]:
-        """That of every camera, the first one's first."""
+        """All cameras of the drive with their trust, the first camera first."""
         return self, *self.further
-
-    def record(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        more = {"further": [one.record() for one in self.further]} if self.further else {}
-        return {"camera": self.camera, "rotation_share": self.rotation_share, **more}
-
-    @classmethod
-    def of(cls, record: dict[str, Any]) -> CameraTrust:
-        """The camera that a record names. Raises LookupError, TypeError or ValueError where it is damaged."""
-        further = tuple(cls.of(dict(one)) for one in record.get("further", ()))
-        return cls(dict(record["camera"]), float(record["rotation_share"]), further)
 
 
 def camera_trust(member: Member, verify: VerifySettings, execution: Execution) -> CameraTrust:

@@ -53,15 +53,15 @@ class Landmarked(NamedTuple):
     one those with a descriptor."""
 
     keyframe: Ints
-    """(P,)."""
+    """(P,) rows of the keyframes."""
     camera: Ints
     """(P,) numbers."""
     world_from_body: Floats
     """(P, 4, 4) at the stamps of the pictures."""
     earth: Earth | None
-    """Pose of that frame on earth."""
+    """Pose on earth of the frame of these poses; None without satellite fixes."""
     tables: Mapping[int, LandmarkTable]
-    """By camera."""
+    """Landmarks of each camera, by its number."""
 
     def landmarks(self, row: int, settings: VerifySettings) -> KeyframeLandmarks:
         """The landmarks of a picture. Raises ResultError where their file is damaged."""

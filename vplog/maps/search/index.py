@@ -7,7 +7,6 @@ content, so MAP/index alone determines which segments serve. The folder may be r
 
 from __future__ import annotations
 
-import hashlib
 import os
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,10 +24,9 @@ from vplog.errors import LibraryError, ResultError
 from vplog.execution.execution import Execution
 from vplog.maps.search.segment import SUFFIX, Content, Segment, open_segment, write_segment
 from vplog.maps.storage.contents import library_mismatch
-from vplog.maps.storage.damage import DamagedDriveError, reading_drive
+from vplog.maps.storage.damage import DamagedDriveError, files_of, reading_drive
 from vplog.maps.storage.layout import ADD_AGAIN
 from vplog.results import tables
-from vplog.storage.parquet_limits import check_file, footer_start
 
 if TYPE_CHECKING:
     from vplog.maps.storage.map_store import Store
@@ -43,13 +41,13 @@ _LEFT_OVER_S = 86_400.0
 
 @dataclass(frozen=True, eq=False)
 class SegmentView:
-    """A segment as a search uses it."""
+    """A segment, and which of its drives a search takes from it."""
 
     segment: Segment
     path: Path | None
     """None where it is in memory alone."""
     numbers: Int32s
-    """(D,) number of each of its drives in the map; -1 where the map has it no more, or another part has it."""
+    """(D,) number of each of its drives in the map; -1 where the map no longer has it, or another segment has it."""
     stored: StoredFile | None = None
     """Where a map on an object store has it, for other machines."""
 
@@ -59,7 +57,7 @@ class SegmentView:
         return int(np.diff(self.segment.first)[self.numbers >= 0].sum())
 
     def of(self, numbers: Iterable[int]) -> SegmentView:
-        """Without the drives of other numbers."""
+        """The segment with the drives of these numbers alone."""
         return replace(
             self, numbers=np.where(np.isin(self.numbers, np.fromiter(numbers, np.int32)), self.numbers, np.int32(-1))
         )
@@ -103,27 +101,9 @@ def update_index(
 
 
 def content_of(store: Store, drive: str, about: Mapping[str, Any]) -> Content:
-    """The drive's content by its drive.json or, on an object store, its manifest. Raises ResultError."""
-    files = about.get("files") if store.mirror is None else store.mirror.drives[drive]["files"]
-    entry = files.get("descriptors.parquet") if isinstance(files, dict) else None
-    if isinstance(entry, dict) and isinstance(mark := entry.get("sha256"), str):
-        return Content(drive, about["key"], mark)
-    with reading_drive(drive):
-        return Content(drive, about["key"], _footer_hash(store.file(drive, "descriptors.parquet")))
-
-
-def _footer_hash(path: Path) -> str:
-    try:
-        check_file(path)
-        with path.open("rb") as stream:
-            start = footer_start(stream)
-            if start < 0 or stream.read() != b"PAR1":
-                raise ResultError(f"{path} is damaged. Copy it back, or {ADD_AGAIN}")
-            stream.seek(start)
-            return hashlib.sha256(stream.read()[:-8]).hexdigest()
-    except OSError as error:
-        why = error.strerror or error
-        raise ResultError(f"{path} cannot be read: {why}. Check its permissions, or {ADD_AGAIN}") from None
+    """The drive's content by its drive.json or, on an object store, its manifest."""
+    files = files_of(about) if store.mirror is None else store.mirror.drives[drive]["files"]
+    return Content(drive, about["key"], str(files.get("descriptors.parquet", {}).get("sha256", "")))
 
 
 def _open_all(store: Store, state: CodedState) -> tuple[list[tuple[Segment, Path]], list[Path], list[str]]:

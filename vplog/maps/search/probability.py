@@ -1,7 +1,8 @@
-"""How probable it is that the best answer to each view is its place, learned on the answers themselves.
+"""Probability that the best answer to each view is its place, learned on the answers themselves.
 
-What look-alike places of the answer's own drive score tells what the best of them would: other drives may show the same
-place, and say nothing of look-alikes. A map is larger than one drive, and the best of more of them scores higher.
+It is compared with the best score that look-alike places would reach, which is estimated from the answer's own drive:
+other drives may show the same place, and are no look-alikes. The estimate is scaled up to the size of the map, since
+the best of more look-alikes scores higher.
 """
 
 from __future__ import annotations

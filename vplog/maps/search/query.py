@@ -21,7 +21,7 @@ from vplog.maps.geo_bounds import Box, DriveBounds, box_of_fixes
 from vplog.maps.search.exact import RankedPlaces, best_places
 from vplog.maps.search.index import SegmentView, pictures_of, read_column, update_index
 from vplog.maps.search.probability import answer_probabilities
-from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, LineSearch, best_lines, drives_by_credit
+from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, LineSearch, best_lines, drives_by_votes
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import reading_drive
@@ -245,7 +245,7 @@ def search(
             return best_places(parts, state, descriptors, min(query.top, places), execution, executor), warnings
         if places > EXACT_PLACES:
             single = best_places(parts, state, descriptors, PLACES_A_VIEW, execution, executor)
-            numbered = {number: numbered[number] for number in drives_by_credit(single, lines.settings.length).tolist()}
+            numbered = {number: numbered[number] for number in drives_by_votes(single, lines.settings.length).tolist()}
             warnings.append(f"Sequences were searched in the {len(numbered)} of {count} drives most like single views.")
         elif executor is not None:
             warnings.append(f"Ray was not used: sequences in maps of up to {EXACT_PLACES} places are searched here.")

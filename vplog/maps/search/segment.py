@@ -49,7 +49,7 @@ class Content:
     """Key in drive.json: hash of all that the drive was made from."""
     mark: str
     """sha256 of its descriptors.parquet by drive.json or the manifest, which differs between tables even where the key
-    is the same; in a map of an older vplog that of its footer."""
+    is the same."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 EXACT_PLACES = 200_000
 """Up to so many places lines are drawn in every drive: some minutes of one core for a log of a thousand views."""
 PLACES_A_VIEW = 100
-"""Best places of each single view that vote for their drives."""
+"""Best places of each single view, which vote for their drives."""
 _DRIVES_A_STRETCH = 8
 """Drives chosen for each stretch of views as long as a window."""
 _SINGLE_VIEWS = SequenceSettings(length=1)
@@ -124,22 +124,20 @@ class _OnKeyframes:
         return best_rows(self.scores(descriptor, stop), k)
 
 
-def drives_by_credit(single: RankedPlaces, length: int) -> Ints:
-    """Numbers of the drives in which lines may be, rising, by the best places of each single view.
-
-    Stretches of `length` views, each half over the last, name the drives with most credit.
-    """
-    view, drive, credit = drive_credits(single)
+def drives_by_votes(single: RankedPlaces, length: int) -> Ints:
+    """Numbers of the drives in which lines may be, increasing: for each stretch of `length` views, each half over the
+    last, those with most votes of the best places of single views."""
+    view, drive, votes = drive_votes(single)
     chosen = []
     for start in range(0, len(single.score), max(length // 2, 1)):
         part = slice(*np.searchsorted(view, [start, start + length]))
-        total = np.bincount(drive[part], credit[part])
+        total = np.bincount(drive[part], votes[part])
         best = np.argsort(-total, kind="stable")[:_DRIVES_A_STRETCH]
         chosen.append(best[total[best] > 0])
     return np.unique(np.concatenate(chosen)) if chosen else np.empty(0, np.int64)
 
 
-def drive_credits(single: RankedPlaces) -> tuple[Ints, Int32s, Floats]:
+def drive_votes(single: RankedPlaces) -> tuple[Ints, Int32s, Floats]:
     """(C,) views, rising, drives, and the vote of each view for the drive.
 
     A vote is the score of the drive's best place less that of the last of the view's places, so a view that resembles
@@ -149,11 +147,11 @@ def drive_credits(single: RankedPlaces) -> tuple[Ints, Int32s, Floats]:
     there = single.score > NO_SCORE
     least = np.where(there, single.score, np.inf).min(axis=1, initial=np.inf)
     full = there.sum(axis=1) == top
-    credit = np.where(there, single.score - np.where(full, least, 0.0)[:, None] + np.float32(1e-6), 0.0)
+    votes = np.where(there, single.score - np.where(full, least, 0.0)[:, None] + np.float32(1e-6), 0.0)
     view, rank = np.nonzero(there)
     order = np.lexsort((rank, single.drive[view, rank], view))
     view, rank = view[order], rank[order]
     drive = single.drive[view, rank]
     first = np.ones(len(view), np.bool_)  # a drive's best place for a view comes first
     first[1:] = (view[1:] != view[:-1]) | (drive[1:] != drive[:-1])
-    return view[first], drive[first], credit[view[first], rank[first]].astype(np.float64)
+    return view[first], drive[first], votes[view[first], rank[first]].astype(np.float64)

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from urllib.parse import unquote
 
 from vplog.errors import LibraryError, NewerError, ResultError, nearest_path
-from vplog.maps.geo_bounds import earth_from_record, earth_of_run
+from vplog.maps.geo_bounds import earth_from_record
 from vplog.maps.storage.catalogue import Entry, read_catalogue, state_of, write_catalogue
 from vplog.maps.storage.damage import (
     DamagedDriveError,
@@ -73,17 +73,12 @@ class Store:
         return self.root / "index"
 
     @property
-    def joint_damage(self) -> str:
-        """Why a writer has dropped the joint graphs of a map on an object store; empty where it has not."""
-        return "" if self.mirror is None else self.mirror.rest_damage
-
-    @property
     def staging(self) -> Path:
-        """Hidden folder on the map's file system, where a writer makes what it renames in."""
+        """Hidden folder on the map's file system, where a writer makes what it then renames into the map."""
         return self.root / ".staging"
 
     def run(self, drive: str, names: Iterable[str] = RUN_TABLES) -> Path:
-        """The run folder; of a map on a store with these of its files."""
+        """The run folder; of a map on an object store a local one, into which these of its files are fetched."""
         if self.mirror is not None:
             self.mirror.fetch(drive, names)
         return self.root / "runs" / folder_name(drive)
@@ -102,7 +97,7 @@ class Store:
             self.mirror.evict(drive)
 
     def library(self, digest: str, names: Collection[str] = ()) -> Path:
-        """The folder of a library; of a map on a store with all of its files, or these."""
+        """The folder of a library; of a map on an object store a local one, into which its files are fetched."""
         if self.mirror is not None:
             self.mirror.library(digest, names)
         return self.root / "libraries" / digest
@@ -133,8 +128,7 @@ class Store:
     def earth(self, drive: str) -> Earth | None:
         """The georeference of a drive, None where it has none. Raises DamagedDriveError."""
         with reading_drive(drive):
-            about = self.record(drive)
-            return earth_from_record(about["earth"]) if "earth" in about else earth_of_run(self.full_run(drive))
+            return earth_from_record(self.record(drive).get("earth"))
 
     def record(self, drive: str) -> dict[str, Any]:
         """drive.json of a drive. Raises ResultError."""
@@ -146,7 +140,7 @@ class Store:
 
     def figures(self, drive: str) -> dict[str, Any]:
         """run.json of a drive; of a map on a store its counts, totals and warnings. Raises ResultError."""
-        known = None if self.mirror is None else self.mirror.drives[drive].get("run")
+        known = None if self.mirror is None else self.mirror.drives[drive]["run"]
         return known or run_record.read_run_json(self.file(drive, "run.json"))
 
     @property
@@ -369,8 +363,9 @@ def skip_damaged(store: Store, work: Callable[[], T]) -> T:
 
 def damage_warnings(store: Store) -> list[str]:
     """A warning for each damaged drive of a map, with the remedy that fits a map."""
-    dropped = f"{store.joint_damage}: the joint graphs are dropped. Join the drives again: vplog map join {store}"
-    return [dropped] * bool(store.joint_damage) + [
+    why = "" if store.mirror is None else store.mirror.rest_damage
+    dropped = f"{why}: the joint graphs are dropped. Join the drives again: vplog map join {store}"
+    return [dropped] * bool(why) + [
         f"{drive} is damaged and left out: {why.partition('. ')[0].rstrip('.')}. "
         f"Compute it again from its log: vplog batch LOG -o {store}"
         for drive, why in sorted(store.damaged.items())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -43,8 +43,8 @@ def reading_drive(drive: str) -> Iterator[None]:
 
 def check_run_tables(folder: Path, record: dict[str, Any]) -> None:
     """Raises ResultError where run.json or a table of a drive is missing or, tables by their length, not as drive.json
-    has it. A drive.json of an older vplog has no lengths: then damage is found when the file is read."""
-    files = _files(record)
+    has it. Without lengths in drive.json damage is found when the file is read."""
+    files = files_of(record)
     for name in RUN_TABLES if files else ():
         if wrong := _difference(folder / name, files.get(name, {}), hashed=name == "run.json"):
             raise ResultError(wrong)
@@ -53,7 +53,7 @@ def check_run_tables(folder: Path, record: dict[str, Any]) -> None:
 def damaged_files(folder: Path) -> list[str]:
     """A line for each file of a run folder in a map that does not have the length and sha256 that drive.json names."""
     try:
-        files = _files(drive_record(folder))
+        files = files_of(drive_record(folder))
     except ResultError as error:
         return [str(error)]
     lines = (_difference(folder / name, files.get(name, {})) for name in sorted({*RUN_TABLES, *files}))
@@ -111,8 +111,8 @@ def _difference(path: Path, wanted: dict[str, Any], hashed: bool = True) -> str:
     return ""
 
 
-def _files(record: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Length and sha256 of each file, by drive.json; empty where an older vplog wrote it."""
+def files_of(record: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """`bytes` and `sha256` of each file of a run folder, by its drive.json; empty where that lacks them."""
     files = record.get("files")
     sound = isinstance(files, dict) and all(isinstance(files[name], dict) and is_below(name) for name in files)
     return files if isinstance(files, dict) and sound else {}

@@ -28,7 +28,7 @@ import pyarrow.parquet as pq
 from vplog.errors import ResultError
 from vplog.maps.storage import delta_log, objects
 from vplog.maps.storage.contents import Store, skip_damaged
-from vplog.maps.storage.damage import reading_drive
+from vplog.maps.storage.damage import files_of, reading_drive
 from vplog.maps.storage.layout import TABLES
 from vplog.maps.storage.snapshot import store_errors
 from vplog.results import tables
@@ -205,7 +205,7 @@ def _missing(
     wanted = {drive: _made_from(store, drive, record) for drive, record in store.drives().items()}
     files = _files(commits)
     stale = {name for name, file in files.items() if not file["drives"].items() <= wanted.items()}
-    small = {name for name, file in files.items() if _longest(file) < _FILE_BYTES / 2}
+    small = {name for name, file in files.items() if all(size < _FILE_BYTES / 2 for size, _ in file["tables"].values())}
     if compact and len(small - stale) > 1:
         stale |= small
     current = {drive for name, file in files.items() if name not in stale for drive in file["drives"]}
@@ -232,15 +232,10 @@ def _drives(files: Mapping[str, dict[str, Any]]) -> dict[str, str]:
     return {drive: made_from for file in files.values() for drive, made_from in file["drives"].items()}
 
 
-def _longest(file: dict[str, Any]) -> int:
-    return max((size for size, _ in file["tables"].values()), default=0)
-
-
 def _made_from(store: Store, drive: str, record: dict[str, Any]) -> str:
-    """A hash of the tables of a drive; in maps of before that have none, of all that the drive was made from."""
-    files = record.get("files", {}) if store.mirror is None else store.mirror.drives[drive]["files"]
-    hashes = [files.get(f"{name}.parquet", {}).get("sha256") for name in TABLES]
-    return key_of(hashes if all(hashes) else record)[:32]
+    """A hash of the tables of a drive."""
+    files = files_of(record) if store.mirror is None else store.mirror.drives[drive]["files"]
+    return key_of([files.get(f"{name}.parquet", {}).get("sha256") for name in TABLES])[:32]
 
 
 def _write_files(

@@ -13,7 +13,6 @@ from __future__ import annotations
 import hashlib
 import os
 import threading
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,24 +55,20 @@ class Cache:
         return False
 
     def keep(self, digest: str, source: Path) -> None:
-        """Keep a file that has this sha256. Where that fails it is fetched again another time."""
-        _replace(self.root / "objects" / digest, lambda part: link(source, part))
+        """Link a file that has this sha256 into the cache. Where that fails it is fetched again another time."""
+        path = self.root / "objects" / digest
+        part = path.with_name(f".{digest}.{os.getpid()}-{threading.get_ident()}.part")
+        with suppress(OSError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            link(source, part)
+            part.replace(path)
+        with suppress(OSError):  # of a disk that is full; and of two links to one file a rename leaves both
+            part.unlink(missing_ok=True)
 
     def trim(self) -> None:
         """Remove least recently used files until the rest is within `max_bytes`, and within half of what the disk
         would have free without it. Other processes keep their links until they end."""
         trim([self.root / name for name in ("objects", "index")], self.max_bytes)
-
-
-def _replace(path: Path, write: Callable[[Path], object]) -> None:
-    """A file as `write` makes it, whole or not at all; nothing where the disk refuses."""
-    part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(part)
-        part.replace(path)
-    with suppress(OSError):  # of a disk that is full; and of two links to one file a rename leaves both
-        part.unlink(missing_ok=True)
 
 
 def cache_in(folder: Path | None, max_gb: float | None = None) -> Cache | None:

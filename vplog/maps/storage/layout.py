@@ -9,13 +9,15 @@ import shutil
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import quote
+
+from pydantic import AfterValidator
 
 from vplog.errors import NewerError, ResultError
 from vplog.results import run_record, tables
 from vplog.run.cache.code_hash import code_of
-from vplog.storage.folders import numbered
+from vplog.storage.folders import is_below, numbered
 from vplog.storage.json_records import CHECKSUM, canonical_json, key_of, plain
 
 FORMAT = run_record.FORMAT
@@ -56,6 +58,14 @@ def quoted(drive: str) -> str:
     return f"{begins}~{hashlib.sha256(drive.encode()).hexdigest()[:16]}"
 
 
+def _checked_below(name: str) -> str:
+    if not is_below(name):
+        raise ValueError(f"{name!r} is not below its folder")
+    return name
+
+
+Below = Annotated[str, AfterValidator(_checked_below)]
+"""Name of something below the map's folder, in a record that may come from a stranger."""
 _WANTED = {"drive": str, "log": str, "key": str, "library": str, "inputs": dict}
 
 

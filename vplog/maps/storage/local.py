@@ -108,7 +108,7 @@ def exchange_folders(one: Path, other: Path) -> bool:
 
 
 def link_tables(store: Store, drive: str) -> None:
-    """Each table of the run folder under its data set; a copy on file systems without hard links."""
+    """Link each table of the run folder into its data set, MAP/NAME/drive=ID; a copy where there are no hard links."""
     for name in TABLES:
         source = store.run(drive) / f"{name}.parquet"
         path = store.root / name / folder_name(drive) / source.name

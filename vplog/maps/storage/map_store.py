@@ -118,8 +118,8 @@ def follow_with_delta(store: Store, patience_s: float = 0.0, *, begin: bool = Fa
 
 
 def publish(store: Store, drive: str, made: Path, sent: upload.SentRun | None = None) -> str:
-    """Make a finished run folder, with its drive.json, the drive's, in place of the one it may have. Where it is on
-    earth is noted with it. One that was `sent` to a map on a store need not be here. The ID that the drive has in the
+    """Make a finished run folder, with its drive.json, the drive's, in place of the one it may have; its georeference
+    is added to drive.json. One that was `sent` to a map on a store need not be here. Returns the ID of the drive in the
     map: another one where another writer has meanwhile put another drive of that ID into a map on a store. Raises
     ResultError; then the map has the drive as before.
     """

@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
 
+from vplog.maps.storage.layout import sha256_of
 from vplog.storage import remote_path
 from vplog.storage.object_store import plain_errors
 from vplog.storage.remote_path import RemotePath
@@ -61,9 +62,7 @@ def get_with_version(path: RemotePath) -> Versioned | None:
 
 def send(path: RemotePath, source: Path) -> tuple[str, PutResult]:
     """A local file as an object; sha256 of what was sent, and the store's answer. Raises OSError."""
-    with source.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    return digest, remote_path.send(path, source)
+    return sha256_of(source), remote_path.send(path, source)
 
 
 def fetch(path: RemotePath, target: Path, most: int) -> str:

@@ -124,7 +124,7 @@ class Mirror:
         self.drives = dict(newest)
         rest, before = self.manifest.now["rest"], self.held
         same = {name: about for name, about in before.items() if rest.get(name) == about}
-        self.held = {name: about for name, about in same.items() if not of_order(name)}
+        self.held = {name: about for name, about in same.items() if not is_join_state(name)}
         for name in self.local_rest():
             verified = name.startswith("joins/") and name.endswith(".parquet")  # which counts
             if name not in self.held and (name in before or name in rest or not (verified or _of_index(name))):
@@ -177,14 +177,11 @@ class Mirror:
         packed = {name: about["pack"]["token"] for name, about in files.items() if "pack" in about}
         gone = [f"{place / name} is not there." for name in files.keys() - there.keys() - packed.keys()]
         known = self.manifest.now.get("packs", {})
-        doubtful = [
-            name
-            for name, token in packed.items()
-            if packs.get(token) != _state(known.get(token, {"bytes": 0, "tag": ""}))
-        ]
+        sound = {token for token, about in known.items() if packs.get(token) == (about["bytes"], about["tag"])}
+        doubtful = [name for name, token in packed.items() if token not in sound]
         doubtful += [
             name for name, about in files.items()
-            if name not in packed and there.get(name, "") not in ("", (about["bytes"], about.get("tag")))
+            if name not in packed and there.get(name, "") not in ("", (about["bytes"], about["tag"]))
             and (name in RUN_TABLES or about["bytes"] != there[name][0])
         ]  # fmt: skip
         try:
@@ -332,17 +329,13 @@ class Mirror:
         return self.local / "runs" / folder_name(drive)
 
 
-def of_order(name: str) -> bool:
-    """Whether a file says which drives a join has come to."""
+def is_join_state(name: str) -> bool:
+    """Whether a file records how far joins have come: joint.json and joins/states-*."""
     return name == "joint.json" or name.startswith("joins/states-")
 
 
 def _of_index(name: str) -> bool:
     return name.startswith("index/")
-
-
-def _state(about: dict[str, Any]) -> tuple[int, str]:
-    return about["bytes"], about["tag"]
 
 
 def tag_of(meta: Any) -> str:

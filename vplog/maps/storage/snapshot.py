@@ -32,7 +32,7 @@ from typing_extensions import TypedDict  # as pydantic needs it below Python 3.1
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.storage import objects
 from vplog.maps.storage.damage import UnreachableError
-from vplog.maps.storage.layout import FORMAT
+from vplog.maps.storage.layout import FORMAT, Below
 from vplog.storage.folders import is_below
 from vplog.storage.json_records import has_checksum, with_checksum
 from vplog.storage.parquet_limits import check_version
@@ -81,12 +81,15 @@ class _Pack(TypedDict):
 class _File(TypedDict):
     bytes: StrictInt
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-    tag: NotRequired[str]
+    tag: str
     """ETag."""
     rows: NotRequired[StrictInt]
     pack: NotRequired[_Packed]
     """Where a small file of a drive is, if not in its folder."""
-    generation: NotRequired[Generation]
+
+
+class _RestFile(_File):
+    generation: Generation
     """Folder of a file beside drives, MAP/rest/GENERATION/NAME: a random name."""
 
 
@@ -105,11 +108,9 @@ class _Drive(TypedDict):
     record: _Record
     generation: Generation
     """Its files are in MAP/runs/drive=ID/GENERATION, a random name that is never used twice."""
-    files: dict[str, _File]
-    run: NotRequired[dict[str, Any]]
+    files: dict[Below, _File]
+    run: dict[str, Any]
     """Figures of its run.json."""
-    stamps_ns: NotRequired[list[StrictInt] | None]
-    """First and last keyframe."""
     packed: NotRequired[str]
     """When files of its folder were put into a pack, in UTC: from then on they are replaced."""
     component: NotRequired[str | None]
@@ -120,7 +121,7 @@ class _Layer(TypedDict):
     """Entries that differ from those of the layers below, by name; None: the entry is removed."""
 
     drives: dict[str, _Drive | None]
-    rest: dict[str, _File | None]
+    rest: dict[Below, _RestFile | None]
     """All else that a map's folder has, as what joins its drives."""
 
 
@@ -139,9 +140,9 @@ class _Row(TypedDict):
 class _Snapshot(_Layer):
     library: str | None
     settings: dict[str, Any]
-    libraries: dict[str, dict[str, _File]]
+    libraries: dict[Below, dict[Below, _File]]
     failures: dict[str, dict[str, Any]]
-    copies: dict[str, str | None]
+    copies: dict[Below, Below | None]
     """Objects that are to be copied within the store, by the new name; None: that are to be removed."""
     replaced: dict[str, str]
     """When folders and files that earlier snapshots name were replaced, in UTC."""
@@ -153,7 +154,8 @@ class _Snapshot(_Layer):
     """Those that files of drives are in, by token."""
 
 
-_ROWS, _LAYER, _SNAPSHOT = TypeAdapter(list[_Row]), TypeAdapter(_Layer), TypeAdapter(_Snapshot)
+_ROWS: TypeAdapter[Any] = TypeAdapter(list[_Row])
+_LAYER, _SNAPSHOT = TypeAdapter(_Layer), TypeAdapter(_Snapshot)
 
 
 def empty() -> Snapshot:
@@ -189,7 +191,10 @@ class Manifest:
                 return
             head = _json(found.data, place)
             check_version(cast("Path", place), head.get("format"), PACKED_FORMAT, head.get("vplog"))
-            rows = _validated(_ROWS, head.get("snapshots", []), place)
+            try:
+                rows = _ROWS.validate_python(head.get("snapshots", []))
+            except ValueError:
+                raise _no_snapshot(place) from None
             if not rows:
                 raise ResultError(f"{place} names no snapshot: it is damaged. Copy it back from a backup.")
             if self.as_of is not None:
@@ -214,9 +219,12 @@ class Manifest:
         if data is None or (len(data), sha256(data).hexdigest()) != (row["bytes"], row["sha256"]):
             raise ResultError(f"{place} is gone, or damaged. Copy it back from a backup.")
         try:
-            return _checked(kind.validate_json(zlib.decompressobj(31).decompress(data, _MOST_BYTES)), place)
+            found = kind.validate_json(zlib.decompressobj(31).decompress(data, _MOST_BYTES))
         except (ValueError, zlib.error):
             raise _no_snapshot(place) from None
+        if any(entry is not None and entry["record"]["drive"] != drive for drive, entry in found["drives"].items()):
+            raise _no_snapshot(place)
+        return found
 
     def commit(self, what: str, change: Callable[[Snapshot], object]) -> None:
         """Make `change` to the newest snapshot; it is called again where another writer comes in between, and may raise
@@ -233,7 +241,7 @@ class Manifest:
         raise ResultError(f"{self.remote} is written to by others without a pause. Run again.")
 
     def _write(self, what: str, wanted: Snapshot) -> bool:
-        """Whether no other writer came first; else the newest snapshot is read."""
+        """Write a snapshot if no other writer came first; else read the newest. Returns whether it was written."""
         layers, drives = self.layers, len(wanted["drives"])
         changed = _difference(wanted, layers)
         if _entries(changed) > _MOST_CHANGES:
@@ -339,36 +347,6 @@ def _json(data: bytes, place: RemotePath) -> dict[str, Any]:
     if not sound:
         raise ResultError(f"{place} is damaged. Copy it back from a backup.")
     return record
-
-
-def _validated(kind: TypeAdapter[Any], value: Any, place: RemotePath) -> Any:
-    try:
-        return kind.validate_python(value)
-    except ValueError:
-        raise _no_snapshot(place) from None
-
-
-def checked(snapshot: Snapshot, place: RemotePath) -> Snapshot:
-    """A snapshot without layers, as `Manifest.now` has it. Raises ResultError where it is none."""
-    found = _checked(_validated(_SNAPSHOT, {**snapshot, "layers": []}, place), place)
-    return {name: found[name] for name in snapshot}
-
-
-def _checked(found: dict[str, Any], place: RemotePath) -> dict[str, Any]:
-    """A snapshot or a layer whose names stay within the map. Raises ResultError."""
-    drives = {drive: entry for drive, entry in found["drives"].items() if entry is not None}
-    names = {*found["rest"], *(name for entry in drives.values() for name in entry["files"])}
-    for name in ("copies", "libraries"):
-        names |= found.get(name, {}).keys()
-    names |= {*filter(None, found.get("copies", {}).values())}
-    names |= {name for files in found.get("libraries", {}).values() for name in files}
-    if (
-        not all(map(is_below, names))
-        or any(drive != entry["record"]["drive"] for drive, entry in drives.items())
-        or any(about is not None and "generation" not in about for about in found["rest"].values())
-    ):
-        raise _no_snapshot(place)
-    return found
 
 
 def _no_snapshot(place: RemotePath) -> ResultError:

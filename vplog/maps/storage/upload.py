@@ -26,9 +26,9 @@ from vplog.maps.storage.layout import (
     set_drive_id,
     sha256_of,
 )
-from vplog.maps.storage.remote_map import Copies, Mirror, drives_in, of_order, tag_of
+from vplog.maps.storage.remote_map import Copies, Mirror, drives_in, is_join_state, tag_of
 from vplog.maps.storage.snapshot import LostRaceError, Snapshot, now, store_errors
-from vplog.results import run_record, tables
+from vplog.results import run_record
 from vplog.storage.remote_path import RemotePath, names_below, objects_below
 from vplog.storage.scratch import files_in, scratch
 
@@ -106,14 +106,12 @@ def send_run(remote: RemotePath, made: Path, began: float) -> SentRun:
     """Send a finished run folder, from any machine, to a map that is written to. Raises ResultError."""
     complete_record(made, hashed=False)
     rows = {f"{name}.parquet": {"rows": rows_of(made / f"{name}.parquet")} for name in TABLES}
-    stamps = tables.read_keyframes(made / "keyframes.parquet")[0].stamp_ns
     run = run_record.read_run_json(made / "run.json")
     entry = {
         "record": drive_record(made),
         "generation": secrets.token_hex(8),
         "files": {},
         "run": {name: run[name] for name in _FIGURES if name in run},
-        "stamps_ns": [int(stamps[0]), int(stamps[-1])] if len(stamps) else None,
     }
     names = [name for name in files_in(made) if name != "drive.json"]
     files = _send_all(names, made, remote / SentRun(entry, began).place)
@@ -302,13 +300,13 @@ def send_rest(mirror: Mirror) -> None:
     generation, began = secrets.token_hex(8), time.time()
     sent = _send_all(new, mirror.local, mirror.remote / "rest" / generation)
     changes = {**{name: {**about, "generation": generation} for name, about in sent.items()}, **dict.fromkeys(gone)}
-    components = _components(mirror.local / "joint.json") if {"joint.json"} & changes.keys() else None
+    components = _components(mirror.local / "joint.json") if "joint.json" in changes else None
 
     def change(snapshot: Snapshot) -> None:
         check_recent(began)
         contested = set(changes)
-        if any(map(of_order, changes)):  # drives are joined one after the other
-            contested |= set(filter(of_order, snapshot["rest"]))
+        if any(map(is_join_state, changes)):  # drives are joined one after the other
+            contested |= set(filter(is_join_state, snapshot["rest"]))
         for name in contested:
             theirs = snapshot["rest"].get(name)
             if theirs != known.get(name) and (theirs or {}).get("sha256") != hashes.get(name):

@@ -95,9 +95,7 @@ def _smoothed(odometry: Odometry, rows: Ints, measured: Floats, spread: float) -
     """(V,) logs of a scale that wanders slowly, by those measured, and the deviation of these from it."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(odometry.odom_from_body[:, :3, 3], axis=0), axis=1))])
     sigma = SCALE_WANDER * np.sqrt(np.diff(way[rows]) + 1e-6)
-    if odometry.breaks is not None:
-        pieces = np.searchsorted(odometry.breaks, rows, "right")
-        sigma[np.diff(pieces) > 0] = _ACROSS
+    sigma[np.diff(np.searchsorted(odometry.breaks, rows, "right")) > 0] = _ACROSS
     smooth = random_walk(sigma)
     x, left = np.full(len(rows), float(np.median(measured))), spread
     for _ in range(_ROUNDS):

@@ -69,9 +69,8 @@ def _not_accelerations(imu: Imu) -> str:
 
 def _states(odometry: Odometry, imu: Imu, camera: Camera, bias: Floats) -> States:
     """Frames at a distance in time, and those at breaks, with what the IMU measured between them."""
-    breaks = odometry.breaks if odometry.breaks is not None else np.zeros(0, np.int64)
     chosen = list[int]()
-    for a, b in pairwise([0, *breaks.tolist(), len(odometry.stamp_ns)]):
+    for a, b in pairwise([0, *odometry.breaks.tolist(), len(odometry.stamp_ns)]):
         inside = [a]
         for row in range(a + 1, b):
             if odometry.stamp_ns[row] - odometry.stamp_ns[inside[-1]] >= _PERIOD_NS:
@@ -89,7 +88,9 @@ def _states(odometry: Odometry, imu: Imu, camera: Camera, bias: Floats) -> State
     covariance[1:] = sums[rows[1:] + 1] - sums[rows[:-1] + 1]
     stamps = odometry.stamp_ns[rows]
     measured = [None, *(preintegrated(imu, int(a), int(b), bias) for a, b in pairwise(stamps))]
-    return States(rows, cameras, se3.inverse(imu.body_from_imu) @ lever, covariance, np.isin(rows, breaks), measured)
+    return States(
+        rows, cameras, se3.inverse(imu.body_from_imu) @ lever, covariance, np.isin(rows, odometry.breaks), measured
+    )
 
 
 def _inertial(odometry: Odometry, camera: Camera, states: States, found: Solved) -> Inertial:
@@ -108,7 +109,7 @@ def _inertial(odometry: Odometry, camera: Camera, states: States, found: Solved)
     moved = correct_trajectory(odometry, own, bodies).world_from_body
     bridged = np.array([states.imu[k] is not None for k in np.flatnonzero(states.broken).tolist()], bool)
     breaks, covariance = odometry.breaks, odometry.covariance
-    if breaks is not None and covariance is not None and len(bridged):
+    if covariance is not None and len(bridged):
         near = np.sqrt(np.trace(found.broken[:, 3:, 3:], axis1=1, axis2=2)) < _NEAR
         bridged &= near & sure
         ad = se3.adjoint(body_from_camera @ se3.inverse(states.imu_from_camera))

@@ -41,8 +41,7 @@ def in_metres(odometry: Odometry, gps: Gps, camera: Camera) -> Odometry | None:
     enough for one. Pieces without such fixes take the scale of the others."""
     lever = camera.body_from_camera
     poses = se3.inverse(lever) @ odometry.odom_from_body @ lever
-    breaks = odometry.breaks if odometry.breaks is not None else np.zeros(0, np.int64)
-    bounds = np.concatenate([[0], breaks, [len(poses)]]).tolist()
+    bounds = np.concatenate([[0], odometry.breaks, [len(poses)]]).tolist()
     sigma_m = _sigma_m(gps)
     ways = [_way(odometry.stamp_ns[a:b], poses[a:b], gps, sigma_m) for a, b in pairwise(bounds)]
     found = [_log_scale(way, sigma_m) if len(way.stamp_ns) >= _LEAST else None for way in ways]
@@ -64,8 +63,7 @@ def scaled(odometry: Odometry, scale: Floats, camera: Camera) -> Odometry:
     lever = camera.body_from_camera
     poses = se3.inverse(lever) @ odometry.odom_from_body @ lever
     steps = np.diff(poses[:, :3, 3], axis=0) * scale[1:, None]
-    if odometry.breaks is not None:
-        steps[odometry.breaks - 1] = 0.0
+    steps[odometry.breaks - 1] = 0.0
     poses[1:, :3, 3] = poses[0, :3, 3] + np.cumsum(steps, axis=0)
     covariance = odometry.covariance
     if covariance is not None:
