@@ -116,6 +116,23 @@ def test_a_walk_holds_the_chosen_frames(traversals: tuple[Path, Path], store: Fe
     np.testing.assert_array_equal(walk.store[2].descriptors, SIFT(frame.image).descriptors)
 
 
+def test_features_stay_what_they_are_when_another_process_writes_them_again(
+    traversals: tuple[Path, Path], store: FeatureFolder
+) -> None:
+    """Its times have other lengths as text, and its threads are ahead by another number of frames."""
+    log, stamps = logs.open(traversals[0]), np.arange(5)
+    first = extract_traversal(log, SIFT, store, stamps)
+    before = [first.store[row].descriptors for row in range(5)]
+    for file in store.folder.iterdir():
+        file.unlink()
+    with pytest.MonkeyPatch.context() as clock:
+        clock.setattr("vplog.benchmark.feature_cache.time.thread_time", iter(np.arange(20.0) ** 9 / 7).__next__)
+        again = extract_traversal(log, SIFT, store, stamps)
+    assert (again.feature_ms != first.feature_ms).all()
+    for row in range(5):
+        np.testing.assert_array_equal(first.store[row].descriptors, before[row])
+
+
 def test_frames_keep_their_numbers_where_others_are_damaged(
     traversals: tuple[Path, Path], store: FeatureFolder, tmp_path: Path
 ) -> None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
 
 from vplog.data import Features
 from vplog.errors import ResultError
@@ -16,6 +19,8 @@ from vplog.run.cache.stage_cache import CONTENT_AT, AbsentError, DamagedError
 
 _LENGTH = struct.Struct("<I")
 """Bytes of the JSON head of a part, which comes before its features and pictures."""
+_TIME = np.dtype("<f4")
+"""Of the CPU times, which come after them."""
 
 
 class _Row(NamedTuple):
@@ -64,23 +69,24 @@ class Extracted:
         """Take the keyframes of the next part. Raises DamagedError, and AbsentError where there is no such file."""
         try:
             with path.open("rb") as stream:
-                length = path.stat().st_size
+                length = stream.seek(0, os.SEEK_END)
                 stream.seek(CONTENT_AT)
                 begin = CONTENT_AT + _LENGTH.size + (head_bytes := _LENGTH.unpack(stream.read(_LENGTH.size))[0])
                 if begin > length:
                     raise DamagedError("its header is longer than the file")
                 head = json.loads(stream.read(head_bytes))
-            rows = [_Row(*map(int, row)) for row in head["rows"]]
+                rows = [_Row(*map(int, row)) for row in head["rows"]]
+                for row in rows:
+                    if min(row[1:]) < 0 or not row.width or not row.height or begin + row.end > length:
+                        raise DamagedError("its header points beyond its end")
+                stream.seek(begin + max((row.end for row in rows), default=0))
+                cpu_ms = np.frombuffer(stream.read(), _TIME).tolist()
             lost = [str(why) for why in head["lost"]]
             undecodable = [(str(topic), int(stamp_ns)) for topic, stamp_ns in head["undecodable"]]
-            cpu_ms = list(map(float, head.get("cpu_ms", ())))
         except FileNotFoundError:
             raise AbsentError from None
         except (OSError, ValueError, TypeError, KeyError, RecursionError, struct.error) as error:
             raise DamagedError(f"its header cannot be read: {error}") from None
-        for row in rows:
-            if min(row[1:]) < 0 or not row.width or not row.height or begin + row.end > length:
-                raise DamagedError("its header points beyond its end")
         self.stamp_ns += [row.stamp_ns for row in rows]
         self.lost += lost
         self.undecodable += undecodable
@@ -138,7 +144,8 @@ def packed(
     cpu_ms: Sequence[float] = (),
 ) -> bytes:  # fmt: skip
     """Content of the file of a part: stamp, features and picture of its keyframes, and why others were lost. `cpu_ms`
-    is for comparisons; the same input gives other times, and a run's parts have none."""
+    is for comparisons, and a run's parts have none; the same input gives other times, which come last, so that all else
+    is in its place for those who have opened the file when another process writes it again."""
     rows, chunks, at = [], [], 0
     for stamp_ns, features, picture in decoded:
         data, small = features_to(features), int(features.thumbnail is not None)
@@ -146,6 +153,5 @@ def packed(
         rows.append(_Row(stamp_ns, at, len(features), *size, small, len(picture), values))
         chunks += [data, picture]
         at += len(data) + len(picture)
-    tree = {"rows": rows, "lost": lost, "undecodable": undecodable, **({"cpu_ms": cpu_ms} if cpu_ms else {})}
-    head = json.dumps(tree).encode()
-    return b"".join([_LENGTH.pack(len(head)), head, *chunks])
+    head = json.dumps({"rows": rows, "lost": lost, "undecodable": undecodable}).encode()
+    return b"".join([_LENGTH.pack(len(head)), head, *chunks, np.array(cpu_ms, _TIME).tobytes()])
