@@ -292,6 +292,7 @@ def test_a_drive_against_itself(verb: Verb, drive: Demo) -> None:
     assert found["truth"]["pairs"] == same.sum()
     assert found["positives"] == same.any(1).sum() > 5
     assert found["query"] == found["map"] == str(drive.log)
+    assert found["library"]["size"] == 8  # as `run` takes of so few keyframes
     assert found["methods"]["bobb"]["r_at_1"] > 0.5
     assert {*TIMES, "r_at_5", "r_at_10", "anr", "ap", "recall_at_p100", "f1", "bytes_per_image"} < {
         *found["methods"]["bobb"]
