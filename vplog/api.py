@@ -318,7 +318,7 @@ def compare(
     `image,label`), FILE.npy, `labels` (folders), `utm` (file names), FILE.tum, `poses` or `gps` (within `distance_m`
     and `heading_deg`); None for answers without scores.
     library: a log or a library of reference images, None for `library_size` images of the map drive: where it is None,
-    too, all of them, 1600 at most, and of a drive in its own past 100, and more where places look alike.
+    too, all of them, 1600 at most, and of a drive in its own past as many as `run` takes.
     sequence: also match windows of so many frames.
     out: a local folder for compare.json, answers.csv, scores and figures.
     cache, cache_gb: folder and largest size in 10^9 bytes of the cache of features, None for the user's.
@@ -454,7 +454,7 @@ class Map:
         threads: int | None = None,
         progress: Progress = silent,
     ) -> Answers:
-        """The `top` places of the map most like each view of a log.
+        """The `top` places of the map most like each view of a log, or a picture.
 
         sequence: views in a window, odd; 1 ranks each by itself, None as the map's settings say.
         drives, box, near_fixes_m: search only drives of these names, that may have places in a box of degrees (south,

@@ -285,6 +285,19 @@ def test_the_same_frames_at_dusk(traversals: tuple[Path, Path]) -> None:
     assert done.record["methods"]["bobb"]["settings"]["windows_along"] == 3
 
 
+def test_names_without_numbers_are_paired_in_order_and_it_is_said(
+    verb: Verb, traversals: tuple[Path, Path], tmp_path: Path
+) -> None:
+    (tmp_path / "names").mkdir()
+    for number in range(FRAMES):
+        name = tmp_path / "names" / f"{chr(ord('a') + number)}.png"
+        name.symlink_to(traversals[0] / f"{number}.png")
+    for folder in (tmp_path / "names", traversals[1]):
+        arguments = ("compare", folder, traversals[0], "--truth", "index", "--methods", "thumbnail", "--json", *QUICK)
+        said = [warning for warning in verb(*arguments).json["warnings"] if "pairs frames in order" in warning]
+        assert len(said) == (folder.name == "names")
+
+
 def test_a_drive_against_itself(verb: Verb, drive: Demo) -> None:
     """The positives are those that the truth has, counted pair by pair."""
     found = verb(
@@ -296,6 +309,7 @@ def test_a_drive_against_itself(verb: Verb, drive: Demo) -> None:
     assert found["truth"]["pairs"] == same.sum()
     assert found["positives"] == same.any(1).sum() > 5
     assert found["query"] == found["map"] == str(drive.log)
+    assert found["library"]["size"] == 8  # as `run` takes of so few keyframes
     assert found["methods"]["bobb"]["r_at_1"] > 0.5
     assert {*TIMES, "r_at_5", "r_at_10", "anr", "ap", "recall_at_p100", "f1", "bytes_per_image"} < {
         *found["methods"]["bobb"]

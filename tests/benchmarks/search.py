@@ -152,17 +152,20 @@ def make_index(places: Places, settings: BobbSettings, pairing: Any, library: in
 def plain_scores(places: Places, query: Place, settings: BobbSettings, pairing: str) -> np.ndarray:
     """(N,) float32 Eq. (1) with weights, as it is written down: every pair of equal references, then one division."""
     table = _table(settings).astype(np.int64)
-    total = np.zeros(len(places), np.int64)
+    total, along = np.zeros((len(places), 3), np.int64), settings.windows_along
     for j, reference in enumerate(query.references):
         row, k = np.nonzero(places.references == reference)
         cells = table[query.boxes[j][None, :, None], places.boxes[row, k][:, None, :]]
-        best, same = cells.max(axis=2).sum(axis=1), np.trace(cells, axis1=1, axis2=2)
-        alike = {"best": best, "same": same, "both": best + same}[pairing]
-        np.add.at(total, row, int(query.weights[j]) * places.weights[row, k].astype(np.int64) * alike)
+        in_row = np.einsum("erarb->eab", cells.reshape(-1, along, along, along, along))
+        best, same = cells.max(axis=2).sum(axis=1)[:, None], np.trace(in_row, axis1=1, axis2=2)[:, None]
+        beside = np.column_stack([np.trace(in_row, offset, 1, 2) for offset in (-1, 1)])
+        both = np.hstack([5 * best + 5 * same, 5 * best + 6 * beside])
+        alike = {"best": best, "same": same, "both": both}[pairing]
+        np.add.at(total, row, int(query.weights[j]) * places.weights[row, k, None].astype(np.int64) * alike)
     length = np.sqrt((places.weights.astype(np.int64) ** 2).sum(axis=1))
     own = np.sqrt((query.weights.astype(np.int64) ** 2).sum())
-    whole = int(table.max()) * (2 if pairing == "both" else 1) * query.boxes.shape[1]
-    return (total / (length * (own * whole))).astype(np.float32)
+    whole = int(table.max()) * (10 if pairing == "both" else 1) * query.boxes.shape[1]
+    return (total.max(axis=1) / (length * (own * whole))).astype(np.float32)
 
 
 def is_exact(index: CodeIndex, places: Places, query: Place, settings: BobbSettings, pairing: str) -> bool:

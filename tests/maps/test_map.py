@@ -7,12 +7,14 @@ import json
 import shutil
 from typing import TYPE_CHECKING, cast
 
+import cv2
 import duckdb
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from tests.maps.runs import map_of_run, put_rows
+from vplog import logs
 from vplog.execution.execution import Execution
 from vplog.maps.search.query import MapQuery, search
 from vplog.maps.search.sequences import LineSearch
@@ -105,6 +107,15 @@ def test_a_drive_is_found_where_it_is(root: Path, drive: Demo, verb: Verb, tmp_p
     assert sum(answer["keyframe"] == answer["query"] for answer in best) >= 0.9 * len(best)
     assert "views matched to a place" in verb(*query, "-o", out, "--threads", 1).out
     assert hashlib.sha256(out.read_bytes()).hexdigest() == digest
+
+
+def test_a_picture_is_found(root: Path, finished: Path, drive: Demo, verb: Verb, tmp_path: Path) -> None:
+    """At the keyframe that it shows."""
+    stamps = pq.read_table(finished / "keyframes.parquet")["stamp_ns"].to_numpy()
+    frame = next(iter(logs.open(drive.log).frames(stamps[30:31])))
+    cv2.imwrite(str(tmp_path / "picture.png"), frame.decode().image)
+    answers = verb("map", "query", root, tmp_path / "picture.png", "--top", 1, "--json").json["answers"]
+    assert [(one["drive"], one["keyframe"], one["query_name"]) for one in answers] == [("all", 30, "picture.png")]
 
 
 def test_places_of_another_library_are_refused(root: Path, finished: Path, drive: Demo, verb: Verb) -> None:

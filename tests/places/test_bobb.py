@@ -232,15 +232,16 @@ def test_search_is_equation_1(seed: int, pairing: str, stop: int) -> None:
     scores = index.scores(query, stop)
     assert len(scores) == min(stop, count)
     for m in range(len(scores)):
-        total = 0.0
+        total = np.zeros(3)
         for j in range(J):
             for k in range(J):
                 if references[0, j] == references[m, k] != NO_REFERENCE:
                     cells = table[boxes[0, j][:, None], boxes[m, k][None]] / 6
                     best, same = cells.max(axis=1).mean(), np.diag(cells).mean()
-                    alike = {"best": best, "same": same, "both": (best + same) / 2}[pairing]
-                    total += unit[0, j] * unit[m, k] * alike
-        assert scores[m] == pytest.approx(total, abs=1e-6)
+                    right, left = (cells[0, 1] + cells[2, 3]) / 4, (cells[1, 0] + cells[3, 2]) / 4
+                    both = (best + np.array([same, 1.2 * right, 1.2 * left])) / 2
+                    total += unit[0, j] * unit[m, k] * {"best": best, "same": same, "both": both}[pairing]
+        assert scores[m] == pytest.approx(total.max(), abs=1e-6)
     ranking = index.query(query, 5, stop)
     order = np.lexsort((np.arange(len(scores)), -scores))
     order = order[scores[order] > 0][:5]

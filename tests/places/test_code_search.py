@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Literal
 
@@ -51,16 +52,21 @@ def _places(rng: np.random.Generator, count: int, J: int, windows: int, library:
 
 def _equation_1(query: Places, other: Places, pairing: Pairing) -> np.float32:
     """Eq. (1) with weights: whole numbers to the end, then one division."""
-    total = 0
+    total, along = np.zeros(3, np.int64), math.isqrt(query.boxes.shape[1])
     for j, reference in enumerate(query.references.tolist()):
         for k in np.flatnonzero((other.references == reference) & (reference != NO_REFERENCE)):
             cells = TABLE[query.boxes[j][:, None], other.boxes[k][None]].astype(int)
-            best, same = int(cells.max(axis=1).sum()), int(np.diag(cells).sum())
-            alike = {"best": best, "same": same, "both": best + same}[pairing]
-            total += int(query.weights[j]) * int(other.weights[k]) * alike
+            best, column = int(cells.max(axis=1).sum()), np.arange(len(cells)) % along
+            same, right, left = int(np.diag(cells).sum()), 0, 0
+            for window in np.flatnonzero(column > 0):
+                right, left = right + int(cells[window - 1, window]), left + int(cells[window, window - 1])
+            alike = {
+                "best": [best] * 3, "same": [same] * 3, "both": 5 * best + np.array([5 * same, 6 * right, 6 * left]),
+            }[pairing]  # fmt: skip
+            total += int(query.weights[j]) * int(other.weights[k]) * np.array(alike)
     lengths = [np.sqrt(max(int((p.weights.astype(int) ** 2).sum()), 1)) for p in (other, query)]
-    whole = int(TABLE.max()) * (2 if pairing == "both" else 1) * query.boxes.shape[1]
-    return np.float32(total / (lengths[0] * (lengths[1] * whole)))
+    whole = int(TABLE.max()) * (10 if pairing == "both" else 1) * query.boxes.shape[1]
+    return np.float32(total.max() / (lengths[0] * (lengths[1] * whole)))
 
 
 def _top(scores: np.ndarray, k: int) -> list[int]:

@@ -64,8 +64,8 @@ class CompareOptions:
     library: Path | None = None
     """A drive, or a saved library; None for the map."""
     library_size: int | None = None
-    """None for all frames of the map, 1600 at most. Of a drive in its own past, the paper's 100, and more where places
-    look alike, see `places.self_recognition`."""
+    """None for all frames of the map, 1600 at most. Of a drive in its own past as many as `vplog run` takes of as
+    many keyframes, see `places.reference_choice`; of a library's log 100."""
     library_seed: int = 0
     min_gap: int | None = None
     """Frames that a match is older, at least, in a drive compared with itself."""
@@ -176,7 +176,7 @@ class _Drives:
         if isinstance(source, list):
             return map_traversal, query_traversal, source, warnings
         itself = self.query_log is self.map_log
-        size = options.library_size or (PAPER_SIZE if itself or source is not None else MOST)
+        size = options.library_size or (None if itself else PAPER_SIZE if source is not None else MOST)
         wanted = LibrarySettings(choose="random", size=size, seed=options.library_seed)
         if source is None or self.library is None:
             rows = self._reference_rows(map_traversal, wanted)
@@ -186,15 +186,15 @@ class _Drives:
             traversal = self.traversal_of(self.library, source, chosen)
             references = references_of(traversal, chosen, images)
             warnings += traversal.warnings
-        if options.library_size is not None and size > len(references):
+        if options.library_size is not None and options.library_size > len(references):
             warnings.append(
                 f"The library has {len(references)} images instead of {size}: its drive has no more frames."
             )
         return map_traversal, query_traversal, references, warnings
 
     def _reference_rows(self, traversal: Traversal, wanted: LibrarySettings) -> Ints:
-        """Rows of the map's frames that become references; of a drive in its own past an eighth of them at most, unless
-        their number is given."""
+        """Rows of the map's frames that become references; of a drive in its own past as many as `vplog run` takes,
+        unless their number is given."""
 
         def reference(row: int) -> Reference:
             return Reference(NO_IMAGE, traversal.store[row], traversal.name, int(traversal.stamp_ns[row]))
@@ -294,6 +294,10 @@ def check_truth(known: PlaceTruth, query: Log, other: Log, min_gap: int | None) 
             "more with --tolerance, --distance-m or --heading-deg."
         )
     warnings = []
+    if known.about.get("by") == "rows" and (query.file_names() or other.file_names()):
+        warnings.append(
+            "--truth index pairs frames in order: the file names of one drive, or both, do not number them."
+        )
     for log, frames in {query.name: (query, known.query_frames), other.name: (other, known.map_frames)}.values():
         if len(frames) < len(log.stamps()):
             outside = len(log.stamps()) - len(frames)

@@ -59,7 +59,7 @@ def _truth_options(required: bool) -> argparse.ArgumentParser:
     option(sub, "--distance-m", parser.positive, "M", "poses, utm, gps: same place within (default: 6; utm: 25)")
     option(sub, "--heading-deg", parser.positive, "DEG", "poses, utm: and turned by at most (default: 45; utm: any)")
     option(sub, "--min-gap", parser.at_least_one, "N", "a drive against itself: matches are N frames older or more")
-    text, size = ("default: 100", 100) if required else ("default: all frames of MAP to 1600; else 100 or more", None)
+    text, size = ("default: 100", 100) if required else ("default: all of MAP to 1600; of its own past an eighth", None)
     option(sub, "--library-size", parser.at_least_one, "L", f"reference images of the library ({text})", default=size)
     parser.cache_options(sub, "features are kept between calls")
     return parent

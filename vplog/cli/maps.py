@@ -160,7 +160,7 @@ def info_map(arguments: argparse.Namespace) -> None:
 
 
 def query_map(arguments: argparse.Namespace) -> None:
-    """Find the places of a map most like each view of a log, here or on the workers of a Ray cluster."""
+    """Find the places of a map most like each view of a log, or a picture, here or on the workers of a Ray cluster."""
     with Progress(arguments) as progress:
         found = call(api.Map(arguments.map).query, arguments, progress=progress)
     print_result(arguments, found.record, printing.print_answers)
@@ -268,7 +268,7 @@ def add_maps(
 
 
 def _add_query(sub: argparse.ArgumentParser) -> None:
-    option(sub, "log", place, "LOG")
+    option(sub, "log", place, "LOG|IMAGE")
     option(sub, "--top", parser.at_least_one, "K", "places for each view (default: 10)", default=10)
     option(sub, "--sequence", parser.at_least_one, "L", "views in a window, odd; 1: none (default: as the map's)")
     option(sub, "--drive", str, "ID", "search only this drive; repeatable", action="append", default=[], dest="drives")

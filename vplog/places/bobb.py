@@ -19,7 +19,7 @@ from vplog.data import Boxes, Bytes, Features, Float32s, Floats, Int32s, Ints, R
 from vplog.errors import LibraryError
 from vplog.execution.execution import Execution
 from vplog.places import expected_votes
-from vplog.places.code_search import BLOCK, CodeIndex, CodeLists, Pairing, Place, build_lists
+from vplog.places.code_search import BLOCK, CodeIndex, CodeLists, Pairing, Place, build_lists, compare_windows
 from vplog.places.columns import RecordState, from_column, to_column
 from vplog.places.library_files import RelearnedSettings
 from vplog.places.matches import (
@@ -84,7 +84,8 @@ class BobbSettings(WeighedMatchSettings, RelearnedSettings):
     """Height of a box in cells."""
     pairing: Literal["best", "same", "both"] = "both"
     """Boxes of two places compared on one reference: each with the best of the other's (Eq. 1), with that of the same
-    window, or the mean of the two: the same window tells a place seen from the same spot, the best a nearer view."""
+    window, or the mean of the two: the same window tells a place seen from the same spot, the best a nearer view. In
+    the mean all windows may be shifted by one, left or right, where that fits better: the camera has turned."""
 
     @model_validator(mode="after")
     def _fits_a_byte(self) -> Self:
@@ -323,10 +324,13 @@ class BobbState(RecordState):
 
         def compare(rows: Ints, ranks: Ints, others: Ints, other_ranks: Ints) -> tuple[Floats, Floats]:
             cells = table[boxes[rows, ranks][:, :, None], boxes[others, other_ranks][:, None, :]].astype(np.float64)
-            best, same = cells.max(axis=2).mean(axis=1), np.einsum("eii->e", cells) / s.boxes
-            overlap = {"best": best, "same": same, "both": (best + same) / 2.0}[s.pairing]
-            overlap /= s.box_columns * s.box_rows
-            return overlap, overlap * weights[rows, ranks] * weights[others, other_ranks]
+            by_shift = compare_windows(cells, s.windows_along, s.pairing) / (s.boxes * s.box_columns * s.box_rows)
+            worth = by_shift * (weights[rows, ranks] * weights[others, other_ranks].astype(np.int64))[:, None]
+            pair = np.unique(np.column_stack([rows, others]), axis=0, return_inverse=True)[1].reshape(-1)
+            total = np.zeros((int(pair.max(initial=-1)) + 1, 3))
+            np.add.at(total, pair, worth)
+            best = np.arange(len(rows)), total.argmax(axis=1)[pair]
+            return by_shift[best], worth[best]
 
         return list_shared(np.where(references == NO_REFERENCE, -1, references.astype(np.int64)), query, match, compare)
 

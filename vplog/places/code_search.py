@@ -8,6 +8,7 @@ places compares boxes only where an upper bound of the score reaches the best fo
 from __future__ import annotations
 
 import heapq
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,7 +19,7 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from vplog.data import Bools, Bytes, Float32s, Ints, Ranking, Uint16s
+from vplog.data import Bools, Bytes, Float32s, Floats, Ints, Ranking, Uint16s
 from vplog.errors import ResultError
 
 Pairing = Literal["best", "same", "both"]
@@ -30,8 +31,10 @@ MOST_ROWS = 65_536
 """Rows that a block may have: an offset has 16 bits."""
 STEPS = 255
 """A bound is a product of two unit vectors, each value a whole number of these steps, rounded up."""
-_PAIRINGS = {"best": (1, 0), "same": (0, 1), "both": (1, 1)}
-"""Weights of a box's best overlap and of its overlap with the same window's box."""
+_PAIRINGS = {"best": (1, 0, 0), "same": (0, 1, 0), "both": (5, 5, 6)}
+"""Weights of a box's best overlap, of that with the same window's box, and of that with the box of the window beside
+it, where all windows are shifted by one, to the left or to the right: the picture of a camera that has turned. Of three
+windows in a row two are left then; 6 : 5 is about the root of 3 : 2."""
 _ROUNDING = 1e-6
 """Scores round to float32, by a share of 6e-8; what is below the worst of the best by more than this is below it."""
 _LANES = 8
@@ -108,15 +111,24 @@ def check_lists(lists: CodeLists) -> None:
         raise ResultError("Its lists do not fit together.")
 
 
+def compare_windows(cells: Floats, along: int, pairing: Pairing) -> Floats:
+    """(E, 3) cells that the boxes of I windows share with others', summed by the pairing's weights, for the view as it
+    is, and shifted to the right and to the left; `cells` (E, I, I) are those of each two boxes."""
+    best, same, beside = np.array(_PAIRINGS[pairing]) / sum(_PAIRINGS[pairing][:2])
+    in_row = np.einsum("erarb->eab", cells.reshape(-1, along, along, along, along))  # by the columns of both windows
+    shifted = np.column_stack([np.trace(in_row, offset, 1, 2) for offset in (0, -1, 1)])
+    return best * cells.max(axis=2).sum(axis=1)[:, None] + shifted * (same, beside, beside)
+
+
 class CodeIndex:
     """Places of a map; rows are in the order given."""
 
     def __init__(self, lists: CodeLists, overlap: Bytes, pairing: Pairing) -> None:
         """`overlap` (256, 256) is the cells that two boxes share."""
         self._lists, self._overlap, self._windows = lists, overlap, lists.boxes.shape[1]
-        self._most = overlap.max(axis=1).astype(np.int64)
-        self._comparison = (0,) * self._windows, _PAIRINGS[pairing], lists.block
-        self._whole = int(overlap.max(initial=1)) * sum(_PAIRINGS[pairing]) * self._windows
+        self._most, self._along = overlap.max(axis=1).astype(np.int64), math.isqrt(self._windows)
+        self._comparison = ((0,) * self._along,) * self._along, _PAIRINGS[pairing], lists.block
+        self._whole = int(overlap.max(initial=1)) * sum(_PAIRINGS[pairing][:2]) * self._windows
         self._longest = int(np.diff(lists.start).max(initial=0))
         for part in lists.parts:
             part.flags.writeable = False  # a kernel is compiled once, for lists in memory and for those of a file
@@ -136,7 +148,8 @@ class CodeIndex:
         return self._lists.start.shape[1] - 1
 
     def scores(self, descriptor: Place, stop: int | None = None) -> Float32s:
-        """(stop,) 0..1: mean overlap of the boxes, weighted by the references' weights as unit vectors; 1 is equal."""
+        """(stop,) 0..1: mean overlap of the boxes, weighted by the references' weights as unit vectors; 1 is equal. Of
+        the three shifts of the view each place has the best, the same on all references."""
         result = np.zeros(self._end(stop), np.float32)
         _score_all(self._query(descriptor), self._comparison, self._lists.parts, result)
         return result
@@ -177,7 +190,9 @@ class CodeIndex:
         weights, boxes = weights[used], descriptor.boxes[used]
         cells = np.zeros((len(used), 256, -(-self._windows // _LANES) * _LANES), np.uint8)
         cells[:, :, : self._windows] = self._overlap[boxes].transpose(0, 2, 1)
-        most = self._most[boxes].sum(axis=1) * sum(self._comparison[1])
+        most, (best, same, beside) = self._most[boxes].reshape(-1, self._along, self._along), self._comparison[1]
+        every, right, left = (part.sum(axis=(1, 2)) for part in (most, most[..., 1:], most[..., :-1]))
+        most = best * every + np.maximum(same * every, beside * np.maximum(left, right))
         reach = np.ceil(weights * most * STEPS / scale).astype(np.int32)
         return descriptor.references[used].astype(np.int64), weights, reach, cells, cells.view(np.uint64), scale
 
@@ -207,20 +222,35 @@ def _sum_bytes(word):
 
 @numba.njit(cache=True, nogil=True)
 def _compare(cells, words, boxes, e, windows, pairing):
-    """Cells that the windows' boxes share with the best box of entry e and with that of the same window, summed.
+    """Cells that the windows' boxes share with the best box of entry e and with that of the same window, summed, and
+    the same with that of the window to the right, and to the left.
 
-    `windows` is a tuple for its length, which is known when compiled: no loop is left of it.
+    `windows` are rows of tuples for their lengths, which are known when compiled: no loop is left of them.
     """
-    best, same = np.int64(0), np.int64(0)
+    best, same, right, left = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
+    along = len(windows[0])
     e = np.uint64(e)  # unsigned, as all numbers in this loop: a sign would be checked every time
-    for part in range((len(windows) + _LANES - 1) // _LANES):
+    for part in range((len(windows) * along + _LANES - 1) // _LANES):
         most = np.uint64(0)
-        for i in range(len(windows)):
+        for i in range(len(windows) * along):
             most = _larger_bytes(most, words[boxes[e, np.uint64(i)], np.uint64(part)])  # pyrefly: ignore[missing-argument]
         best += _sum_bytes(most)
-    for i in range(len(windows)):
-        same += np.int64(cells[boxes[e, np.uint64(i)], np.uint64(i)])
-    return pairing[0] * best + pairing[1] * same
+    for i in range(len(windows) * along):
+        box = cells[boxes[e, np.uint64(i)]]
+        same += np.int64(box[np.uint64(i)])
+        if i % along > 0:
+            right += np.int64(box[np.uint64(i - 1)])
+        if i % along < along - 1:
+            left += np.int64(box[np.uint64(i + 1)])
+    best *= pairing[0]
+    return best + pairing[1] * same, best + pairing[2] * right, best + pairing[2] * left
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(total, weight, cells):
+    """Add what an entry is worth at each of the three shifts."""
+    for shift in range(3):
+        total[shift] += weight * cells[shift]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -239,7 +269,7 @@ def _score_all(query, comparison, lists, result):
     windows, pairing, block = comparison
     start, offset, weight, _, coded, square = lists
     stop = result.shape[0]
-    total = np.zeros(MOST_ROWS, np.int64)  # an offset of a damaged file may be beyond the block
+    total = np.zeros((MOST_ROWS, 3), np.int64)  # an offset of a damaged file may be beyond the block
     for b in range((stop + block - 1) // block):
         rows = min(stop - b * block, block)
         total[:rows] = 0
@@ -248,12 +278,12 @@ def _score_all(query, comparison, lists, result):
             row, mass, boxes = offset[first:last], weight[first:last], coded[first:last]
             here, word = cells[j], words[j]
             for e in range(last - first):
-                total[row[e]] += weights[j] * np.int64(mass[e]) * _compare(here, word, boxes, e, windows, pairing)
+                _add(total[row[e]], weights[j] * np.int64(mass[e]), _compare(here, word, boxes, e, windows, pairing))
         for row in range(rows):
-            if total[row] > 0:
+            if total[row, 0] > 0:
                 place = b * block + row
                 length = np.sqrt(np.float64(max(square[place], np.uint32(1))))
-                result[place] = total[row] / (length * scale)
+                result[place] = max(total[row, 0], total[row, 1], total[row, 2]) / (length * scale)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -266,7 +296,7 @@ def _find_best(query, comparison, lists, longest, extent, wanted, drives):
     k, worst = wanted
     runs, counts = drives
     found = [(np.float32(0.0), np.int64(0)) for _ in range(0)]  # a heap: the worst first, of equals the latest row
-    bound, total = np.zeros(MOST_ROWS, np.int32), np.zeros(MOST_ROWS, np.int64)  # as for all scores
+    bound, total = np.zeros(MOST_ROWS, np.int32), np.zeros((MOST_ROWS, 3), np.int64)  # as for all scores
     touched, candidates = np.empty(MOST_ROWS, np.int64), np.empty(longest + 1, np.int64)
     least = _reached(worst)
     for b in range(begin, end if k > 0 else begin):
@@ -290,15 +320,15 @@ def _find_best(query, comparison, lists, longest, extent, wanted, drives):
                 candidates[reaching] = e
                 reaching += bound[row[e]] >= least
             for e in candidates[:reaching]:
-                more = weights[j] * np.int64(mass[e]) * _compare(here, word, boxes, e, windows, pairing)
-                if more > 0 and total[row[e]] == 0:
+                more, worth = _compare(here, word, boxes, e, windows, pairing), weights[j] * np.int64(mass[e])
+                if worth * more[0] > 0 and total[row[e], 0] == 0:
                     touched[count] = row[e]
                     count += 1
-                total[row[e]] += more
+                _add(total[row[e]], worth, more)
         for row in touched[:count]:
             place = b * block + row
             length = np.sqrt(np.float64(max(square[min(place, stop - 1)], np.uint32(1))))
-            score = np.float32(total[row] / (length * scale))
+            score = np.float32(max(total[row, 0], total[row, 1], total[row, 2]) / (length * scale))
             total[row] = 0
             if row < rows and score >= worst and counts[np.searchsorted(runs, place, side="right") - 1]:
                 _offer(found, k, score, place)

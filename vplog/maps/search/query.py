@@ -67,7 +67,7 @@ def query_map(
     root: Path, path: Path, topics: logs.TopicChoice | None = None, query: MapQuery = MapQuery(),
     execution: Execution = Execution(),
 ) -> dict[str, Any]:  # fmt: skip
-    """The `top` places of the map that are most like each view of a log.
+    """The `top` places of the map that are most like each view of a log, or a picture.
 
     Views are chosen and described as the map's drives were, with its library. Raises VplogError with one line.
     """
@@ -78,7 +78,7 @@ def query_map(
         settings = pipeline.sequence
         if query.sequence is not None:
             settings = SequenceSettings.read({**settings.model_dump(), "length": query.sequence}, "--sequence")
-        log = logs.open(path, topics)
+        log = logs.open_images([path], topics) if logs.is_image_file(path) else logs.open(path, topics)
         if query.sequence is None and log.file_names() is not None and log.odometry() is None:
             settings = settings.model_copy(update={"length": 1})  # pictures are spaced as they come
         if query.near_fixes_m is not None:
