@@ -475,6 +475,8 @@ def test_topics_that_are_not_there_are_named_with_the_choices(verb: Verb, drive:
     assert "/nowhere" in error
     assert IMAGE in error
     assert ODOMETRY in verb("info", drive.log, "--odometry-topic", "/nowhere").error
+    error = verb("run", drive.log, "-o", tmp_path / "run", "--odometry", "twist").error
+    assert "no odometry by --odometry twist" in error
     assert "/nowhere" in verb("library", drive.log, "-o", tmp_path / "library", "--image-topic", "/nowhere").error
     assert not (tmp_path / "library").exists()
 

@@ -186,7 +186,8 @@ def source_of(log: Log, topics: TopicChoice) -> Literal["log", "visual", "lidar"
         return "lidar"
     if topics.odometry is None and gives_visual(log):
         return "visual"
-    raise LogError(f"{log.name} has no odometry, and a trajectory is built on it. {log.without_odometry()}")
+    requested = f" by --odometry {topics.odometry}" if topics.odometry else ""
+    raise LogError(f"{log.name} has no odometry{requested}, and a trajectory is built on it. {log.without_odometry()}")
 
 
 def odometry_of(log: Log, topics: TopicChoice, steps: Steps) -> Odometry:
