@@ -63,6 +63,8 @@ def camera_of(name: str, calibration: CalibrationMessage | None, size: tuple[int
 def camera_from_image(camera: Camera, size: tuple[int, int], calibration: CalibrationMessage | None) -> Floats | None:
     """(2, 3) from px of an image of `size` to px of the camera, the identity where they differ by less than a px. By
     the image's own calibration; else, where the shape is the same, by scale. None where it is another."""
+    if calibration is None and size == (camera.width, camera.height):
+        return np.eye(2, 3)
     own = None if calibration is None else camera_of(camera.name, calibration, size, Notes())
     if camera.matrix is not None and own is not None and own.matrix is not None:
         found = (camera.matrix @ np.linalg.inv(own.matrix))[:2]
