@@ -184,7 +184,7 @@ class RayExecutor(Executor):
         return self.follow(task.remote(fn, *args, **kwargs))
 
     def _node_for(self, locality: str) -> str:
-        """Of the nodes with enough cores the one whose name, together with the text, has the largest hash (rendezvous
+        """ID of the node with enough cores whose name, together with the text, has the largest hash (rendezvous
         hashing): few texts move where a node comes or goes, and none where the cluster starts again."""
 
         def rank(node: dict[str, Any]) -> list[bytes]:

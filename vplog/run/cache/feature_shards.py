@@ -20,7 +20,7 @@ from vplog.run.cache.stage_cache import CONTENT_AT, AbsentError, DamagedError
 _LENGTH = struct.Struct("<I")
 """Bytes of the JSON head of a part, which comes before its features and pictures."""
 _TIME = np.dtype("<f4")
-"""Of the CPU times, which come after them."""
+"""Type of the CPU times, which come after them."""
 
 
 class _Row(NamedTuple):
