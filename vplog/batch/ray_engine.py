@@ -178,20 +178,21 @@ class RayExecutor(Executor):
         """A task, which goes to any node with free cores; one whose argument has a `locality`, a text, goes to the node
         that others with the same text went to, in whose cache its files are."""
         locality, task = getattr(args[0], "locality", "") if args else "", self._task
-        if locality:
+        if locality and (node := self._node_for(locality)):
             affinity = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy
-            task = task.options(scheduling_strategy=affinity(self._node_for(locality), soft=True))
+            task = task.options(scheduling_strategy=affinity(node, soft=True))
         return self.follow(task.remote(fn, *args, **kwargs))
 
     def _node_for(self, locality: str) -> str:
         """ID of the node with enough cores whose name, together with the text, has the largest hash (rendezvous
-        hashing): few texts move where a node comes or goes, and none where the cluster starts again."""
+        hashing): few texts move where a node comes or goes, and none where the cluster starts again. Empty where there
+        is no such node."""
 
         def rank(node: dict[str, Any]) -> list[bytes]:
             return [hashlib.sha256(f"{node[name]} {locality}".encode()).digest() for name in ("NodeName", "NodeID")]
 
         able = [one for one in self._ray.nodes() if one["Alive"] and one["Resources"].get("CPU", 0) >= self._cores]
-        return max(able, key=rank)["NodeID"]
+        return max(able, key=rank)["NodeID"] if able else ""
 
     def follow(self, answer: Any) -> Future[Any]:
         """The future of a Ray task, whose errors are those of this side."""
