@@ -21,16 +21,16 @@ def score_open_set(ranks: Ranks) -> dict[str, Any]:
     """
     if not ranks.positive.any():
         return {}
-    asked = ranks.candidates > 0
-    positive = ranks.positive[asked]
+    ranked = ranks.candidates > 0
+    positive = ranks.positive[ranked]
     found: dict[str, Any] = {"without_match": int((~positive).sum())}
-    scores = np.where(np.isnan(ranks.top_score), -np.inf, ranks.top_score.astype(np.float64))[asked]
+    scores = np.where(np.isnan(ranks.top_score), -np.inf, ranks.top_score.astype(np.float64))[ranked]
     found["auroc"] = auroc(scores, positive)
-    found["recall_at_1_percent_false_alarms"] = recall_at_false_alarms(scores, ranks.top_true[asked], positive)
+    found["recall_at_1_percent_false_alarms"] = recall_at_false_alarms(scores, ranks.top_true[ranked], positive)
     if ranks.p_match is not None:
         known = reliability_of_matches(ranks)
         found["p_match"] = {
-            "auroc": auroc(np.nan_to_num(ranks.p_match[asked], nan=-1.0), positive),
+            "auroc": auroc(np.nan_to_num(ranks.p_match[ranked], nan=-1.0), positive),
             "mean": round(float(np.nanmean(ranks.p_match)), 6),
             **known.as_json(),
         }

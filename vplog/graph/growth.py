@@ -169,10 +169,10 @@ def solve_again(
     poses, solved = [drive.graph.world_from_body for drive in drives], dict[tuple[int, ...], Refined]()
     maps = list[tuple[int, ...]]()
     for last in (False,) * (_ROUNDS - 1) + (True,):
-        kept = [
+        enough = [
             places(one, settings.spacing, w) >= settings.least_closures for one, w in zip(between, weight, strict=True)
         ]
-        maps = maps_of(len(drives), between, kept)
+        maps = maps_of(len(drives), between, enough)
         for members in [one for one in maps if len(one) > 1 and one not in solved]:
             inside = set(members)
             ties = [at for at, one in enumerate(between) if {one.later, one.earlier} <= inside]

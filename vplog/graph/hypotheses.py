@@ -110,8 +110,8 @@ def best_hypothesis(
         found += _at_the_sigmas_of_others(claimed, found)
     else:
         solution = optimiser(graph)
-        kept = np.where(solution.weight > 0.5, 1.0, 0.0)
-        found.append(_refit(claimed, kept, solution.world_from_body, Sigmas()))
+        weight = np.where(solution.weight > 0.5, 1.0, 0.0)
+        found.append(_refit(claimed, weight, solution.world_from_body, Sigmas()))
     likeliest = [one.sigmas for one in _likeliest(found)]
     for sigmas in dict.fromkeys([Sigmas(), *likeliest]):  # others would be of what false closures happen to share
         alone = hypothesis_of(claimed, none, chain.poses, sigmas)

@@ -173,8 +173,8 @@ def best_together(found: dict[int, Proposals], count: int) -> dict[int, Proposal
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order)) - np.searchsorted(query[order], query[order])
     ends = np.cumsum([len(one.query) for one in found.values()])[:-1]
-    kept = np.split(place < count, ends)
-    return {m: one.rows(rows) for (m, one), rows in zip(found.items(), kept, strict=True)}
+    best = np.split(place < count, ends)
+    return {m: one.rows(rows) for (m, one), rows in zip(found.items(), best, strict=True)}
 
 
 @step("verify", lambda *_: closures_codec())
