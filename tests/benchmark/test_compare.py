@@ -654,6 +654,22 @@ def test_answers_of_a_file_stand_beside_the_methods(traversals: tuple[Path, Path
     assert f"answers:{names}" in said.out
 
 
+def test_a_number_is_a_frame_also_where_images_are_named_by_numbers(
+    traversals: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """As in a table of the truth: images 1.png, 2.png, ... are frames 0, 1, ..."""
+    folders = [tmp_path / traversal.name for traversal in traversals]
+    for traversal, folder in zip(traversals, folders, strict=True):
+        folder.mkdir()
+        for number, image in enumerate(sorted(traversal.glob("*.png"), key=lambda path: int(path.stem))):
+            (folder / f"{number + 1}.png").symlink_to(image)
+    answers = tmp_path / "answers.csv"
+    answers.write_text("query,match\n" + "".join(f"{row},{row}\n" for row in range(FRAMES)))
+    done = compare.compare(*folders, [f"answers:{answers}"], TruthChoice("index", tolerance=0), SMALL)
+    (found,) = done.record["methods"].values()
+    assert found["r_at_1"] == 1.0
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -331,10 +331,9 @@ def test_evaluate_with_a_clock_that_is_said_to_be_off_and_a_truth_of_the_camera(
     from vplog.evaluate.truth import read_truth
     from vplog.geometry import se3
     from vplog.geometry.tum import write_tum
-    from vplog.results.mcap_read import read_camera_pose
+    from vplog.results.mcap_read import read_camera_poses
 
-    true, camera = read_truth(drive.truth), read_camera_pose(finished / "result.mcap")
-    assert camera is not None
+    true, (camera,) = read_truth(drive.truth), read_camera_poses(finished / "result.mcap")
     plain = verb("evaluate", finished, "--truth", drive.truth, "--json").json
     late, of_camera = tmp_path / "late.tum", tmp_path / "camera.tum"
     write_tum(late, Trajectory(true.stamp_ns - 400_000_000, true.world_from_body))
@@ -347,6 +346,13 @@ def test_evaluate_with_a_clock_that_is_said_to_be_off_and_a_truth_of_the_camera(
     assert "The truth is that of the camera" in found.err
     assert f"{plain['closures']['accepted_true']} of them true" in found.out
     assert not np.array_equal(se3.inverse(camera), camera)
+    positions, poses = tmp_path / "positions.tum", np.tile(np.eye(4), (len(true.stamp_ns), 1, 1))
+    poses[:, :3, 3] = true.world_from_body[:, :3, 3]
+    write_tum(positions, Trajectory(true.stamp_ns, poses))
+    found = verb("evaluate", finished, "--truth", positions, "--json").json
+    assert found["ate_after"]["rmse_m"] == pytest.approx(plain["ate_after"]["rmse_m"], abs=1e-6)
+    assert (found["rpe_after"], found["drift_after"]) == (None, None)
+    assert "RPE" not in verb("evaluate", finished, "--truth", positions).out
 
 
 def test_evaluate_and_config_in_words(verb: Verb, drive: Demo, finished: Path, tmp_path: Path) -> None:

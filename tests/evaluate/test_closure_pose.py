@@ -20,7 +20,7 @@ SEEDS = range(2)
 
 def judged(drive: Drawn, truth: Trajectory) -> tuple[ClosureScore, Judgement, BodyTruth]:
     found = body_truth(truth, drive.odometry, drive.camera)
-    return *score_closures(drive.keyframes, drive.closures, found, drive.stop, camera=drive.camera), found
+    return *score_closures(drive.keyframes, drive.closures, found, drive.stop, cameras=[drive.camera]), found
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -207,3 +207,21 @@ def test_loops_of_a_real_drive() -> None:
     )
     assert found.revisits_found == len(same)
     assert found.recall_at_full_precision == found.recall
+
+
+def test_a_rear_camera_sees_the_place_on_the_way_back() -> None:
+    """The body stands at 3 and looks west, where its rear camera looks as the front one did."""
+    ahead = se3.pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+    behind = se3.pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)) @ ahead
+    stamps = SECOND * np.arange(10)
+    keyframes, truth = Keyframes("d", stamps, ROUTE), BodyTruth(Trajectory(stamps, ROUTE))
+    stop = np.maximum(np.arange(10) - 2, 0)
+    closures = dataclasses.replace(ledger([(9, 3, 0.6, True)]), query_camera=np.ones(1, np.int32))
+    found, _ = score_closures(keyframes, closures, truth, stop, cameras=[ahead, behind])
+    assert (found.opposite, found.same_place, found.place_precision, found.accepted_true) == (0, 1, 1.0, 1)
+    assert (found.revisits, found.revisits_found) == (4, 1)
+    front = dataclasses.replace(closures, query_camera=np.zeros(1, np.int32))
+    found, _ = score_closures(keyframes, front, truth, stop, cameras=[ahead, behind])
+    assert (found.opposite, found.same_place) == (1, 0)
+    one, _ = score_closures(keyframes, front, truth, stop, cameras=[ahead])
+    assert one.revisits == 3

@@ -108,3 +108,18 @@ def test_fixes_of_a_real_drive_lie_on_its_truth() -> None:
     found = ate_to_gps(truth, fixes)
     assert found.count > 160
     assert found.rmse_m == pytest.approx(np.sqrt(1.5**2 + 1.5**2 + 3.0**2), rel=0.1)
+
+
+def test_fixes_are_those_of_the_antenna_where_its_place_is_known() -> None:
+    """In a circle the antenna, 2 m ahead of the body, is on a wider one."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 41)
+    rotation = se3.so3_exp(angle[:, None] * [0.0, 0.0, 1.0])
+    body = np.stack([10.0 * np.sin(angle), -10.0 * np.cos(angle), 0.0 * angle], axis=1)
+    antenna = body + (rotation @ [2.0, 0.0, 0.0])
+    degree_m = A_M * np.radians(1.0)
+    parallel = degree_m * (B_M / A_M) ** 2  # of a meridian at the equator
+    found = gps(antenna[:, 1] / parallel, antenna[:, 0] / degree_m, 0.0)
+    estimate = Trajectory(found.stamp_ns, se3.pose(rotation, body))
+    assert ate_to_gps(estimate, found).rmse_m > 0.1
+    placed = dataclasses.replace(found, antenna_m=np.array([2.0, 0.0, 0.0]))
+    assert ate_to_gps(estimate, placed).rmse_m < 1e-3

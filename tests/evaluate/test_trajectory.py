@@ -273,3 +273,30 @@ def test_a_truth_of_1_hz_between_the_stamps_is_compared_at_its_own() -> None:
     assert ate(compared, truth).count == len(at_ns)
     assert ate(compared, truth).max_m < 1e-9
     assert at_truth(estimate, estimate) == (estimate, False)
+
+
+def test_what_lies_between_two_drives_of_a_map_is_not_compared() -> None:
+    """A truth of 1 Hz goes on for half an hour between them, while the robot is driven elsewhere."""
+    rows = np.r_[0:400, 1600:2001]
+    whole = along_x(100.0)
+    estimate = Trajectory(whole.stamp_ns[rows], whole.world_from_body[rows])
+    at_ns = whole.stamp_ns[10:-10:20] + 23_000_000
+    poses = se3.interpolate_at(whole.stamp_ns, whole.world_from_body, at_ns)
+    gap = (at_ns > estimate.stamp_ns[399]) & (at_ns < estimate.stamp_ns[400])
+    poses[gap, 1, 3] += 1000.0
+    truth = Trajectory(at_ns, poses)
+    compared, interpolated = at_truth(estimate, truth)
+    assert interpolated
+    found = ate(compared, truth)
+    assert found.count == (~gap).sum()
+    assert found.max_m < 1e-9
+
+
+def test_a_truth_of_1_hz_may_be_longer_than_the_drive() -> None:
+    whole = along_x(100.0)
+    at_ns = whole.stamp_ns[::20] + 23_000_000
+    truth = Trajectory(at_ns[:-1], se3.interpolate_at(whole.stamp_ns, whole.world_from_body, at_ns[:-1]))
+    short = Trajectory(whole.stamp_ns[:60], whole.world_from_body[:60])
+    compared, interpolated = at_truth(short, truth)
+    assert interpolated
+    assert ate(compared, truth).count == 3

@@ -280,3 +280,34 @@ def test_rerun_converts_the_whole_picture_and_finds_no_fault(tmp_path: Path) -> 
     ):
         found = [int(c.split("with ")[1].split()[0]) for c in chunks if f"- {entity} -" in c and component in c]
         assert sum(found) == rows, entity
+
+
+def test_the_cameras_of_a_rig_come_back_by_number(tmp_path: Path) -> None:
+    behind = se3.pose(np.diag([-1.0, -1.0, 1.0]), np.array([0.1, 0.2, 0.3]))
+    write(tmp_path / "r.mcap", replace(SHOWN, further_cameras=[behind]))
+    found = mcap_read.read_camera_poses(tmp_path / "r.mcap")
+    np.testing.assert_allclose(found, [CAMERA.body_from_camera, behind], atol=1e-9)
+
+
+def test_a_way_across_the_antimeridian_does_not_go_around_the_earth() -> None:
+    earth = Earth((-17.0, 179.9999, 0.0), np.eye(4))
+    poses = se3.pose(np.eye(3), np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]]))
+    tree = geo.feature_collection(earth, poses, np.array([0, 1]), RUN.closures.rows(np.zeros(0, np.int64)))
+    (first, second) = tree["features"][0]["geometry"]["coordinates"]
+    assert 0.0 < second[0] - first[0] < 0.01
+
+
+def test_a_run_without_metres_lies_on_earth_by_a_similarity() -> None:
+    poses = RUN.solution.world_from_body
+    trajectory = Trajectory(RUN.keyframes.stamp_ns, poses)
+    enu = 3.0 * poses[:, :3, 3]
+    where = geo.on_earth(Earth((49.0, 8.0, 100.0), np.eye(4)), se3.pose(np.eye(3), enu))
+    unknown = np.full((len(enu), 3, 3), np.nan)
+    fixes = Gps(trajectory.stamp_ns, where[:, 1], where[:, 0], where[:, 2], unknown)
+    earth = earth_of(trajectory, fixes, None, metric=False)
+    assert earth is not None
+    np.testing.assert_allclose(geo.on_earth(earth, poses), where, atol=1e-5)
+    assert (
+        earth_of(trajectory, replace(fixes, latitude_deg=0 * where[:, 1], longitude_deg=0 * where[:, 0]), None)
+        is not None
+    )

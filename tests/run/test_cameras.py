@@ -75,6 +75,8 @@ def test_the_rear_camera_closes_the_way_back(rig: Path, verb: Callable[..., Said
     assert all(base64.b64encode(jpeg).decode() in page for jpeg in thumbnails.values())
     judged = verb("evaluate", out, "--truth", rig / "truth.tum", "--json").json
     assert judged["closures"]["accepted_false"] == 0
+    assert judged["closures"]["place_precision"] == 1.0
+    assert judged["closures"]["recall"] > 0.0
     assert judged["ate_after"]["rmse_m"] < 0.5 * judged["ate_before"]["rmse_m"]
     shown = verb("explain", out, "--closure", int(np.flatnonzero(used)[0]), "--json").json["picture"]
     assert shown["agree"] >= 20

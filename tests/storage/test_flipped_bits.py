@@ -209,7 +209,7 @@ def test_no_flip_in_what_is_read_of_an_mcap_is_silent(tmp_path: Path) -> None:
         pictures={0: b"closure" * 20}, gps=gps,
     )  # fmt: skip
     write_mcap(path, RUN.keyframes, RUN.solution.world_from_body, RUN.graph, RUN.closures, METADATA, extras)
-    readers = (mcap_read.read_pictures, mcap_read.read_fixes, mcap_read.read_camera_pose)
+    readers = (mcap_read.read_pictures, mcap_read.read_fixes, mcap_read.read_camera_poses)
     for number, read in enumerate((*readers, lambda path: list(mcap_read.read_images(path)))):
         assert silent(path, read, number) == []
 

@@ -4,8 +4,8 @@
     0,17,0.93
     1.jpg,18.jpg,0.88
 
-Frames are numbers counted from 0, or in a folder of images their names. `score` may be left out: a query's answers then
-come best first.
+Frames are numbers counted from 0, also where images are named by numbers, or the names of images. `score` may be left
+out: a query's answers then come best first.
 """
 
 from __future__ import annotations
@@ -70,9 +70,7 @@ class _Frames:
 
     def row(self, cell: str, where: str) -> int | None:
         """None where the frame is not among those compared. Raises SettingsError where there is none."""
-        number = self._named(cell)
-        if number is None and cell.isdecimal() and len(cell) < 10:
-            number = int(cell)
+        number = int(cell) if cell.isdecimal() and len(cell) < 10 else self._named(cell)
         if number is None or number >= self._count:
             text = f"{where}: {cell[:80]!r} is no frame of {self._drive}, which has {self._count}. {_FORMAT}"
             raise SettingsError(text)

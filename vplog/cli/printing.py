@@ -273,8 +273,8 @@ def _truth_notes(found: dict[str, Any]) -> list[str]:
         notes.append("The odometry of this run is the truth itself: only the scores of its closures mean something.")
     if truth is not None and not truth["oriented"]:
         notes.append(
-            "The truth has no orientations, so closures are judged by place, without heading. To judge their "
-            "poses, give a truth with orientations."
+            "The truth has no orientations, so closures are judged by place, without heading, and there is no RPE and "
+            "no drift. For these, give a truth with orientations."
         )
     if found.get("interpolated"):
         notes.append("Few poses have a stamp within 0.01 s of the truth's: poses are interpolated at its stamps.")

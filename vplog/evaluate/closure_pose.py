@@ -75,11 +75,11 @@ def pose_errors(
     query: TruthAt,
     match: TruthAt,
     bounds: PoseBounds,
-    cameras: tuple[Floats | None, Floats | None] = (None, None),
+    cameras: tuple[Floats, Floats] = (np.eye(4), np.eye(4)),
 ) -> tuple[Bools, Bools, Bools, Bools]:
     """Judge the closures by the truth at the keyframes of their queries and of their matches.
 
-    `cameras` are body_from_camera of queries and of matches, the identity where not known. Four of (C,): with a pose
+    `cameras` are body_from_camera, (4, 4) or (C, 4, 4), of queries and of matches. Four of (C,): with a pose
     and a truth at both ends; right; wrong, which not judged ones are not either; right but further off than the claimed
     covariance and the truth's error allow (99.9 %).
     """
@@ -90,7 +90,8 @@ def pose_errors(
     true = se3.between(match.world_from_body[there], query.world_from_body[here])
     measured, claimed = closures.match_from_query[rows], _covariance(closures.information[rows])
     directed = np.array([closures.scale[row] == "none" for row in rows], bool)
-    measured[directed] = _at_true_length(measured[directed], true[directed], *cameras)
+    into, out = (np.broadcast_to(one, (len(closures), 4, 4))[rows[directed]] for one in cameras)
+    measured[directed] = _at_true_length(measured[directed], true[directed], into, out)
     claimed[directed] = 0.0
     apart = se3.between(true, measured)
     # a truth that is turned at the match moves the query by as much at its distance
@@ -110,9 +111,9 @@ def pose_errors(
     return posed, right, wrong, overconfident
 
 
-def _at_true_length(measured: Floats, true: Floats, query_camera: Floats | None, match_camera: Floats | None) -> Floats:
-    """Closures (R, 4, 4) whose step from camera to camera is as long as the true one."""
-    into, out = (np.eye(4) if camera is None else camera for camera in (query_camera, match_camera))
+def _at_true_length(measured: Floats, true: Floats, into: Floats, out: Floats) -> Floats:
+    """Closures (R, 4, 4) whose step from the query's camera, body_from_camera `into`, to the match's, `out`, is as long
+    as the true one."""
     measured, true = (se3.inverse(out) @ one @ into for one in (measured, true))
     length, wanted = (np.linalg.norm(one[:, :3, 3], axis=1, keepdims=True) for one in (measured, true))
     measured[:, :3, 3] *= wanted / np.maximum(length, 1e-12)

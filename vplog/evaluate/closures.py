@@ -6,7 +6,9 @@ between the true poses, as in `vplog compare`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -114,25 +116,25 @@ def judge_closures(
     match: TruthAt,
     bounds: PoseBounds,
     place: PlaceCriterion,
-    cameras: tuple[Floats | None, Floats | None] = (None, None),
+    cameras: tuple[Sequence[Floats], Sequence[Floats]] = ((), ()),
     oriented: bool = True,
 ) -> Judgement:
     """Compare a ledger with the truth at its queries' and its matches' keyframes, in one frame.
 
-    `cameras` are body_from_camera of queries and of matches; `oriented` whether the truth has orientations: without,
-    places are within the distance, and no pose is judged.
+    `cameras` are body_from_camera (4, 4) of the cameras of queries and of matches, by number; `oriented` whether the
+    truth has orientations: without, places are within the distance, and no pose is judged.
     """
     known = query.known[closures.query] & match.known[closures.match]
     rows = np.flatnonzero(known)
     here, there = query.world_from_body[closures.query[rows]], match.world_from_body[closures.match[rows]]
     distance = np.linalg.norm(here[:, :3, 3] - there[:, :3, 3], axis=1)
-    axes = [
-        optical_axis(camera, at.world_from_body[at.known]) for camera, at in zip(cameras, (query, match), strict=True)
-    ]
+    ends = (cameras[0], query, closures.query_camera), (cameras[1], match, closures.match_camera)
+    axes = [_optical_axes(mounts, at)[np.minimum(number[rows], len(mounts))] for mounts, at, number in ends]
     heading, near = _heading_deg(here, there, *axes) * oriented, distance <= place.distance_m
     at_place, opposite = np.zeros((2, len(closures)), bool)
     at_place[rows], opposite[rows] = near & (heading <= place.heading_deg), near & (heading > _OPPOSITE_DEG)
-    posed, right, wrong, overconfident = np.array(pose_errors(closures, query, match, bounds, cameras)) & oriented
+    into, out = (np.stack([*mounts, np.eye(4)])[np.minimum(number, len(mounts))] for mounts, _, number in ends)
+    posed, right, wrong, overconfident = np.array(pose_errors(closures, query, match, bounds, (into, out))) & oriented
     by_place = known & ~posed
     right, wrong = right | by_place & at_place, wrong | by_place & ~at_place
     return Judgement(bounds, posed, overconfident, known, at_place, opposite, right, wrong)
@@ -144,11 +146,12 @@ def score_closures(
     truth: BodyTruth,
     stop: Ints,
     place: PlaceCriterion | None = None,
-    camera: Floats | None = None,
+    cameras: Sequence[Floats] = (),
 ) -> tuple[ClosureScore, Judgement]:
-    """Compare a drive's ledger with the truth; `camera` is body_from_camera, None where it is not known.
+    """Compare a drive's ledger with the truth; `cameras` are body_from_camera by number, as far as they are known.
 
-    Keyframe i may close a loop with the rows below `stop[i]`, (N,): it is a revisit when one of these is of its place.
+    Keyframe i may close a loop with the rows below `stop[i]`, (N,): it is a revisit when one of these is of its place,
+    by any camera of either.
     Raises TruthError where no keyframe has a truth.
     """
     place = place or PlaceCriterion()
@@ -159,13 +162,19 @@ def score_closures(
         )
     covered = np.flatnonzero(at.known)
     bounds = pose_bounds(at.world_from_body[covered][:, :3, 3])
-    judged = judge_closures(closures, at, at, bounds, place, (camera, camera), truth.oriented)
+    judged = judge_closures(closures, at, at, bounds, place, (cameras, cameras), truth.oriented)
     poses = at.world_from_body[covered]
-    axis = optical_axis(camera, poses)
+    axes = [optical_axis(camera, poses) for camera in cameras or [None]]
     older = np.searchsorted(covered, np.minimum(np.asarray(stop), np.arange(len(at.known)))[covered])
     heading_deg = place.heading_deg if truth.oriented else 180.0
     revisit = np.zeros(len(at.known), bool)
-    revisit[covered] = pose_pairs(poses, poses, place.distance_m, heading_deg, axis, axis).below(older).positive
+    revisit[covered] = np.any(
+        [
+            pose_pairs(poses, poses, place.distance_m, heading_deg, here, there).below(older).positive
+            for here, there in product(axes, axes)
+        ],
+        axis=0,
+    )
     judged = replace(judged, curves=_curves(closures, judged, revisit))
     return _score(closures, judged, at.known, revisit, place), judged
 
@@ -239,11 +248,17 @@ def _score(
     )  # fmt: skip
 
 
-def _heading_deg(a: Floats, b: Floats, a_axis: Floats | None, b_axis: Floats | None) -> Floats:
-    """(R,) degrees between the optical axes of poses (R, 4, 4), or of their whole rotation."""
-    if a_axis is None or b_axis is None:
-        return np.degrees(se3.angle(se3.between(a, b)))
-    return np.degrees(np.arccos(np.clip(((a[:, :3, :3] @ a_axis) * (b[:, :3, :3] @ b_axis)).sum(1), -1.0, 1.0)))
+def _optical_axes(cameras: Sequence[Floats], at: TruthAt) -> Floats:
+    """(K + 1, 3) in the body, NaN where not known, as the last row is: that of a camera that has no number here."""
+    axes = [optical_axis(camera, at.world_from_body[at.known]) for camera in cameras]
+    return np.array([np.full(3, np.nan) if axis is None else axis for axis in [*axes, None]])
+
+
+def _heading_deg(a: Floats, b: Floats, a_axis: Floats, b_axis: Floats) -> Floats:
+    """(R,) degrees between the optical axes (R, 3) of poses (R, 4, 4), or of their whole rotation where one is NaN."""
+    cosine = np.einsum("rij,rj,rik,rk->r", a[:, :3, :3], a_axis, b[:, :3, :3], b_axis)
+    whole = np.degrees(se3.angle(se3.between(a, b)))
+    return np.where(np.isnan(cosine), whole, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 def _curves(closures: Closures, judged: Judgement, revisit: Bools) -> dict[str, Floats]:

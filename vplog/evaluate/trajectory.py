@@ -13,6 +13,7 @@ import numpy as np
 
 from vplog.data import Floats, Ints, Trajectory
 from vplog.errors import TruthError, plural
+from vplog.evaluate.pairs import bracketing
 from vplog.geometry import se3
 
 MAX_DIFFERENCE_S = 0.01
@@ -102,11 +103,11 @@ def at_truth(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, bool]
     """The estimate as it is compared with the truth, and whether it was interpolated at the truth's stamps.
 
     It is where most of the truth's poses within it have none of its stamps near: a truth of 1 Hz in a clock of its own.
+    Those in a gap of it, as between the drives of a map, are left out.
     """
-    inside = (truth.stamp_ns >= estimate.stamp_ns[0]) & (truth.stamp_ns <= estimate.stamp_ns[-1])
-    at_ns = truth.stamp_ns[inside]
+    at_ns = truth.stamp_ns[bracketing(estimate.stamp_ns, truth.stamp_ns)[2]]
     near, _ = _nearest(_seconds(at_ns), _seconds(estimate.stamp_ns))
-    if len(truth.stamp_ns) >= len(estimate.stamp_ns) or 2 * len(near) >= len(at_ns):
+    if len(at_ns) >= len(estimate.stamp_ns) or 2 * len(near) >= len(at_ns):
         return estimate, False
     poses = se3.interpolate_at(estimate.stamp_ns, estimate.world_from_body, at_ns)
     return Trajectory(at_ns, poses), True

@@ -32,14 +32,15 @@ def earth_of_run(folder: Path) -> Earth | None:
 
     Raises ResultError where a file of the run is damaged.
     """
-    known = run_record.read_run_json(folder / "run.json").get("gps")
+    record = run_record.read_run_json(folder / "run.json")
+    known = record.get("gps")
     fixes = (
         mcap_read.read_fixes(folder / "result.mcap") if known is None and (folder / "result.mcap").is_file() else None
     )
     if known is None and fixes is None:
         return None
     trajectory, _ = tables.read_trajectory(folder / "trajectory.parquet")
-    return earth_of(trajectory, fixes, known)
+    return earth_of(trajectory, fixes, known, run_record.has_metres(record))
 
 
 def earth_record(earth: Earth | None, world_from_body: Floats) -> dict[str, Any] | None:

@@ -49,6 +49,11 @@ _DISTORTION = {"plumb_bob": "plumb_bob", "rational_polynomial": "rational_polyno
 """Our names of distortion models, as Foxglove's schema has them (equidistant in ROS is Kannala and Brandt's)."""
 
 
+def camera_frame(number: int) -> str:
+    """The frame of a camera by its number, the first one's being CAMERA."""
+    return f"{CAMERA}_{number}" if number else CAMERA
+
+
 def _time(stamp_ns: int) -> Timestamp:
     message = Timestamp()
     message.FromNanoseconds(stamp_ns)

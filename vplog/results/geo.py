@@ -32,7 +32,8 @@ class Earth:
     origin: tuple[float, float, float]
     """Latitude and longitude in degrees and altitude in m, WGS84."""
     enu_from_world: Floats
-    """(4, 4): from the trajectory's frame to m east, north and up of the origin."""
+    """(4, 4): from the trajectory's frame to m east, north and up of the origin; a similarity where the trajectory has
+    a unit of length of its own."""
 
 
 def on_earth(earth: Earth, world_from_body: Floats) -> Floats:
@@ -42,11 +43,11 @@ def on_earth(earth: Earth, world_from_body: Floats) -> Floats:
 
 
 def feature_collection(earth: Earth, world_from_body: Floats, stamp_ns: Ints, closures: Closures) -> dict[str, Any]:
-    """GeoJSON of keyframes (N, 4, 4): the path as one line, and of each accepted closure the line between its ends."""
-    where = [
-        [round(x, _DEGREE_DIGITS), round(y, _DEGREE_DIGITS), round(z, _METRE_DIGITS)]
-        for x, y, z in on_earth(earth, world_from_body).tolist()
-    ]
+    """GeoJSON of keyframes (N, 4, 4): the path as one line, and of each accepted closure the line between its ends.
+    Longitudes go on beyond 180 degrees, so that no line across the antimeridian goes around the earth."""
+    degrees = on_earth(earth, world_from_body)
+    degrees[:, 0] = np.unwrap(degrees[:, 0], period=360.0)
+    where = [[round(x, _DEGREE_DIGITS), round(y, _DEGREE_DIGITS), round(z, _METRE_DIGITS)] for x, y, z in degrees]
     features = []
     if len(where) > 1:
         about = {"name": "optimised", "start_ns": str(stamp_ns[0]), "end_ns": str(stamp_ns[-1])}

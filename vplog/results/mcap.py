@@ -116,6 +116,8 @@ class McapExtras(McapContent):
     """Content of result.mcap beside the tables, all of it optional."""
 
     camera: Camera | None = None
+    further_cameras: Sequence[Floats] = ()
+    """body_from_camera (4, 4) of the cameras beside the first."""
     image: Callable[[int], bytes] | None = None
     """JPEG of a keyframe by its row."""
     image_size: tuple[int, int] = (0, 0)
@@ -192,8 +194,8 @@ def _solved(
             yield stamp_ns, "/graph/rejected", _rejected(stamp_ns, world_from_body, closures)
             fixed = [(foxglove.RERUN_ROOT, foxglove.MAP, foxglove.IDENTITY)]
             if extras.camera is not None:
-                mount = se3.vectors(extras.camera.body_from_camera).tolist()
-                fixed.append((foxglove.BODY, foxglove.CAMERA, mount))
+                for number, mount in enumerate([extras.camera.body_from_camera, *extras.further_cameras]):
+                    fixed.append((foxglove.BODY, foxglove.camera_frame(number), se3.vectors(mount).tolist()))
                 fixed += [(foxglove.MAP, frame, foxglove.IDENTITY) for frame in (foxglove.REFERENCE, foxglove.CLOSURE)]
             yield stamp_ns, "/tf_static", foxglove.transforms(stamp_ns, fixed)
             if extras.earth is not None:

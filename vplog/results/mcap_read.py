@@ -9,6 +9,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import count, takewhile
 from pathlib import Path
 from typing import BinaryIO
 
@@ -26,7 +27,7 @@ from mcap.writer import MCAP0_MAGIC
 from vplog.data import Floats, Gps
 from vplog.geometry import se3
 from vplog.results.closure_views import checked
-from vplog.results.foxglove import CAMERA
+from vplog.results.foxglove import camera_frame
 from vplog.results.mcap import FIXES, PICTURES, VIEWS, McapContent
 from vplog.results.tables import reading
 from vplog.storage.parquet_limits import crc_of
@@ -93,15 +94,16 @@ def read_images(path: Path) -> Iterator[CameraPicture]:
                 yield CameraPicture(message.log_time, CompressedImage.FromString(message.data).data, matrix, size)
 
 
-def read_camera_pose(path: Path) -> Floats | None:
-    """body_from_camera (4, 4), None where the file has none. Raises ResultError as above."""
+def read_camera_poses(path: Path) -> list[Floats]:
+    """body_from_camera (4, 4) of the cameras by number, as far as the file has them. Raises ResultError as above."""
+    found: dict[str, Floats] = {}
     with _reading(path) as reader:
         for _, _, message in reader.iter_messages(topics=["/tf_static"]):
             for one in FrameTransforms.FromString(message.data).transforms:
-                if one.child_frame_id == CAMERA:
-                    q, t = one.rotation, one.translation
-                    return se3.from_vectors(np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w]))
-    return None
+                q, t = one.rotation, one.translation
+                found[one.child_frame_id] = se3.from_vectors(np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w]))
+    names = takewhile(found.__contains__, map(camera_frame, count()))
+    return [found[name] for name in names]
 
 
 def read_topics(path: Path) -> list[str]:

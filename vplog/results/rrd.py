@@ -14,7 +14,7 @@ from vplog.data import ACCEPTED, Closures, Floats, Ints, Verdict
 from vplog.errors import ResultError
 from vplog.geometry import se3
 from vplog.results.geo import on_earth
-from vplog.results.mcap_read import read_camera_pose, read_images, read_topics
+from vplog.results.mcap_read import read_camera_poses, read_images, read_topics
 from vplog.results.report.page import Tracks, TruthComparison
 from vplog.storage.scratch import put_in_place
 
@@ -135,8 +135,7 @@ def _time(stamp_ns: Any) -> Any:
 
 def _log_camera(recording: Any, rr: Any, result: Path) -> None:
     """The camera on the body, and its pictures."""
-    placed = read_camera_pose(result)
-    if placed is not None:
+    for placed in read_camera_poses(result)[:1]:
         transform = rr.Transform3D(translation=placed[:3, 3], mat3x3=placed[:3, :3])
         recording.log(_CAMERA, transform, static=True)
     known = False

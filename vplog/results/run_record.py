@@ -107,6 +107,11 @@ def read_single_run(folder: Path) -> dict[str, Any]:
     return record
 
 
+def has_metres(record: dict[str, Any]) -> bool:
+    """Whether the lengths of a run are metres, by its run.json."""
+    return record.get("scale") != "unknown"
+
+
 def recorded(record: Any, path: Path, kind: type, *names: str) -> Any:
     """The value of a record under these names. Raises ResultError where there is none, or one of another kind."""
     for name in names:

@@ -126,8 +126,9 @@ def write(
     extras = replace(
         mcap_extras(inputs, previews, run.closures, run.references, verify, pictures, execution),
         thumbnails=camera_thumbnails(run.views, run.closures),
+        further_cameras=[view.camera.body_from_camera for view in run.views[1:]],
         gps=gps,
-        earth=earth_of(trajectory, gps, about_gps(run.solved)),
+        earth=earth_of(trajectory, gps, about_gps(run.solved), run.odometry.metric),
         about={"versions": provenance.versions(), "inputs": steps.cache.hashes()},
     )
     places = [place for view in run.views for place in view.places]

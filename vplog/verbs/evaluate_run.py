@@ -19,6 +19,7 @@ from vplog.evaluate.truth import ate_to_gps, read_truth
 from vplog.geometry import se3
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.results import mcap_read, run_record, tables
+from vplog.results.run_record import has_metres
 from vplog.run.provenance import reopened
 from vplog.storage.folders import is_below
 from vplog.storage.urls import shown
@@ -50,11 +51,6 @@ class TruthOptions(closures.PlaceCriterion):
     def of(self, record: dict[str, Any]) -> TruthOptions:
         """With the alignment for the run of this record."""
         return self if self.align else replace(self, align="se3" if has_metres(record) else "sim3")
-
-
-def has_metres(record: dict[str, Any]) -> bool:
-    """Whether the lengths of a run are metres, by its run.json."""
-    return record.get("scale") != "unknown"
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,9 +140,9 @@ def evaluate_poses(
         keyframes, world_from_body, covariance, ledger = _stretched(
             keyframes, world_from_body, covariance, ledger, scale
         )
-    camera = _camera(folder)
-    of_body = body_truth(known, before, camera)
-    score, judged = closures.score_closures(keyframes, ledger, of_body, stops, options, camera)
+    cameras = _cameras(folder)
+    of_body = body_truth(known, before, next(iter(cameras), None))
+    score, judged = closures.score_closures(keyframes, ledger, of_body, stops, options, cameras)
     found = {
         "truth": shown(truth),
         "scale": None if has_metres(record) else scale,
@@ -187,20 +183,24 @@ def _shifted(known: Trajectory, options: TruthOptions) -> Trajectory:
 def _trajectories(
     before: Trajectory, after: Trajectory, known: Trajectory, of_body: BodyTruth, options: TruthOptions
 ) -> dict[str, Any]:
-    """ATE and RPE against the truth as it is given, as evo has them, and the drift against that of the body."""
+    """ATE and RPE against the truth as it is given, as evo has them, and the drift against that of the body. RPE and
+    drift are None where the truth has no orientations: steps are compared in the frame of the pose that they start at.
+    """
     found: dict[str, Any] = {}
     for when, one in (("before", before), ("after", after)):
         compared, found["interpolated"] = trajectory.at_truth(one, known)
         found[f"ate_{when}"] = asdict(trajectory.ate(compared, known, alignment=options.align))
-        found[f"rpe_{when}"] = asdict(trajectory.rpe(compared, known))
-        found[f"drift_{when}"] = asdict(trajectory.drift(compared, of_body.trajectory))
+        found[f"rpe_{when}"] = found[f"drift_{when}"] = None
+        if of_body.oriented:
+            found[f"rpe_{when}"] = asdict(trajectory.rpe(compared, known))
+            found[f"drift_{when}"] = asdict(trajectory.drift(compared, of_body.trajectory))
     return found
 
 
-def _camera(folder: Path) -> Floats | None:
-    """body_from_camera (4, 4), None where the run was written without."""
+def _cameras(folder: Path) -> list[Floats]:
+    """body_from_camera (4, 4) of each camera, none where the run was written without."""
     path = folder / "result.mcap"
-    return mcap_read.read_camera_pose(path) if path.exists() else None
+    return mcap_read.read_camera_poses(path) if path.exists() else []
 
 
 def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptions) -> dict[str, Any]:
@@ -248,7 +248,7 @@ def _joins(folder: Path, drives: dict[str, RunEvaluation], place: closures.Place
             query, match = (drives[name].truth.at(drives[name].keyframes.stamp_ns) for name in (later, earlier))
             bounds = pose_bounds(*(at.world_from_body[at.known][:, :3, 3] for at in (query, match)))
             oriented = drives[later].truth.oriented and drives[earlier].truth.oriented
-            cameras = _camera(folder / later), _camera(folder / earlier)
+            cameras = _cameras(folder / later), _cameras(folder / earlier)
             judged = closures.judge_closures(ledger, query, match, bounds, place, cameras, oriented)
             counts = closures.count_closures(ledger, judged, place)
             found.append({"query_drive": later, "match_drive": earlier, **counts})

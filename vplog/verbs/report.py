@@ -20,13 +20,14 @@ from vplog.pipeline import Pipeline, recorded_pipeline
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.previews import thumbnail
 from vplog.results.report.page import Pictures, TruthComparison
+from vplog.results.run_record import has_metres
 from vplog.run.figures.run_figures import ClosureInputs, choose_views, reference_pictures, view_closures
 from vplog.run.provenance import library_at
 from vplog.run.report import write_report
 from vplog.stages import BoxState, Log, PlaceState
 from vplog.storage.remote_path import original
 from vplog.storage.urls import shown
-from vplog.verbs.evaluate_run import TruthOptions, evaluate, evaluate_poses, has_metres, log_truth
+from vplog.verbs.evaluate_run import TruthOptions, evaluate, evaluate_poses, log_truth
 
 
 def report(

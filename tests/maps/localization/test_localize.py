@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -150,6 +151,15 @@ def test_a_map_localises_in_the_frame_of_its_joined_drives(halves: Path, picture
     assert {one["drive"] for one in record["answers"]} == {"before", "after"}
     components = {name for one in record["answers"] if (name := one["frame"])}
     assert components <= {"before", "after"}
+    apart = tmp_path / "apart"
+    shutil.copytree(root, apart)
+    shutil.rmtree(apart / "joint", ignore_errors=True)
+    (apart / "joint.json").unlink(missing_ok=True)
+    out, calibration = tmp_path / "poses.tum", {"calibration_file": pictures / "camera.yaml"}
+    alone = api.localize(apart, pictures / "pictures", topics=calibration, out=out)
+    (most, count), (_, others) = Counter(one["frame"] for one in alone["answers"]).most_common(2)
+    assert len(read_tum(out, TruthError, "-o")[0]) == count
+    assert any(f"in the frame of {most}, and lacks {others} picture" in text for text in alone["warnings"])
     image = next((pictures / "pictures").iterdir())
     assert vplog.open_map(root).localize(image, pictures / "camera.yaml").localized
     assert vplog.open_map(root).info(check=True)["damaged_files"] == []

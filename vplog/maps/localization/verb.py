@@ -12,7 +12,7 @@ import numpy as np
 
 from vplog import logs
 from vplog.data import Keyframes, Trajectory, Verdict
-from vplog.errors import LogError, ResultError
+from vplog.errors import LogError, ResultError, plural
 from vplog.execution.execution import Execution
 from vplog.geometry import se3, tum
 from vplog.maps.localization.localize import TOP, LocalizedPicture, localize_log
@@ -46,7 +46,7 @@ def localize_paths(
         records = [one.record() for one in found]
         if out is not None:
             header = TableMetadata(places.pipeline.model_dump(mode="json"), places.state.hash)
-            _write(out, records, found, joined, header)
+            warnings = warnings + _write(out, records, found, joined, is_log, header)
         return {
             "map": str(root),
             "log": " ".join(map(str, paths)),
@@ -100,16 +100,24 @@ def _of_body(one: LocalizedPicture) -> tuple[Any, Any]:
 
 
 def _write(
-    out: Path, records: list[dict[str, Any]], found: list[LocalizedPicture], joined: Trajectory | None,
+    out: Path, records: list[dict[str, Any]], found: list[LocalizedPicture], joined: Trajectory | None, is_log: bool,
     header: TableMetadata,
-) -> None:  # fmt: skip
+) -> list[str]:  # fmt: skip
+    """Warnings. A trajectory without odometry has the poses in the frame of most."""
     if out.suffix == ".parquet":
         write_localized(out, records, header)
-        return
+        return []
     if joined is not None:
         tum.write_tum(out, joined)
-        return
-    known = {one.stamp_ns: pose for one in found if (pose := one.found.world_from_camera) is not None}
-    if not known:
+        return []
+    localized = [one for one in found if one.localized]
+    if not localized:
         raise ResultError(f"None of {len(found)} pictures is localised, so {out} is not written.")
+    frame, count = Counter(one.frame for one in localized).most_common(1)[0]
+    among = [one for one in localized if one.frame == frame]
+    known = {one.stamp_ns: _of_body(one)[0] if is_log else one.found.world_from_camera for one in among}
     tum.write_tum(out, Trajectory(np.array([*known], np.int64), np.stack([*known.values()])))
+    if count == len(localized):
+        return []
+    others = plural(len(localized) - count, "picture")
+    return [f"{out} is in the frame of {frame}, and lacks {others} localised in drives that are not joined with it."]

@@ -322,12 +322,13 @@ def _map(content: ReportContent) -> tuple[list[tuple[str, str]], dict[str, Any]]
         paths.insert(0, ("other", "baseline, optimised", content.changes.path))
     gps, earth = content.tracks.found.gps, content.tracks.earth
     if gps is not None and earth is not None:
-        fixes_m = se3.transform(se3.inverse(earth.enu_from_world), geodesy.local_enu(gps).enu_m)
+        fixes_m = se3.transform(np.linalg.inv(earth.enu_from_world), geodesy.local_enu(gps).enu_m)
         paths.insert(0, ("gps", "GPS fixes", fixes_m))
     view = charts.map_view(np.concatenate([points for _, _, points in paths]))
     axes = dict(zip("xyz", view.T.tolist(), strict=True))
     if earth is not None:
-        axes["N"] = (view @ earth.enu_from_world[1, :3]).tolist()
+        north = earth.enu_from_world[1, :3]
+        axes["N"] = (view @ north / np.linalg.norm(north)).tolist()
     legend = [(kind, name) for kind, name, points in paths if len(points)]
     legend += [(f"dot {kind}", name) for kind, name, rows in groups if rows.any()]
     flat = [

@@ -245,9 +245,12 @@ def view_closures(
     return dict(zip(rows, execution.map(one, rows), strict=True))
 
 
-def earth_of(trajectory: Trajectory, gps: Gps | None, solved: dict[str, Any] | None) -> Earth | None:
+def earth_of(
+    trajectory: Trajectory, gps: Gps | None, solved: dict[str, Any] | None, metric: bool = True
+) -> Earth | None:
     """The pose of a trajectory on earth: that of the solve (`solved`, the `gps` of run.json), else by alignment to the
-    fixes (Umeyama 1991). None without at least three fixes within the drive."""
+    fixes (Umeyama 1991), with scale where the trajectory is not `metric`. None without at least three fixes within the
+    drive, or where they do not move and there is no scale."""
     if solved is not None:
         try:
             origin = [float(solved["origin"][name]) for name in ("latitude_deg", "longitude_deg", "altitude_m")]
@@ -264,4 +267,6 @@ def earth_of(trajectory: Trajectory, gps: Gps | None, solved: dict[str, Any] | N
     if inside.sum() < _LEAST_FIXES:
         return None
     poses = se3.interpolate_at(trajectory.stamp_ns, trajectory.world_from_body, fixes.stamp_ns[inside])
-    return Earth(fixes.origin, se3.umeyama(poses[:, :3, 3], fixes.enu_m[inside])[0])
+    enu_from_world, scale = se3.umeyama(poses[:, :3, 3], fixes.enu_m[inside], with_scale=not metric)
+    enu_from_world[:3, :3] *= scale
+    return Earth(fixes.origin, enu_from_world) if scale > 0.0 else None
