@@ -19,13 +19,15 @@ import pytest
 from tests.rerun import rerun
 from tests.results.example import COUNT, METADATA, make_run
 from tests.results.test_mcap import decode, of
-from vplog.data import USED, Gps, Verdict
+from vplog.data import USED, Gps, Trajectory, Verdict
 from vplog.errors import ResultError
+from vplog.geometry import se3
 from vplog.results import geo, mcap_read
 from vplog.results.contracts import TOPICS
 from vplog.results.geo import Earth
 from vplog.results.mcap import McapExtras, ReferenceBoxes, camera_topic, write_mcap
 from vplog.results.previews import PictureSettings, jpeg, preview, scaled_size, shrink
+from vplog.run.figures.run_figures import earth_of
 from vplog.storage.image_file import decode_image
 
 if TYPE_CHECKING:
@@ -307,7 +309,7 @@ def test_a_run_without_metres_lies_on_earth_by_a_similarity() -> None:
     earth = earth_of(trajectory, fixes, None, metric=False)
     assert earth is not None
     np.testing.assert_allclose(geo.on_earth(earth, poses), where, atol=1e-5)
-    assert (
-        earth_of(trajectory, replace(fixes, latitude_deg=0 * where[:, 1], longitude_deg=0 * where[:, 0]), None)
-        is not None
+    frozen = replace(
+        fixes, latitude_deg=np.zeros(len(enu)), longitude_deg=np.zeros(len(enu)), altitude_m=0.0 * enu[:, 0]
     )
+    assert earth_of(trajectory, frozen, None, metric=False) is None

@@ -100,10 +100,11 @@ def compare(
     warnings: list[str] = []
     with ExitStack() as stack:
         out = options.out
-        made = None if out is None else stack.enter_context(staged(out, lambda: _comparison_in(out)))
+        made = None if out is None else stack.enter_context(staged(out, lambda: _comparison_in(out, query, other)))
         stack.enter_context(logged_warnings(warnings))
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=".vplog-", dir=made)))
-        drives = _open(query, other, truth, pipeline, options, scratch, execution)
+        cached = stack.enter_context(options.cache.opened(scratch))
+        drives = _open(query, other, truth, pipeline, options, cached, execution)
         warnings += check_truth(drives.known, drives.query_log, drives.map_log, options.min_gap)  # before the long part
         images = any(isinstance(one, OnnxSettings | PluginSettings) for one in recognisers.values())
         map_traversal, query_traversal, references, notes = drives.extract_all(images)
@@ -137,7 +138,6 @@ def compare(
         if made is not None:
             figures.draw(ranks, made)
             run_record.write_run_json(made / "compare.json", account)
-    options.cache.trim()
     return Comparison(account, ranks, answers)
 
 
@@ -157,12 +157,12 @@ class _Drives:
     """The log or the images of the library folder; None of the map or a saved library."""
     options: CompareOptions
     pipeline: Pipeline
-    scratch: Path
+    cached: tuple[Path, Path]
+    """The folders of `CacheChoice.opened`."""
     execution: Execution
 
     def traversal_of(self, path: Path, log: Log, frames: Ints) -> Traversal:
-        folder = self.options.cache.open() or self.scratch
-        made = FeatureFolder.of(folder, path, self.options.topics, self.pipeline.features)
+        made = FeatureFolder.of(*self.cached, path, self.options.topics, self.pipeline.features)
         return extract_traversal(log, self.pipeline.features, made, frames, self.execution)
 
     def extract_all(self, images: bool) -> tuple[Traversal, Traversal, list[Reference], list[str]]:
@@ -230,8 +230,8 @@ class _Drives:
 
 
 def _open(
-    query: Path, other: Path, truth: TruthChoice | None, pipeline: Pipeline, options: CompareOptions, scratch: Path,
-    execution: Execution,
+    query: Path, other: Path, truth: TruthChoice | None, pipeline: Pipeline, options: CompareOptions,
+    cached: tuple[Path, Path], execution: Execution,
 ) -> _Drives:  # fmt: skip
     """The logs, the truth and the library of a comparison."""
     topics = every_image(options.topics) if truth is not None and truth.is_labels else options.topics
@@ -244,7 +244,7 @@ def _open(
         library = None
     if library is not None:
         source = load_references(library, execution) if _is_saved(library) else logs.open(library, topics)
-    return _Drives(query, other, query_log, map_log, known, library, source, options, pipeline, scratch, execution)
+    return _Drives(query, other, query_log, map_log, known, library, source, options, pipeline, cached, execution)
 
 
 def every_image(topics: logs.TopicChoice | None) -> logs.TopicChoice:
@@ -313,9 +313,16 @@ def same_drive(a: Path, b: Path) -> bool:
     return a.resolve() == b.resolve()
 
 
-def _comparison_in(out: Path) -> list[str]:
-    """The files of a comparison in a folder that a new one replaces. Raises SettingsError where there are others."""
-    check_contents(out, "a comparison", run_record.is_ours(out / "compare.json"))
+def _comparison_in(out: Path, query: Path, other: Path) -> list[str]:
+    """The files of a comparison in a folder that a new one of the same drives replaces. Raises SettingsError where
+    there are others, or it is of other drives."""
+    path = out / "compare.json"
+    check_contents(out, "a comparison", run_record.is_ours(path))
+    if path.exists():
+        earlier = run_record.read_run_json(path)
+        drives = [str(earlier.get(name)) for name in ("query", "map")]
+        if not all(map(same_drive, map(Path, drives), (query, other))):
+            raise SettingsError(f"{out} holds a comparison of {' in '.join(drives)}. Choose another folder with -o.")
     return ["compare.json", "answers.csv", "scores-[0-9][0-9]-*.npz", *FIGURES]
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -22,7 +24,7 @@ from vplog.run.cache.stage_cache import file_name, key_of, sealed
 from vplog.run.feature_extraction import PART_KEYFRAMES, described, image_topics, is_whole
 from vplog.stages import Extractor, Log
 from vplog.storage.input_hashes import stat_signature
-from vplog.storage.scratch import replacing
+from vplog.storage.scratch import replacing, scratch
 from vplog.storage.user_cache import cache_folder, max_bytes, trim
 
 
@@ -39,9 +41,20 @@ class CacheChoice:
         """The folder for features, None where nothing is kept. Raises SettingsError where it cannot be used."""
         return cache_folder(self.folder, "features", self.max_gb)
 
-    def trim(self) -> None:
-        """Remove what was not used for longest, down to the largest size."""
-        if (folder := self.open()) is not None:
+    @contextmanager
+    def opened(self, otherwise: Path) -> Iterator[tuple[Path, Path]]:
+        """The folder for features, and one for links to those in use, for a block: both `otherwise` where nothing is
+        kept. What was not used for longest goes before and after it, down to the largest size; linked files stay for
+        those who read them."""
+        folder = self.open()
+        if folder is None:
+            yield otherwise, otherwise
+            return
+        trim([folder], max_bytes(self.max_gb))
+        try:
+            with scratch("open", among=folder) as links:
+                yield folder, links
+        finally:
             trim([folder], max_bytes(self.max_gb))
 
 
@@ -50,13 +63,15 @@ class FeatureFolder:
     """A folder for the features of one drive, and what these are made from beside its frames."""
 
     folder: Path
+    links: Path
+    """A folder for links to the files in use, which outlast their removal."""
     made_from: dict[str, Any] = field(default_factory=dict)
     """Plain values; the same ones stand for the same features."""
 
     @classmethod
-    def of(cls, folder: Path, path: Path, topics: TopicChoice | None, extractor: Any) -> FeatureFolder:
+    def of(cls, folder: Path, links: Path, path: Path, topics: TopicChoice | None, extractor: Any) -> FeatureFolder:
         """For the drive at `path`, known by lengths and times of its files."""
-        return cls(folder, {
+        return cls(folder, links, {
             "files": stat_signature(path),
             "topics": None if topics is None else image_topics(topics),
             "features": extractor.model_dump(mode="json"),
@@ -67,10 +82,9 @@ class FeatureFolder:
         """Features and pictures of the frames with these stamps (N,), those that are not there yet from the log."""
         parts = [stamp_ns[at : at + PART_KEYFRAMES] for at in range(0, len(stamp_ns), PART_KEYFRAMES)]
         keys = [key_of({**self.made_from, "drive": log.name, "stamps": part.tolist()}) for part in parts]
+        paths = {key: self._linked(key) for key in keys}
         missing = [
-            (part, key)
-            for part, key in zip(parts, keys, strict=True)
-            if not is_whole(self._path(key), key, part.tolist())
+            (part, key) for part, key in zip(parts, keys, strict=True) if not is_whole(paths[key], key, part.tolist())
         ]
         wanted = [stamp for part, _ in missing for stamp in part.tolist()]
         done = len(stamp_ns) - len(wanted)
@@ -89,11 +103,24 @@ class FeatureFolder:
             times, spent[:] = spent[:], []
             with replacing(self._path(key)) as stream:
                 stream.write(sealed(key, packed(decoded, lost, [], times)))
+            paths[key] = self._linked(key)
         found = Extracted()
         for key in keys:
-            os.utime(self._path(key))  # used now
-            found.add(self._path(key))
+            found.add(paths[key])
         return found
+
+    def _linked(self, key: str) -> Path:
+        """The file of a part by a link of its own, marked as used now."""
+        path = self._path(key)
+        link = self.links / path.name
+        if link == path:
+            return path
+        with suppress(OSError):  # it is not there yet, or the file system has no links
+            link.unlink(missing_ok=True)
+            os.link(path, link)
+            os.utime(path)
+            return link
+        return path
 
     def _path(self, key: str) -> Path:
         return self.folder / file_name("frames", key)

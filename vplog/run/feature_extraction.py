@@ -194,7 +194,7 @@ def split_keyframes(
 
 def image_topics(topics: logs.TopicChoice) -> dict[str, Any]:
     """The choice of topics as far as images depend on it; files beside the log by their content."""
-    named = topics.model_dump(mode="json", exclude={"gps", "masks", "mask_topics", "cameras", "camera_height_m"})
+    named = topics.model_dump(mode="json", exclude={"gps", "masks", "cameras", "camera_height_m"})
     for name, path in topics.files.items():
         hashes = hash_inputs(path)
         named[name] = hashes if path.is_dir() else list(hashes.values())  # a file may be called otherwise

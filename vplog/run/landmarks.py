@@ -65,10 +65,11 @@ def run_drive(
 
 
 def landmark_key(folder: Path, record: dict[str, Any], settings: DriveSettings, camera: int) -> str:
-    """sha256 over all that the landmarks of a finished run's camera depend on."""
+    """sha256 over all that the landmarks of a finished run's camera depend on, but for the files beside its log."""
+    pictures = camera_pictures(folder, camera).keyframes
     made_from = {
         "inputs": record.get("inputs"), "topics": record.get("topics"), "most": MOST,
-        "keyframes": camera_pictures(folder, camera).keyframes.stamp_ns.tolist(), "camera": camera,
+        "keyframes": pictures.stamp_ns.tolist(), "odometry": pictures.odom_from_body.tolist(), "camera": camera,
         "features": settings.features.identity(), "stereo": settings.stereo.model_dump(mode="json"),
         "verify": settings.verify.model_dump(mode="json"), **code_of(__name__, type(settings.features).__module__),
     }  # fmt: skip

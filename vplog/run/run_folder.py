@@ -25,7 +25,7 @@ _RUN_FILES = (
     "run.json", "report.html", "result.mcap", "graph.g2o", "trajectory.tum", "keyframes.parquet", "descriptors.parquet",
     "closures.parquet", "edges.parquet", "trajectory.parquet", "library/library.json", "library/features.parquet",
     "library/references.parquet", "map[0-9]*.g2o", "joins.parquet", "joint_keyframes.parquet",
-    "joint_trajectory.parquet", "joint_trajectory.tum", "landmarks.parquet",
+    "joint_trajectory.parquet", "joint_trajectory.tum", "landmarks*.parquet",
     *(f"closure-{'[0-9]' * digits}.png" for digits in range(1, 10)),
 )  # fmt: skip
 """Glob patterns of all files that runs and `explain` write into the folder of a run and into those of its drives."""

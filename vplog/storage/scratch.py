@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -21,6 +23,8 @@ from vplog.storage.folders import check_replaceable, is_below, regular_files
 Bytes = NDArray[np.uint8]
 
 
+_PART = re.compile(r"\d+(-[0-9a-f]{8})?")
+"""Number of the process that writes a file, which is not the only one of that number where containers share a disk."""
 _PIECE_BYTES = 2**24
 """Bytes of a file sent at once: Ray's smallest store has 75 MiB and needs room for several; 16 MiB take 10 ms to
 copy."""
@@ -125,7 +129,7 @@ def replacing(path: Path, parents: bool = False) -> Iterator[BinaryIO]:
         path = path.resolve() if path.is_symlink() else path
         check_replaceable(path)
         _sweep_parts(path)
-        part = path.with_name(f".{path.name}.{os.getpid()}.part")
+        part = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
         try:
             with part.open("wb") as lock:
                 with suppress(OSError):  # a file system without locks
@@ -143,7 +147,7 @@ def replacing(path: Path, parents: bool = False) -> Iterator[BinaryIO]:
 def _sweep_parts(path: Path) -> None:
     begin, end = f".{path.name}.", ".part"
     for part in path.parent.glob(f"{escape(begin)}*{end}"):
-        if part.name[len(begin) : -len(end)].isdecimal() and _is_left(part):
+        if _PART.fullmatch(part.name[len(begin) : -len(end)]) and _is_left(part):
             part.unlink(missing_ok=True)
 
 

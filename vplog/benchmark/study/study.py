@@ -32,6 +32,7 @@ from vplog.pipeline import Pipeline
 from vplog.results.run_record import is_ours, read_run_json, write_run_json
 from vplog.results.staging import check_contents, staged
 from vplog.run.cache.code_hash import code_of
+from vplog.run.feature_extraction import image_topics
 from vplog.storage.folders import check_regular
 from vplog.storage.input_hashes import hash_inputs
 from vplog.storage.json_records import key_of, plain
@@ -85,12 +86,12 @@ def study(
         _check_same_drives(out, hashes)
         common = {
             "features": pipeline.features.model_dump(mode="json"),
-            "topics": None if topics is None else topics.model_dump(mode="json"),
+            "topics": None if topics is None else topics.model_dump(mode="json") | {"content": image_topics(topics)},
             "min_gap": min_gap,
             "truth_hash": _truth_hash(truth),
         }
-        cached = options.cache.open() or scratch
-        folders = [FeatureFolder.of(cached, path, topics, pipeline.features) for path in drives]
+        cached = stack.enter_context(options.cache.opened(scratch))
+        folders = [FeatureFolder.of(*cached, path, topics, pipeline.features) for path in drives]
         bench = Bench(
             names, opened, hashes, recognisers, known, _covered(known, opened), pipeline, min_gap,
             {**common, "code": code_of(*_SCORES)}, out / "trials.json", scratch, folders, execution,
@@ -127,7 +128,6 @@ def study(
         notes = [warning for log in opened for warning in log.warnings] + warnings + bench.warnings
         result = _write(made, account, inputs, done, list(dict.fromkeys(notes)))
     shutil.rmtree(out / _WORK, ignore_errors=True)
-    options.cache.trim()
     return result
 
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vplog.data import Floats, Int32s, Ints
-from vplog.errors import ResultError
+from vplog.errors import LibraryError, ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.loops.candidate import Drive
@@ -40,8 +40,8 @@ from vplog.results.run_cameras import camera_pictures
 from vplog.run.landmarks import landmark_key, landmarks_file, run_drive, write_drive_landmarks
 from vplog.run.provenance import library_at
 from vplog.stages import CodedState, PlaceState
-from vplog.storage.json_records import plain
-from vplog.storage.remote_path import RemotePath
+from vplog.storage.json_records import key_of, plain
+from vplog.storage.remote_path import RemotePath, original
 from vplog.storage.scratch import scratch
 
 Search = Callable[[Sequence[Any], int], list[list[tuple[int, int]]]]
@@ -121,7 +121,9 @@ def _of_run(folder: Path, execution: Execution) -> Iterator[Places]:
     pipeline = recorded_pipeline(folder, record)
     with library_at(folder, record) as library:
         state = pipeline.places.load(library, Execution(execution.threads))
-    column, _ = tables.read_descriptors(folder / "descriptors.parquet")
+    column, made_by = tables.read_descriptors(folder / "descriptors.parquet")
+    if made_by != state.hash:
+        raise LibraryError(f"{original(library)} is not the library of the run in {folder}, so nothing is found in it.")
     pictures = tables.read_pictures(folder / "descriptors.parquet")
     index = state.index(state.from_arrow(column))
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
@@ -247,7 +249,8 @@ def _map_landmarks(
     of_drive = member_of(store, about)
     member = of_drive.of_camera(camera)
     folder = store.run(about["drive"])
-    key = landmark_key(folder, run_record.read_run_json(folder / "run.json"), member.pipeline, camera)
+    record = run_record.read_run_json(folder / "run.json")
+    key = key_of([landmark_key(folder, record, member.pipeline, camera), member.key])
 
     @contextmanager
     def drive() -> Iterator[Drive]:

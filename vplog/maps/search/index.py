@@ -106,6 +106,17 @@ def content_of(store: Store, drive: str, about: Mapping[str, Any]) -> Content:
     return Content(drive, about["key"], str(files.get("descriptors.parquet", {}).get("sha256", "")))
 
 
+def check_content(store: Store, drive: str, about: Mapping[str, Any]) -> None:
+    """Raises ResultError where the map has a drive of another content by now than its drive.json `about` is of."""
+    _check_content(store, content_of(store, drive, about))
+
+
+def _check_content(store: Store, one: Content) -> None:
+    if content_of(store, one.drive, store.record(one.drive)) != one:
+        path = store.file(one.drive, "descriptors.parquet")
+        raise ResultError(f"{path} was replaced while the map was searched. Run again.")
+
+
 def _open_all(store: Store, state: CodedState) -> tuple[list[tuple[Segment, Path]], list[Path], list[str]]:
     """The segments that fit the library, the files that are of no use, and why the damaged ones are not."""
     known, useless, warnings = [], [], []
@@ -168,9 +179,7 @@ def _plan_compaction(
 def _build(store: Store, group: Sequence[Content], state: CodedState, execution: Execution) -> Segment:
     def read(one: Content) -> pa.Array:
         column = read_column(store, one.drive, state)
-        if content_of(store, one.drive, store.record(one.drive)) != one:
-            path = store.file(one.drive, "descriptors.parquet")
-            raise ResultError(f"{path} was replaced while it was read. Run again.")
+        _check_content(store, one)
         return column
 
     columns = list(execution.map(read, group))

@@ -17,7 +17,7 @@ from vplog.execution.execution import Execution
 from vplog.maps.geo_bounds import DriveBounds
 from vplog.maps.localization.places import Places, opened
 from vplog.maps.search.exact import best_places
-from vplog.maps.search.index import SegmentView, pictures_of, update_index
+from vplog.maps.search.index import SegmentView, check_content, pictures_of, update_index
 from vplog.maps.search.query import MapQuery, open_map, search
 from vplog.maps.search.sequences import LineSearch
 from vplog.maps.storage import map_store, objects
@@ -84,7 +84,9 @@ class OpenState:
         def read(drive: str) -> tuple[Int32s, Ints]:
             path = self.store.file(drive, "descriptors.parquet")
             with reading_drive(drive):
-                return pictures_of(self.store, drive)[0], tables.read_stamps(path)
+                found = pictures_of(self.store, drive)[0], tables.read_stamps(path)
+            check_content(self.store, drive, self.drives[drive])
+            return found
 
         return lru_cache(_DRIVES)(read)
 
@@ -124,7 +126,7 @@ class NewestState:
         if isinstance(self.root, RemotePath):
             found = objects.get_with_version(self.root / "map.json")
             return None if found is None else found.version
-        names = ("map.json", "runs", "removed.json")
+        names = ("map.json", "runs", "removed.json", "joint.json")
         return [(self.root / name).stat().st_mtime_ns for name in names if (self.root / name).exists()]
 
     def _opened(self, execution: Execution) -> OpenState:
