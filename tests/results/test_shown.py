@@ -309,7 +309,6 @@ def test_a_run_without_metres_lies_on_earth_by_a_similarity() -> None:
     earth = earth_of(trajectory, fixes, None, metric=False)
     assert earth is not None
     np.testing.assert_allclose(geo.on_earth(earth, poses), where, atol=1e-5)
-    frozen = replace(
-        fixes, latitude_deg=np.zeros(len(enu)), longitude_deg=np.zeros(len(enu)), altitude_m=0.0 * enu[:, 0]
-    )
+    still = np.zeros(len(enu))
+    frozen = replace(fixes, latitude_deg=still, longitude_deg=still, altitude_m=still)
     assert earth_of(trajectory, frozen, None, metric=False) is None

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 from vplog.errors import ResultError, SettingsError
 from vplog.logs import TopicChoice
 from vplog.maps.storage import layout
+from vplog.places.plugin import PluginSettings
+from vplog.run.cache.code_hash import code_of
 from vplog.storage.json_records import key_of
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.urls import shown
@@ -70,8 +72,9 @@ def with_topics(inputs: Sequence[DriveInput], topics: TopicChoice | None) -> lis
 
 def common_record(pipeline: Pipeline, library: str | None) -> dict[str, Any]:
     """Fields of drive.json that are the same for each drive of a batch. Every setting counts, as every table names them
-    all; the place of a log does not: a map may move with its logs."""
-    return {"settings": key_of(pipeline.model_dump(mode="json")), "library": library}
+    all, and the code of a plug-in; the place of a log does not: a map may move with its logs."""
+    about, places = {"settings": key_of(pipeline.model_dump(mode="json")), "library": library}, pipeline.places
+    return about | ({"plugin": code_of(*places.modules)["code"]} if isinstance(places, PluginSettings) else {})
 
 
 def plan_drives(

@@ -42,6 +42,11 @@ class PluginSettings(Settings):
         made = _imported(_entry_point(self.name))
         return made.read({"kind": self.name, **self.settings}, f"plug-in {self.name}")
 
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Names of the modules whose code its results depend on. Raises SettingsError as `recogniser`."""
+        return (type(self.recogniser()).__module__,)
+
     def learn(self, references: Iterable[Reference], execution: Execution) -> PlaceState:
         """The state that its own settings learn from the references."""
         return self.recogniser().learn(references, execution)

@@ -29,6 +29,7 @@ from vplog.errors import ResultError, SettingsError, TruthError, nearest
 from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, open_truth
 from vplog.execution.execution import Execution, logged_warnings
 from vplog.pipeline import Pipeline
+from vplog.places.plugin import PluginSettings
 from vplog.results.run_record import is_ours, read_run_json, write_run_json
 from vplog.results.staging import check_contents, staged
 from vplog.run.cache.code_hash import code_of
@@ -92,9 +93,11 @@ def study(
         }
         cached = stack.enter_context(options.cache.opened(scratch))
         folders = [FeatureFolder.of(*cached, path, topics, pipeline.features) for path in drives]
+        plugins = [name for one in recognisers.values() if isinstance(one, PluginSettings) for name in one.modules]
+        scoring = code_of(*_SCORES, *plugins)
         bench = Bench(
             names, opened, hashes, recognisers, known, _covered(known, opened), pipeline, min_gap,
-            {**common, "code": code_of(*_SCORES)}, out / "trials.json", scratch, folders, execution,
+            {**common, "code": scoring}, out / "trials.json", scratch, folders, execution,
         )  # fmt: skip
         account = {
             "vplog": __version__,
@@ -110,7 +113,7 @@ def study(
             "seeds": options.seeds,
             "methods": {name: settings.model_dump(mode="json") for name, settings in recognisers.items()},
         }
-        inputs = key_of({**account, "pipeline": pipeline.model_dump(mode="json"), "code": code_of(__name__)})
+        inputs = key_of({**account, "pipeline": pipeline.model_dump(mode="json"), "code": [code_of(__name__), scoring]})
         work = out / _WORK
         done, files = {}, dict[str, Path]()
         for folder in (out, work):

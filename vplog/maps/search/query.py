@@ -19,7 +19,7 @@ from vplog.features.extraction import extract_frames
 from vplog.loops.match_probability import LookAlikes
 from vplog.maps.geo_bounds import Box, DriveBounds, box_of_fixes
 from vplog.maps.search.exact import RankedPlaces, best_places
-from vplog.maps.search.index import SegmentView, pictures_of, read_column, update_index
+from vplog.maps.search.index import SegmentView, check_content, pictures_of, read_column, update_index
 from vplog.maps.search.probability import answer_probabilities
 from vplog.maps.search.sequences import EXACT_PLACES, PLACES_A_VIEW, LineSearch, best_lines, drives_by_votes
 from vplog.maps.storage import map_store
@@ -96,7 +96,7 @@ def query_map(
             known = None if settings.length == 1 else LookAlikes.of(len(descriptors))
             answers, more = search(store, drives, state, descriptors, part, LineSearch(settings, known), execution)
             p_match = answer_probabilities(store, numbered, state, descriptors, answers, known, execution)
-            table = _table(store, list(drives), answers, stamps, p_match)
+            table = _table(store, drives, answers, stamps, p_match)
             named = _named(store, drives, table, log)
             if isinstance(state, EvidenceState):
                 _add_evidence(named, store, names, answers, state, descriptors)
@@ -303,23 +303,25 @@ def _add_evidence(
             one["evidence"] = found[one["query"]]
 
 
-def _table(store: Store, drives: Sequence[str], answers: RankedPlaces, stamps: Ints, p_match: Floats) -> pa.Table:
+def _table(
+    store: Store, drives: Mapping[str, Mapping[str, Any]], answers: RankedPlaces, stamps: Ints, p_match: Floats
+) -> pa.Table:  # fmt: skip
     there = np.arange(answers.score.shape[1]) < answers.count[:, None]
     query, rank = np.nonzero(there)
     number, keyframe = answers.drive[there], answers.keyframe[there]
     stamp, camera = np.empty(len(query), np.int64), np.empty(len(query), np.int32)
     numbers: list[int] = number.tolist()
+    each = list(drives)
     for one in set(numbers):
-        path = store.file(drives[one], "descriptors.parquet")
-        with reading_drive(drives[one]):
-            known, (keyframe_of, camera_of) = tables.read_stamps(path), pictures_of(store, drives[one])
+        path = store.file(each[one], "descriptors.parquet")
+        with reading_drive(each[one]):
+            known, (keyframe_of, camera_of) = tables.read_stamps(path), pictures_of(store, each[one])
+        check_content(store, each[one], drives[each[one]])
         rows = keyframe[number == one]
-        if rows.max() >= len(known):
-            raise ResultError(f"{path} was replaced while the map was searched. Run the query again.")
         stamp[number == one], keyframe[number == one], camera[number == one] = (
             values[rows] for values in (known, keyframe_of, camera_of)
         )
-    names = [drives[one] for one in numbers]
+    names = [each[one] for one in numbers]
     return tables.placed_table(
         [
             query.astype(np.int32), stamps[query], rank.astype(np.int32), names, keyframe, stamp,

@@ -31,9 +31,12 @@ def code_of(*modules: str) -> dict[str, str]:
     """
     own = tuple(module for module in modules if module.partition(".")[0] == "vplog")
     files, packages = imported(own)
-    for module in {*modules} - {*own}:  # a plug-in: its own file, and the version of its package
+    for module in {*modules} - {*own}:  # a plug-in: all files of its package, and its version
+        top = module.partition(".")[0]
+        folders = [Path(place) for place in getattr(sys.modules.get(top), "__path__", ())]
         files[module] = Path(str(sys.modules[module].__file__))
-        packages.add(module.partition(".")[0])
+        files |= {f"{top}/{path.relative_to(folder)}": path for folder in folders for path in folder.rglob("*.py")}
+        packages.add(top)
     digest = hashlib.sha256()
     for name in sorted(files):
         digest.update(f"{name} {hashlib.sha256(files[name].read_bytes()).hexdigest()}\n".encode())
