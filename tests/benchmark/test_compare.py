@@ -17,7 +17,7 @@ from tests.places.sequence_matrix import match_sequences
 from vplog import logs
 from vplog.benchmark import compare
 from vplog.benchmark.compare_figures import queries_shown
-from vplog.benchmark.feature_cache import FeatureFolder
+from vplog.benchmark.feature_cache import CacheChoice, FeatureFolder
 from vplog.benchmark.method_scores import MethodInputs, evaluate_method, stored_bytes
 from vplog.benchmark.recogniser_specs import read_method, read_methods, split_methods
 from vplog.benchmark.sequence_fit import sequence_warning
@@ -76,12 +76,12 @@ def traversals(compiled: None, drive: Demo, tmp_path_factory: pytest.TempPathFac
 @pytest.fixture
 def store(tmp_path: Path) -> FeatureFolder:
     (tmp_path / "features").mkdir()
-    return FeatureFolder(tmp_path / "features")
+    return FeatureFolder(tmp_path / "features", tmp_path / "features")
 
 
 @pytest.fixture(scope="module")
 def day(traversals: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Traversal:
-    folder = FeatureFolder(tmp_path_factory.mktemp("day"))
+    folder = FeatureFolder(place := tmp_path_factory.mktemp("day"), place)
     return extract_traversal(logs.open(traversals[0]), SIFT, folder, execution=Execution(2))
 
 
@@ -696,3 +696,29 @@ def test_answers_that_do_not_fit_are_one_line(
     with pytest.raises(SettingsError, match=message) as caught:
         compare.compare(*traversals, [f"answers:{file}"], TruthChoice("index"), pipeline, options)
     assert "\n" not in str(caught.value)
+
+
+def test_another_comparison_is_not_replaced(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
+    """A mistyped -o costs nothing; the same drives are compared again in the same folder."""
+    options = ("--truth", "index", "--methods", "thumbnail", "-o", tmp_path / "out", *QUICK)
+    for _ in range(2):
+        assert verb("compare", *traversals, *options).code == 0
+    before = (tmp_path / "out" / "compare.json").read_bytes()
+    said = verb("compare", *reversed(traversals), *options)
+    assert f"holds a comparison of {traversals[0]} in {traversals[1]}" in said.error
+    assert (tmp_path / "out" / "compare.json").read_bytes() == before
+
+
+def test_features_in_use_outlast_the_trimming_of_their_cache(traversals: tuple[Path, Path], tmp_path: Path) -> None:
+    """Another comparison with a smaller bound ends while this one reads."""
+    log, extractor = logs.open(traversals[0], None), SMALL.features
+    with CacheChoice(tmp_path).opened(tmp_path) as cached:
+        folder = FeatureFolder.of(*cached, traversals[0], None, extractor)
+        found = folder.extract(log, log.stamps(), extractor, Execution())
+        with CacheChoice(tmp_path, 1e-9).opened(tmp_path):
+            pass
+        assert not list(cached[0].glob("frames-*"))
+        assert len(found[FRAMES - 1].points) > 0
+        again = folder.extract(log, log.stamps(), extractor, Execution())
+        assert (again[3].points == found[3].points).all()
+    assert {path.name.partition("-")[0] for path in cached[0].iterdir()} == {"frames"}

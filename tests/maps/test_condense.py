@@ -264,3 +264,23 @@ def test_a_map_on_a_store_is_condensed_as_a_folder_is(whole: Path, tmp_path: Pat
     assert there == here
     assert info["problems"] == info["damaged_files"] == []
     assert [sorted(one["drives"]) for one in info["components"]] == [sorted(HALVES)]
+
+
+def test_a_map_that_was_not_condensed_to_its_end_says_so(
+    whole: Path, tmp_path: Path, verb: Verb, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small, publish, count = tmp_path / "small", map_store.publish, iter(range(9))
+
+    def killed(*arguments: Any) -> str:
+        if next(count) == 1:
+            raise KeyboardInterrupt
+        return publish(*arguments)
+
+    monkeypatch.setattr(map_store, "publish", killed)
+    assert verb("map", "condense", whole, "-o", small).code == 130
+    monkeypatch.undo()
+    failures = verb("map", "info", small, "--json").json["failures"]
+    assert set(failures) == set(HALVES)
+    assert verb("map", "condense", whole, "-o", small, "--json").json["places"]["after"] > 0
+    info = verb("map", "info", small, "--check", "--json").json
+    assert (info["failures"], info["problems"], len(info["drives"])) == ({}, [], 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ from vplog.execution.execution import Execution
 from vplog.features.sift import SiftSettings
 from vplog.pipeline import Pipeline, pipeline_from, run
 from vplog.places.library_files import read_library_record
+from vplog.run.cache.code_hash import code_of
 from vplog.run.reference_library import build_library, check_library
 from vplog.testing.recogniser_contract import RecogniserContract
 
@@ -150,3 +152,22 @@ def test_logs_keep_colour_for_it(tiny: Demo, tmp_path: Path) -> None:
     colour = frame.decode(colour=True).colour
     assert colour is not None
     assert colour.shape == (*frame.decode().image.shape, 3)
+
+
+def test_all_files_of_a_plugins_package_are_its_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tmp_path / "streets"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "places.py").write_text("from streets import model\n")
+    (package / "model.py").write_text("SIZE = 1\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    try:
+        importlib.import_module("streets.places")
+        before = code_of("streets.places")["code"]
+        (package / "model.py").write_text("SIZE = 2\n")
+        code_of.cache_clear()
+        assert code_of("streets.places")["code"] != before
+    finally:
+        code_of.cache_clear()
+        for name in [name for name in sys.modules if name.partition(".")[0] == "streets"]:
+            del sys.modules[name]

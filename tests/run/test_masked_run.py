@@ -10,9 +10,10 @@ import pytest
 
 from tests.joined import rewritten
 from tests.logs.drives import store
+from vplog.logs import TopicChoice
 from vplog.results.run_record import read_run_json
 from vplog.results.tables import read_keyframes
-from vplog.run.feature_extraction import stored_features
+from vplog.run.feature_extraction import image_topics, stored_features
 from vplog.verbs.demo import SMALL
 from vplog.verbs.demo.record import IMAGE, TYPES
 
@@ -91,3 +92,8 @@ def test_resume_takes_no_mask(verb: Callable[..., Said], tmp_path: Path) -> None
     found = verb("run", "--resume", "-o", tmp_path, "--mask", "mask.png")
     assert found.code == 2
     assert "leave out --mask" in found.err
+
+
+def test_features_depend_on_the_topic_of_their_mask() -> None:
+    plain, masked = TopicChoice(), TopicChoice(mask_topics={IMAGE: "/front/masks"})
+    assert image_topics(plain) != image_topics(masked)

@@ -135,3 +135,15 @@ def test_damaged_run_json_is_one_line(tmp_path: Path, text: str) -> None:
 
 def test_canonical_json_is_the_same_for_any_order() -> None:
     assert canonical_json({"b": 1, "a": {"d": 2, "c": 3}}) == canonical_json({"a": {"c": 3, "d": 2}, "b": 1})
+
+
+def test_processes_of_one_number_on_a_shared_disk_do_not_write_into_each_others_file(tmp_path: Path) -> None:
+    """As containers have them: each writes a file of its own, and the last one stands."""
+    path = tmp_path / "file"
+    with replacing(path) as one:
+        one.write(b"one")
+        with replacing(path) as other:
+            other.write(b"the other")
+        assert path.read_bytes() == b"the other"
+    assert path.read_bytes() == b"one"
+    assert list(tmp_path.iterdir()) == [path]

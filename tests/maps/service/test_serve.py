@@ -186,3 +186,11 @@ def test_boxes_around_a_point_and_drives_within_them() -> None:
         bounds.within(["far"], over, "MAP")
     with pytest.raises(SettingsError, match="no drive 'none'"):
         bounds.within(["none"], None, "MAP")
+
+
+def test_a_join_is_a_new_state(root: Path, finished: Path, tmp_path: Path) -> None:
+    copied = map_of_run(tmp_path / "map", finished)
+    newest = NewestState(copied, None, Execution())
+    assert not newest.refresh()
+    (copied / "joint.json").write_text("{}")
+    assert newest.refresh()

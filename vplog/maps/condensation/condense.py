@@ -44,6 +44,7 @@ from vplog.storage.scratch import copy_folder
 
 LOSS = 0.01
 """Loss of recall at rank one of the map's own queries."""
+_UNFINISHED = "The map was not condensed to its end. Run vplog map condense again."
 _SPACINGS = 3.0
 """An answer is right within so many times the median distance of consecutive keyframes: 3 m of keyframes a metre
 apart."""
@@ -123,9 +124,12 @@ def condense_places(
 
 
 def _write(store: Store, new: Store, found: Condensed) -> None:
-    """The new map. Raises ResultError or SettingsError."""
-    if new.drives() or new.damaged:
+    """The new map, whose drives count as failed until all are there. Raises ResultError or SettingsError."""
+    present, missing = {*new.drives(), *new.damaged}, {drive: one.get("error") for drive, one in new.failures().items()}
+    if present and _UNFINISHED not in missing.values():
         raise SettingsError(f"{new} holds a map already. Choose another folder with -o.")
+    if present:
+        map_store.remove(new, sorted(present))
     if isinstance(found.state, ReferencesState) and not isinstance(found.state, FrameState):
         made = new.staging / "library"
         shutil.rmtree(made, ignore_errors=True)
@@ -134,6 +138,8 @@ def _write(store: Store, new: Store, found: Condensed) -> None:
     else:
         copy_library(new, store, found.state.hash)
     records = store.drives()
+    failures = {drive: {"log": records[drive]["log"], "error": _UNFINISHED} for drive in found.places.drives}
+    new.update_failures(dict(failures))
     for number, drive in enumerate(found.places.drives):
         _write_drive(store, new, records[drive], found, number)
         store.evict(drive)
@@ -141,9 +147,11 @@ def _write(store: Store, new: Store, found: Condensed) -> None:
         store.mirror.rest()
     for name in ("joins", "joint"):  # they name the drives by keys that they still have
         if (store.root / name).is_dir():
+            shutil.rmtree(new.root / name, ignore_errors=True)
             copy_folder(store.root / name, new.root / name, f"{name} of {store} to {new}", copy_function=layout.link)
     if (store.root / "joint.json").is_file():
         layout.link(store.root / "joint.json", new.root / "joint.json")
+    new.update_failures(dict.fromkeys(failures))
 
 
 def _write_drive(store: Store, new: Store, record: Mapping[str, Any], found: Condensed, number: int) -> None:
