@@ -713,7 +713,7 @@ def test_features_in_use_outlast_the_trimming_of_their_cache(traversals: tuple[P
     """Another comparison with a smaller bound ends while this one reads."""
     log, extractor = logs.open(traversals[0], None), SMALL.features
     with CacheChoice(tmp_path).opened(tmp_path) as cached:
-        folder = FeatureFolder.of(*cached, traversals[0], None, extractor)
+        folder = FeatureFolder.of(*cached, traversals[0], None, log, extractor)
         found = folder.extract(log, log.stamps(), extractor, Execution())
         with CacheChoice(tmp_path, 1e-9).opened(tmp_path):
             pass

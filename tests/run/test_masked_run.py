@@ -96,4 +96,5 @@ def test_resume_takes_no_mask(verb: Callable[..., Said], tmp_path: Path) -> None
 
 def test_features_depend_on_the_topic_of_their_mask() -> None:
     plain, masked = TopicChoice(), TopicChoice(mask_topics={IMAGE: "/front/masks"})
-    assert image_topics(plain) != image_topics(masked)
+    assert image_topics(plain, IMAGE) != image_topics(masked, IMAGE)
+    assert image_topics(plain, "/rear") == image_topics(masked, "/rear")

@@ -113,7 +113,8 @@ with replacing(pathlib.Path({str(path)!r})) as stream:
         ]
         for other in others:
             other.touch()
-        written = [*others, tmp_path / f".{path.name}.{process.pid}.part"]
+        [part] = tmp_path.glob(f".result*.{process.pid}-*.part")
+        written = [*others, part]
         assert all(one.exists() for one in written)
         with replacing(path) as stream:
             stream.write(b"whole")

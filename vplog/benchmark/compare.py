@@ -162,7 +162,7 @@ class _Drives:
     execution: Execution
 
     def traversal_of(self, path: Path, log: Log, frames: Ints) -> Traversal:
-        made = FeatureFolder.of(*self.cached, path, self.options.topics, self.pipeline.features)
+        made = FeatureFolder.of(*self.cached, path, self.options.topics, log, self.pipeline.features)
         return extract_traversal(log, self.pipeline.features, made, frames, self.execution)
 
     def extract_all(self, images: bool) -> tuple[Traversal, Traversal, list[Reference], list[str]]:

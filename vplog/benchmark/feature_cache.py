@@ -69,11 +69,13 @@ class FeatureFolder:
     """Plain values; the same ones stand for the same features."""
 
     @classmethod
-    def of(cls, folder: Path, links: Path, path: Path, topics: TopicChoice | None, extractor: Any) -> FeatureFolder:
+    def of(
+        cls, folder: Path, links: Path, path: Path, topics: TopicChoice | None, log: Log, extractor: Any
+    ) -> FeatureFolder:
         """For the drive at `path`, known by lengths and times of its files."""
         return cls(folder, links, {
             "files": stat_signature(path),
-            "topics": None if topics is None else image_topics(topics),
+            "topics": None if topics is None else image_topics(topics, log.camera().name),
             "features": extractor.model_dump(mode="json"),
             **code_of(__name__, "vplog.logs.detect", type(extractor).__module__),
         })  # fmt: skip

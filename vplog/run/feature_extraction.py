@@ -120,7 +120,7 @@ def parts_of(
     if (odometry := log.odometry()) is None:
         raise LogError(f"{log.name} has no odometry of its own, by which its keyframes are selected. Run it whole.")
     keyframes, _ = select_keyframes(log.name, log.stamps(), odometry, pipeline.keyframes)
-    return split_keyframes(path, topics, pipeline, keyframes, inputs_of(path, cache))
+    return split_keyframes(path, topics, log.camera().name, pipeline, keyframes, inputs_of(path, cache))
 
 
 def missing_parts(cache: Path, parts: Iterable[ExtractionPart]) -> list[ExtractionPart]:
@@ -165,11 +165,12 @@ def stored_features(cache: Path, camera: int = 0) -> Extracted | None:
 def split_keyframes(
     drive: Path | Sequence[Path],
     topics: logs.TopicChoice | None,
+    image: str,
     settings: Extraction,
     keyframes: Keyframes,
     inputs: Inputs,
 ) -> list[ExtractionPart]:
-    """The keyframes in parts. Raises LogError where there is only one."""
+    """The keyframes in parts, of the images of topic `image`. Raises LogError where there is only one."""
     stamp_ns = keyframes.stamp_ns
     if len(stamp_ns) < 2:
         raise LogError(
@@ -179,7 +180,7 @@ def split_keyframes(
     topics, paths = topics or logs.TopicChoice(), tuple(address(file.resolve()) for file in files_of(drive))
     alike = {
         "inputs": inputs.token,
-        "topics": image_topics(topics),
+        "topics": image_topics(topics, image),
         "features": settings.features.identity(),
         "stereo": settings.stereo.model_dump(mode="json"),
         "pictures": settings.pictures.model_dump(mode="json", include={"megapixels", "quality"}),
@@ -192,9 +193,10 @@ def split_keyframes(
     ]
 
 
-def image_topics(topics: logs.TopicChoice) -> dict[str, Any]:
-    """The choice of topics as far as images depend on it; files beside the log by their content."""
-    named = topics.model_dump(mode="json", exclude={"gps", "masks", "cameras", "camera_height_m"})
+def image_topics(topics: logs.TopicChoice, image: str) -> dict[str, Any]:
+    """The choice of topics as far as images of topic `image` depend on it; files beside the log by their content."""
+    named = topics.model_dump(mode="json", exclude={"gps", "masks", "mask_topics", "cameras", "camera_height_m"})
+    named["mask"] = topics.mask or topics.mask_topics.get(image)
     for name, path in topics.files.items():
         hashes = hash_inputs(path)
         named[name] = hashes if path.is_dir() else list(hashes.values())  # a file may be called otherwise
@@ -216,7 +218,7 @@ def extract(
     Raises LogError where fewer than two keyframes decode, and ResultError where the disk is full.
     """
     cache = steps.cache
-    parts = split_keyframes(cache.drive, topics, settings, keyframes, cache.inputs)
+    parts = split_keyframes(cache.drive, topics, log.camera().name, settings, keyframes, cache.inputs)
     missing = [
         part for part in parts
         if not (cache.keep and is_whole(cache.folder / part.file, part.key, part.stamp_ns, cache.damaged))

@@ -87,12 +87,16 @@ def study(
         _check_same_drives(out, hashes)
         common = {
             "features": pipeline.features.model_dump(mode="json"),
-            "topics": None if topics is None else topics.model_dump(mode="json") | {"content": image_topics(topics)},
+            "topics": None if topics is None else topics.model_dump(mode="json"),
+            "images": [None if topics is None else image_topics(topics, log.camera().name) for log in opened],
             "min_gap": min_gap,
             "truth_hash": _truth_hash(truth),
         }
         cached = stack.enter_context(options.cache.opened(scratch))
-        folders = [FeatureFolder.of(*cached, path, topics, pipeline.features) for path in drives]
+        folders = [
+            FeatureFolder.of(*cached, path, topics, log, pipeline.features)
+            for path, log in zip(drives, opened, strict=True)
+        ]
         plugins = [name for one in recognisers.values() if isinstance(one, PluginSettings) for name in one.modules]
         scoring = code_of(*_SCORES, *plugins)
         bench = Bench(

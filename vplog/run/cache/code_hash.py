@@ -14,6 +14,8 @@ from importlib import metadata
 from itertools import accumulate
 from pathlib import Path
 
+from vplog.storage.folders import regular_files
+
 _PACKAGE = Path(__file__).parents[2]
 _PUBLISHED_AS = {"cv2": "opencv-python-headless", "faiss": "faiss-cpu", "yaml": "PyYAML", "google": "protobuf"}
 """Packages whose name on PyPI is not the one they are imported by; a search for others takes half a second."""
@@ -35,7 +37,8 @@ def code_of(*modules: str) -> dict[str, str]:
         top = module.partition(".")[0]
         folders = [Path(place) for place in getattr(sys.modules.get(top), "__path__", ())]
         files[module] = Path(str(sys.modules[module].__file__))
-        files |= {f"{top}/{path.relative_to(folder)}": path for folder in folders for path in folder.rglob("*.py")}
+        below = ((folder, name) for folder in folders for name in regular_files(folder))
+        files |= {f"{top}/{name}": folder / name for folder, name in below if name.endswith(".py")}
         packages.add(top)
     digest = hashlib.sha256()
     for name in sorted(files):
