@@ -665,7 +665,8 @@ def test_a_number_is_a_frame_also_where_images_are_named_by_numbers(
             (folder / f"{number + 1}.png").symlink_to(image)
     answers = tmp_path / "answers.csv"
     answers.write_text("query,match\n" + "".join(f"{row},{row}\n" for row in range(FRAMES)))
-    done = compare.compare(*folders, [f"answers:{answers}"], TruthChoice("index", tolerance=0), SMALL)
+    query, other = folders
+    done = compare.compare(query, other, [f"answers:{answers}"], TruthChoice("index", tolerance=0), SMALL)
     (found,) = done.record["methods"].values()
     assert found["r_at_1"] == 1.0
 

@@ -312,7 +312,11 @@ def drive_of(path: Path) -> tuple[Any, Keyframes, list[Any]]:
     """A log, its frames as keyframes, and these in parts."""
     log = logs.open(path)
     keyframes = Keyframes(log.name, log.stamps(), np.tile(np.eye(4), (len(log.stamps()), 1, 1)))
-    return log, keyframes, split_keyframes([path], None, Pipeline(), keyframes, inputs_of(path, None))
+    return (
+        log,
+        keyframes,
+        split_keyframes([path], None, log.camera().name, Pipeline(), keyframes, inputs_of(path, None)),
+    )
 
 
 @pytest.mark.parametrize("kind", ["video", "damaged video", "depth"])

@@ -72,7 +72,7 @@ class FeatureFolder:
     def of(
         cls, folder: Path, links: Path, path: Path, topics: TopicChoice | None, log: Log, extractor: Any
     ) -> FeatureFolder:
-        """For the drive at `path`, known by lengths and times of its files."""
+        """For the drive at `path`, which is `log`, known by lengths and times of its files."""
         return cls(folder, links, {
             "files": stat_signature(path),
             "topics": None if topics is None else image_topics(topics, log.camera().name),

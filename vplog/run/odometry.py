@@ -197,9 +197,8 @@ def odometry_of(log: Log, topics: TopicChoice, steps: Steps) -> Odometry:
         return odometry
     compute = by_lidar if source == "lidar" else by_images
     others = (topics.camera_height_m,) if source == "visual" else ()
-    return steps(
-        compute, log, topics.odometry is None, steps.cache.inputs, image_topics(topics, log.camera().name), *others
-    )
+    images = image_topics(topics, log.camera().name)
+    return steps(compute, log, topics.odometry is None, steps.cache.inputs, images, *others)
 
 
 @step("odometry", lambda *_: json_codec(_from_plain, _plain), lambda log, *_: len(log.stamps()), ("log",))

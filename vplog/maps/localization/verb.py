@@ -115,7 +115,8 @@ def _write(
         raise ResultError(f"None of {len(found)} pictures is localised, so {out} is not written.")
     frame, count = Counter(one.frame for one in localized).most_common(1)[0]
     among = [one for one in localized if one.frame == frame]
-    known = {one.stamp_ns: _of_body(one)[0] if is_log else one.found.world_from_camera for one in among}
+    poses = [_of_body(one)[0] if is_log else one.found.world_from_camera for one in among]
+    known = {one.stamp_ns: pose for one, pose in zip(among, poses, strict=True) if pose is not None}
     tum.write_tum(out, Trajectory(np.array([*known], np.int64), np.stack([*known.values()])))
     if count == len(localized):
         return []

@@ -322,7 +322,9 @@ def _map(content: ReportContent) -> tuple[list[tuple[str, str]], dict[str, Any]]
         paths.insert(0, ("other", "baseline, optimised", content.changes.path))
     gps, earth = content.tracks.found.gps, content.tracks.earth
     if gps is not None and earth is not None:
-        fixes_m = se3.transform(np.linalg.inv(earth.enu_from_world), geodesy.local_enu(gps).enu_m)
+        fixes_m = se3.transform(
+            np.asarray(np.linalg.inv(earth.enu_from_world), np.float64), geodesy.local_enu(gps).enu_m
+        )
         paths.insert(0, ("gps", "GPS fixes", fixes_m))
     view = charts.map_view(np.concatenate([points for _, _, points in paths]))
     axes = dict(zip("xyz", view.T.tolist(), strict=True))
