@@ -212,5 +212,5 @@ def run(
             log, odometry, camera, keyframes, features, library, references, state, coverage, descriptors, solved, views
         )
         header = tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash)
-        written = do(write, folder, result, pipeline.verify, pipeline.pictures, header)
+        written = do(write, folder, result, pipeline.verify, pipeline.pictures, pipeline.features.identity(), header)
         return finish(folder, result, do(report, folder, result, written, head), do)

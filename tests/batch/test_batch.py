@@ -24,6 +24,7 @@ from unittest.mock import Mock
 import duckdb
 import pytest
 
+from tests.features.small_networks import corners
 from tests.forked import VPLOG, Forked
 from tests.joined import rewritten
 from tests.maps.bucket import serving
@@ -231,6 +232,16 @@ def test_another_library_or_writer_is_refused(whole: Path, logs: list[Path], tmp
     (tmp_path / "thesis.txt").write_text("not a map")
     with pytest.raises(SettingsError, match=r"thesis.txt|other"):
         run_batch(logs, tmp_path, pipeline)
+    assert files(whole) == before
+
+
+def test_other_features_are_refused_before_the_map_has_their_settings(
+    whole: Path, logs: list[Path], tmp_path: Path
+) -> None:
+    before, model = files(whole), corners(tmp_path, values=64)  # descriptors as long as those of SIFT
+    settings = ("features.kind=onnx", f"features.model={model}", "places.neighbours=8")
+    with pytest.raises(LibraryError, match=r"features\.kind=sift"):
+        run_batch(logs[:1], whole, load_pipeline("default", settings))
     assert files(whole) == before
 
 

@@ -9,18 +9,20 @@ import pytest
 
 from tests.features.small_networks import LOCAL_YAML, corners
 from tests.places.pictures import texture
-from vplog.data import Reference, Verdict
+from vplog.data import Camera, Frame, Reference, Verdict
 from vplog.errors import LibraryError, VplogError
 from vplog.execution.execution import Execution
 from vplog.features.learned import OnnxFeatureSettings, as_bytes
 from vplog.features.matching import MatchSettings, match_features
 from vplog.features.store import FeatureStore
+from vplog.maps.localization.localize import described
 from vplog.pipeline import Pipeline, pipeline_from, run
 from vplog.places.bobb import BobbSettings
 from vplog.places.hybrid import HybridSettings
+from vplog.places.library_files import name_extractor, read_library_record
 from vplog.places.vlad import VladSettings
 from vplog.results import tables
-from vplog.run.reference_library import build_library
+from vplog.run.reference_library import build_library, check_library
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -127,8 +129,30 @@ def test_a_drive_with_features_of_a_network(drive: Demo, network: Path, tmp_path
     assert any(len(references) for references in closures.shared_references)
     library = tmp_path / "library"
     build_library([drive.log], library, Pipeline.model_validate({"library": {"size": 4}, "places": {"references": 4}}))
-    with pytest.raises(LibraryError, match=r"128 bytes and this drive's 64.*vplog library"):
+    with pytest.raises(LibraryError, match=r"made with features.kind=sift, and this run has onnx.*vplog library"):
         run(drive.log, tmp_path / "other", pipeline, library)
+    assert read_library_record(tmp_path / "out" / "library")["extractor"] == pipeline.features.identity()
+
+
+def test_a_library_of_other_features_is_refused(references: list[Reference], network: Path, tmp_path: Path) -> None:
+    """By their name, as those of SIFT and of a network of 64 values are as long; by length where it has no name."""
+    wide = Pipeline(features=OnnxFeatureSettings(model=str(corners(tmp_path, "wide", values=64))))
+    own, sift = Pipeline(features=OnnxFeatureSettings(model=str(network))), Pipeline()
+    library, state = tmp_path / "library", sift.places.learn(references, Execution())
+    state.save(library)
+    check_library(library, own)
+    for other in (wide, sift):
+        with pytest.raises(LibraryError, match="64 bytes and this drive's 128"):
+            check_library(library, other)
+    name_extractor(library, own.features.identity())
+    assert sift.places.load(library, Execution()).hash == state.hash
+    check_library(library, own.model_copy(update={"features": own.features.model_copy(update={"max_features": 9})}))
+    for name, other in (("sha256", wide), ("kind", sift)):
+        with pytest.raises(LibraryError, match=rf"made with features\.{name}="):
+            check_library(library, other)
+    frame = Frame(0, Camera("a", np.eye(3), "", np.zeros(0), 320, 200, np.eye(4)), texture(0))
+    with pytest.raises(LibraryError, match="64 bytes and this drive's 128"):
+        described(state, sift.features, frame, "a map")
 
 
 @pytest.mark.parametrize(

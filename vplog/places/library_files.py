@@ -40,7 +40,7 @@ _MAX_DESCRIPTOR = 4096
 def check_descriptors(references: Sequence[Reference], features: Features) -> None:
     """Raises LibraryError where the library's descriptors have another length than a drive's."""
     made, own = {one.features.descriptors.shape[1] for one in references}, features.descriptors.shape[1]
-    if made != {own}:
+    if made - {own}:
         raise LibraryError(
             f"The library's descriptors have {max(made)} bytes and this drive's {own}: they are of other local "
             "features. Build the library with these settings of features: vplog library."
@@ -146,14 +146,25 @@ def save_references(
             "features": len(owners),
             "settings": settings.model_dump(mode="json"),
         }
-        part = folder / f".library.json.{os.getpid()}.part"
-        part.write_text(json.dumps(with_checksum(record), indent=2) + "\n", encoding="utf-8")
-        sync_all(folder)
-        put_in_place(part, folder / "library.json")
+        _write_record(folder, record)
     except OSError as error:
         raise LibraryError(
             f"Cannot write the library {folder}: {error.strerror or error}. Choose another folder."
         ) from None
+
+
+def _write_record(folder: Path, record: dict[str, Any]) -> None:
+    part = folder / f".library.json.{os.getpid()}.part"
+    part.write_text(json.dumps(with_checksum(record), indent=2) + "\n", encoding="utf-8")
+    sync_all(folder)
+    put_in_place(part, folder / "library.json")
+
+
+def name_extractor(folder: Path, extractor: dict[str, Any] | None) -> None:
+    """Add to library.json the settings of what found its features: other features may have descriptors as long. None
+    where they are not known, as of libraries of earlier versions."""
+    if extractor is not None:
+        _write_record(folder, {**read_library_record(folder), "extractor": extractor})
 
 
 def _write(path: Path, schema: pa.Schema, columns: Sequence[Any], compression: str) -> None:

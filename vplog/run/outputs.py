@@ -25,6 +25,7 @@ from vplog.geometry import se3, tum
 from vplog.graph import consistency
 from vplog.graph.joint import spaced_apart
 from vplog.graph.refine import about_odometry
+from vplog.places.library_files import name_extractor
 from vplog.results import g2o, mcap, run_record, tables
 from vplog.results.previews import thumbnail
 from vplog.results.report.page import Pictures, ReportContent
@@ -113,6 +114,7 @@ def write(
     run: Run,
     verify: VerifySettings,
     pictures: PictureSettings,
+    extractor: dict[str, Any],
     header: tables.TableMetadata,
     *,
     steps: Steps,
@@ -145,6 +147,7 @@ def write(
     mcap.write_mcap(folder / "result.mcap", keyframes, poses, run.graph, run.closures, header, extras)
     if run.library is None:
         run.state.save(folder / "library")
+        name_extractor(folder / "library", extractor)
     steps.cache.finish([view.pictures.features.files for view in run.views])
     first = len(run.views[0].places)  # the report shows those of the first camera
     return Written(extras, covariance, descriptors[:first], graph_sha256)

@@ -26,7 +26,13 @@ from vplog.places.coverage import (
 )
 from vplog.places.library import WordSettings
 from vplog.places.library import build_library as index_words
-from vplog.places.library_files import check_descriptors, load_references, read_library_record, read_sources
+from vplog.places.library_files import (
+    check_descriptors,
+    load_references,
+    name_extractor,
+    read_library_record,
+    read_sources,
+)
 from vplog.places.plugin import PluginSettings
 from vplog.places.reference_choice import FRAMES_A_REFERENCE, PAPER_SIZE, LibrarySettings, choose, evenly
 from vplog.places.self_recognition import MOST, NO_IMAGE, add_until_enough, further, lacking
@@ -62,13 +68,25 @@ def check_library(folder: Path | None, pipeline: Describing) -> None:
         return
     recover(folder)
     places = pipeline.places.recogniser() if isinstance(pipeline.places, PluginSettings) else pipeline.places
-    made = places.read(read_library_record(folder)["settings"], f"{folder}/library.json")
+    record = read_library_record(folder)
+    made = places.read(record["settings"], f"{folder}/library.json")
     for name, value in places:
         left_open = value is None or name in made.LOCATIONS  # None leaves it to the library
         if not left_open and getattr(made, name) != value:
             raise LibraryError(
                 f"{folder} was made with places.{name}={getattr(made, name)}, and this run has {value}. "
                 f"Build another with `vplog library`, or run with --set places.{name}={getattr(made, name)}."
+            )
+    own, extractor = pipeline.features.identity(), record.get("extractor")
+    if not isinstance(extractor, dict):  # of an earlier version
+        references = load_references(folder)
+        check_descriptors(references, pipeline.features(references[0].image))
+        return
+    for name in ("kind", "sha256"):  # other settings find more or fewer features, which compare
+        if extractor.get(name) != own.get(name):
+            raise LibraryError(
+                f"{folder} was made with features.{name}={extractor.get(name)}, and this run has {own.get(name)}: "
+                "descriptors do not compare. Build another with `vplog library`, or run with its settings of features."
             )
 
 
@@ -170,6 +188,7 @@ def library_of_logs(
             warn(line)
         state = pipeline.places.learn(references, execution)
         state.save(made)
+        name_extractor(made, pipeline.features.identity())
     return state
 
 

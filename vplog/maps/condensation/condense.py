@@ -35,7 +35,7 @@ from vplog.maps.search.query import open_map
 from vplog.maps.storage import layout, map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.map_store import Store
-from vplog.places.library_files import ReferencesState
+from vplog.places.library_files import ReferencesState, name_extractor, read_library_record
 from vplog.results import run_record, tables
 from vplog.run.provenance import library_of
 from vplog.stages import CodedState, FrameState, PlaceState
@@ -134,6 +134,7 @@ def _write(store: Store, new: Store, found: Condensed) -> None:
         made = new.staging / "library"
         shutil.rmtree(made, ignore_errors=True)
         found.state.save_small(made)
+        name_extractor(made, read_library_record(store.library(found.whole.hash)).get("extractor"))
         put_library(new, made, found.state.hash, store.head().settings)
     else:
         copy_library(new, store, found.state.hash)

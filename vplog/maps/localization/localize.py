@@ -19,6 +19,7 @@ from vplog.features.extraction import describe
 from vplog.geometry import se3
 from vplog.geometry.masking import masked
 from vplog.loops.localize import Localization, localize
+from vplog.places.library_files import check_descriptors
 from vplog.results.geo import on_earth
 from vplog.results.tables import POSE_COLUMNS
 from vplog.stages import EncodedFrame, Extractor, FrameState, Log, PlaceState, StoredState
@@ -159,6 +160,7 @@ def described(state: PlaceState, extractor: Extractor, frame: Frame, name: str) 
             "recogniser that describes pictures: --set places.kind=bobb."
         )
     features = describe(extractor, frame)  # depths of a pair would cost as much again, and add little
+    check_descriptors(getattr(state, "references", ()), features)
     descriptor = state.describe_frame(masked(frame)) if isinstance(state, FrameState) else state.describe(features)
     return Picture(frame.stamp_ns, frame.camera, features, descriptor)
 

@@ -29,6 +29,7 @@ from vplog.maps.storage.download_cache import Cache
 from vplog.maps.storage.layout import PICTURES
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline
+from vplog.places.library_files import check_descriptors
 from vplog.places.sequence import SequenceSettings
 from vplog.places.views import views_of
 from vplog.results import tables
@@ -173,17 +174,18 @@ def select_views(log: Log, settings: KeyframeSettings) -> tuple[Ints, Keyframes 
 
 
 def describe_log(
-    log: Log, pipeline: Pipeline, state: PlaceState, execution: Execution
+    log: Log, pipeline: Pipeline, state: PlaceState, execution: Execution, *, query: bool = True
 ) -> tuple[Ints, list[Any], list[str]]:
     """Stamps (Q,) and descriptors of the keyframes of a log, and what was lost; of all frames without odometry.
 
-    A descriptor takes some hundred bytes, and no image or feature is kept.
+    `query` is False for a log that becomes a drive of the map. A descriptor takes some hundred bytes, and no image or
+    feature is kept.
     """
     stamps, keyframes, warnings = select_views(log, pipeline.keyframes)
     if keyframes is None and log.file_names() is None:  # pictures never have odometry
         warnings.append(f"{log.name} has no odometry, so every frame is a query.")
     described, descriptors, lost = [], [], []
-    found = _descriptors(log, stamps, pipeline, state, execution)
+    found = _descriptors(log, stamps, pipeline, state, execution, query)
     for stamp_ns, descriptor, why in execution.counted("describe", found, len(stamps)):
         if descriptor is None:
             lost.append(why)
@@ -198,11 +200,11 @@ def describe_log(
 
 
 def _descriptors(
-    log: Log, stamps: Ints, pipeline: Pipeline, state: PlaceState, execution: Execution
+    log: Log, stamps: Ints, pipeline: Pipeline, state: PlaceState, execution: Execution, query: bool
 ) -> Iterator[tuple[int, Any, str]]:
     """Stamp and descriptor of each frame, which is None, with the reason, where it does not decode."""
     if isinstance(state, FrameState | StoredState):
-        views = views_of(state, log, stamps, lambda _: None, query=True)
+        views = views_of(state, log, stamps, lambda _: None, query)
 
         def view(given: tuple[int, Any]) -> tuple[int, Any, str]:
             try:
@@ -212,9 +214,14 @@ def _descriptors(
 
         return execution.map(view, zip(stamps.tolist(), views.items, strict=True), ahead=2)
 
+    references = getattr(state, "references", ())
+
     def features(found: Any) -> tuple[int, Any, str]:
         stamp_ns, _, features, why = found
-        return stamp_ns, None if features is None else state.describe(features), why
+        if features is None:
+            return stamp_ns, None, why
+        check_descriptors(references, features)
+        return stamp_ns, state.describe(features), why
 
     return execution.map(features, extract_frames(log.frames(stamps), pipeline.features, execution, pipeline.stereo))
 
