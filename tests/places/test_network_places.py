@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from vplog.evaluate.place_truth import TruthChoice
 from vplog.execution.execution import Execution
 from vplog.features import onnx_model
 from vplog.features.sift import SiftSettings
+from vplog.maps.joining.joint_run import run_joint
 from vplog.pipeline import Pipeline, pipeline_from
 from vplog.places.network_vector import OnnxSettings
 from vplog.places.vectors import VectorsSettings
@@ -285,6 +287,38 @@ def test_vectors_of_one_drive_are_not_taken_for_anothers(
     assert len(of_pair.stored(log, log.stamps(), query=True)) == FRAMES
     with pytest.raises(LibraryError, match="does not say which"):
         of_pair.stored(log, log.stamps(), None)
+
+
+def test_a_file_of_one_drive_is_taken_for_no_other(
+    folders: tuple[Path, Path], pair: Path, verb: Callable[..., Said], tmp_path: Path
+) -> None:
+    """Of a pair of files the map has that of the database, and one drive alone; of a model each drive has its own."""
+    night, day = folders
+    quick = ("features.max_features=50", "features.max_megapixels=0.01", "library.size=4", "places.kind=vectors")
+    root, model = tmp_path / "map", tmp_path / "model"
+
+    def batch(root: Path, *logs: Path, file: Path, model: str = "") -> Said:
+        places = [f"places.file={file}", *([f"places.model={model}"] if model else [])]
+        options = [word for one in (*quick, *places) for word in ("--set", one)]
+        return verb("batch", *logs, "-o", root, "--jobs", "1", *options, "--json")
+
+    assert "which of 2 drives" in batch(root, night, day, file=pair).error
+    assert not root.exists()
+    assert batch(root, day, file=pair).code == 0
+    places = tables.read_descriptors(root / "runs" / "drive=day" / "descriptors.parquet")[0]
+    settings = VectorsSettings(file=str(pair))
+    own = settings.learn([reference(0)], Execution())
+    assert places.equals(own.to_arrow(list(described(own, day).astype(np.float16))))
+    assert "which of 2 drives" in batch(root, night, file=pair).error
+    assert batch(root, day, file=pair).code == 0, "it is there already"
+    for folder in folders:
+        np.save(tmp_path / f"{folder.name}.npy", vectors(folder))
+        assert batch(model, folder, file=tmp_path / f"{folder.name}.npy", model="means").code == 0
+    shutil.copytree(day, tmp_path / "other")
+    assert "which of 2 drives" in batch(model, tmp_path / "other", file=tmp_path / "day.npy", model="means").error
+    for one in (VectorsSettings(file=str(pair)), VectorsSettings(file=str(tmp_path / "day.npy"))):
+        with pytest.raises(LibraryError, match="which of 2 drives"):
+            run_joint([night, day], tmp_path / "joint", Pipeline(places=one))
 
 
 def test_distances_rank_as_the_metric_says(tmp_path: Path, folders: tuple[Path, Path]) -> None:

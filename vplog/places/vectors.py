@@ -53,7 +53,7 @@ class VectorsSettings(RelearnedSettings):
     def learn(self, references: Iterable[Reference], execution: Execution) -> VectorsState:
         """Nothing to learn. Raises LibraryError where there is no reference, or no file of vectors."""
         paths = _files(self.file)
-        tables = [_Rows(path) if path.suffix == ".npy" else _Stamped(path) for path in paths]
+        tables = [_opened(path) for path in paths]
         lengths = {table.dimensions for table in tables}
         if len(lengths) > 1:
             raise LibraryError(f"{paths[0]} and {paths[1].name} have vectors of {sorted(lengths)} values: no pair.")
@@ -188,6 +188,21 @@ class _Stamped:
                 f"{int(stamp_ns[missing[0]])}. Give a vector for each."
             )
         return self._vectors[rows[at]]
+
+
+def check_drives(places: object, drives: int) -> None:
+    """Raises LibraryError where places are vectors of a file that does not say which of so many drives they are of."""
+    if isinstance(places, VectorsSettings) and places.file and drives > 1:
+        path = _files(places.file)[-1]
+        if not _opened(path).names_drives:
+            raise LibraryError(
+                f"{path} does not say which of {drives} drives its vectors are of. Give a Parquet file with "
+                f"{_COLUMNS}; or, with places.model, one drive at a time with its own file."
+            )
+
+
+def _opened(path: Path) -> _Rows | _Stamped:
+    return _Rows(path) if path.suffix == ".npy" else _Stamped(path)
 
 
 def _files(name: str) -> list[Path]:

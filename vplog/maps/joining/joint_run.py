@@ -27,6 +27,7 @@ from vplog.maps.joining.inter_session import (
 from vplog.maps.joining.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive
 from vplog.pipeline import Pipeline, Run
 from vplog.pipeline import run as run_alone
+from vplog.places.vectors import check_drives
 from vplog.results import g2o, run_record, tables
 from vplog.results.run_record import CACHE
 from vplog.run import provenance
@@ -69,6 +70,7 @@ def run_joint(
     if pipeline.gps.use:
         raise SettingsError("GPS is for one drive at a time: run each by itself with --gps, or several without.")
     pipeline.decisions.check_single_drive()
+    check_drives(pipeline.places, len(paths))
     opened = [logs.open(path, topics) for path in paths]
     drives_at: dict[str, Path] = {}
     for log, path in zip(opened, paths, strict=True):
