@@ -23,6 +23,7 @@ from vplog.maps.localization.places import opened as opened_places
 from vplog.maps.service import http, open_state
 from vplog.maps.service.open_state import NewestState
 from vplog.maps.storage import map_store
+from vplog.maps.storage.map_store import folder_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -114,6 +115,38 @@ def test_a_drive_that_comes_later_is_found(root: Path, finished: Path) -> None:
 
 def _column(finished: Path) -> Any:
     return http.tables.read_descriptors(finished / "descriptors.parquet")[0]
+
+
+def test_damaged_drives_are_left_out_and_faults_of_the_map_are_its_own(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copied, body = map_of_run(tmp_path / "map", finished), (finished / "descriptors.parquet").read_bytes()
+
+    def damage(drive: str) -> None:
+        (copied / "runs" / folder_name(drive) / "descriptors.parquet").write_bytes(b"damaged")
+
+    damage("ten")
+    with served(copied, refresh_s=3600) as (newest, ask):
+        about = ask("/map")[1]
+        assert about["drives"] == 2
+        assert "ten is damaged and left out" in about["warnings"][0]
+        damage("back 1/2")
+        status, found = ask("/query?top=3", body)
+        assert status == 200
+        assert {one["drive"] for one in found["answers"]} == {"all"}
+        assert sum("is damaged and left out" in one for one in found["warnings"]) == 2
+        assert ask("/query?drive=nowhere", body)[0] == 400
+
+        def broken(*_: object) -> None:
+            raise ResultError("The map has gone.")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(open_state, "best_places", broken)
+            assert ask("/query", body) == (503, {"detail": "The map has gone."})
+        (copied / "map.json").write_text("{")
+        assert not newest.refresh()
+        assert "map.json" in ask("/map")[1]["warnings"][-1]
+        assert ask("/query", body)[0] == 200
 
 
 def test_requests_are_bounded_and_told_why(root: Path, finished: Path) -> None:

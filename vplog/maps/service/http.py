@@ -33,13 +33,17 @@ from vplog.logs import TopicChoice
 from vplog.maps.geo_bounds import box_around
 from vplog.maps.localization.localize import described, localize_frame
 from vplog.maps.search.query import MapQuery
-from vplog.maps.service.open_state import NewestState, OpenState
+from vplog.maps.service.open_state import NewestState, OpenState, UnreadableMapError
+from vplog.maps.storage.contents import damage_warnings
+from vplog.maps.storage.damage import DamagedDriveError, UnreachableError
 from vplog.results import tables
 from vplog.stages import FrameState
 from vplog.storage.scratch import scratch
 from vplog.version import __version__
 
 _PARQUET = b"PAR1"
+_OF_THE_MAP = (UnreadableMapError, DamagedDriveError, UnreachableError)
+"""Errors that another query would meet, too: 503, and not 400."""
 
 
 @dataclass(frozen=True)
@@ -81,14 +85,15 @@ def application(newest: NewestState, limits: Limits, calibration: Path | None = 
 
     @app.exception_handler(VplogError)
     async def refused(_: Request, error: VplogError) -> JSONResponse:
-        return JSONResponse({"detail": str(error)}, 400)
+        return JSONResponse({"detail": str(error)}, 503 if isinstance(error, _OF_THE_MAP) else 400)
 
     @app.get("/map")
     def about() -> dict[str, Any]:
         now = newest.now
+        warnings = [*now.warnings, *damage_warnings(now.store), *filter(None, [newest.problem])]
         return {
             "map": str(newest.root), "vplog": __version__, "drives": len(now.drives), "places": now.places,
-            "recogniser": now.pipeline.places.kind, "library": now.state.hash, "warnings": now.warnings,
+            "recogniser": now.pipeline.places.kind, "library": now.state.hash, "warnings": warnings,
         }  # fmt: skip
 
     @app.post("/query")

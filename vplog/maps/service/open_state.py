@@ -5,14 +5,16 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vplog.data import Int32s, Ints
-from vplog.errors import VplogError
+from vplog.errors import ResultError, VplogError
 from vplog.execution.execution import Execution
 from vplog.maps.geo_bounds import DriveBounds
 from vplog.maps.localization.places import Places, opened
@@ -21,6 +23,7 @@ from vplog.maps.search.index import SegmentView, check_content, pictures_of, upd
 from vplog.maps.search.query import MapQuery, open_map, search
 from vplog.maps.search.sequences import LineSearch
 from vplog.maps.storage import map_store, objects
+from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.download_cache import Cache
 from vplog.maps.storage.map_store import Store
@@ -31,6 +34,10 @@ from vplog.storage.remote_path import RemotePath
 
 _DRIVES = 4096
 """Drives whose stamps stay in memory: some 100 MB of drives of 2000 keyframes."""
+
+
+class UnreadableMapError(ResultError):
+    """The map cannot be read, which is no fault of what is asked."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,24 +56,39 @@ class OpenState:
         """Number of places."""
         if isinstance(self.state, CodedState):
             return sum(part.places for part in self.parts)
-        return sum(self.store.rows("descriptors", drive) for drive in self.drives)
+        return skip_damaged(
+            self.store,
+            lambda: sum(self.store.rows("descriptors", one) for one in self.drives if one not in self.store.damaged),
+        )
 
     @cached_property
     def _bounds(self) -> DriveBounds:
         return DriveBounds(self.drives)
 
     def answers(self, descriptors: Sequence[Any], query: MapQuery) -> tuple[list[dict[str, Any]], list[str]]:
-        """The best places for each view by itself, best first, as plain values; and warnings."""
-        names = self._bounds.names
+        """The best places for each view by itself, best first, as plain values; and warnings. Damaged drives are left
+        out. Raises UnreadableMapError where the map cannot be read, else what is wrong with the query."""
         numbers, warnings = self._bounds.within(query.drives, query.box, str(self.store))
+        try:
+            answers, more = skip_damaged(self.store, lambda: self._answers(descriptors, query.top, numbers))
+        except ResultError as error:
+            raise UnreadableMapError(str(error)) from error
+        return answers, warnings + more + damage_warnings(self.store)
+
+    def _answers(
+        self, descriptors: Sequence[Any], top: int, numbers: Ints
+    ) -> tuple[list[dict[str, Any]], list[str]]:  # fmt: skip
+        names, warnings = self._bounds.names, list[str]()
+        numbers = np.array([one for one in numbers.tolist() if names[one] not in self.store.damaged], np.int64)
+        if not len(numbers):
+            return [], warnings
         if isinstance(self.state, CodedState):
             parts = [part for one in self.parts if (part := one.of(numbers)).places]
-            top = min(query.top, sum(part.places for part in parts))
+            top = min(top, sum(part.places for part in parts))
             found = best_places(parts, self.state, descriptors, top)
         else:
-            only = MapQuery(query.top, drives=[names[number] for number in numbers.tolist()])
-            found, more = search(self.store, self.drives, self.state, descriptors, only, LineSearch())
-            warnings += more
+            only = MapQuery(top, drives=[names[number] for number in numbers.tolist()])
+            found, warnings = search(self.store, self.drives, self.state, descriptors, only, LineSearch())
         answers = []
         for view, count in enumerate(found.count.tolist()):
             for rank in range(count):
@@ -99,17 +121,21 @@ class NewestState:
         self.root, self._cache, self._execution = root, cache, execution
         self._mark = self._marked()
         self.now = self._opened(execution)
+        self.problem = ""
+        """Why the newest state cannot be read, and that before it is answered from; empty where it can."""
         self.localizing = threading.Lock()
         self._localized: tuple[OpenState, Places] | None = None
 
     def refresh(self) -> bool:
         """Open the newest state if it is another one; whether it is. A state that cannot be read is tried again."""
-        with suppress(VplogError, OSError):
-            mark = self._marked()
-            if mark != self._mark:
+        before = self._mark
+        try:
+            if (mark := self._marked()) != before:
                 self.now, self._mark = self._opened(Execution(self._execution.threads)), mark
-                return True
-        return False
+            self.problem = ""
+        except (VplogError, OSError) as error:
+            self.problem = f"The newest state of the map cannot be read, and the one before it answers: {error}"
+        return self._mark != before
 
     def localized_in(self) -> Places:
         """The newest state's places with poses and landmarks; `localizing` is held meanwhile. Raises VplogError."""
@@ -134,8 +160,13 @@ class NewestState:
             store = stack.enter_context(map_store.reading(self.root, self._cache))
             drives, pipeline, state = open_map(store, execution)
             parts, warnings = list[SegmentView](), list[str]()
+
+            def indexed(state: CodedState) -> tuple[dict[str, dict[str, Any]], list[SegmentView], list[str]]:
+                drives = map_store.common_library(store)[1]
+                return drives, *update_index(store, drives, state, execution)
+
             if isinstance(state, CodedState):
-                parts, warnings = update_index(store, drives, state, execution)
+                drives, parts, warnings = skip_damaged(store, lambda: indexed(state))
             found = OpenState(store, drives, pipeline, state, parts, warnings)
             weakref.finalize(found, stack.pop_all().close)  # when the last answer by it is given
         return found
