@@ -12,9 +12,10 @@ from tests.places.pictures import texture
 from vplog.data import Camera, Frame, Reference, Verdict
 from vplog.errors import LibraryError, VplogError
 from vplog.execution.execution import Execution
-from vplog.features.learned import OnnxFeatureSettings, as_bytes
+from vplog.features.learned import LocalNetwork, OnnxFeatureSettings, as_bytes
 from vplog.features.matching import MatchSettings, match_features
 from vplog.features.store import FeatureStore
+from vplog.loops import false_rate
 from vplog.maps.localization.localize import described
 from vplog.pipeline import Pipeline, pipeline_from, run
 from vplog.places.bobb import BobbSettings
@@ -117,8 +118,11 @@ def test_stores_keep_descriptors_of_any_length(references: list[Reference], tmp_
                 np.testing.assert_array_equal(getattr(store[row], name), getattr(reference.features, name))
 
 
-def test_a_drive_with_features_of_a_network(drive: Demo, network: Path, tmp_path: Path) -> None:
-    """Boxes are mined over them, and geometry verifies closures by them."""
+def test_a_drive_with_features_of_a_network(
+    drive: Demo, network: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Boxes are mined over them, and geometry verifies closures by them, without mirrored ones."""
+    monkeypatch.setattr(false_rate, "mirrored", lambda _: pytest.fail("a network's descriptors are mirrored"))
     tree = {"features": {"kind": "onnx", "model": str(network)}, "places": {"references": 4}, "library": {"size": 8}}
     pipeline = pipeline_from(tree, "mine.yaml")
     assert Pipeline.read(pipeline.model_dump(mode="json"), "run.json") == pipeline
@@ -155,12 +159,33 @@ def test_a_library_of_other_features_is_refused(references: list[Reference], net
         described(state, sift.features, frame, "a map")
 
 
+@pytest.mark.parametrize("batch", [True, False])
+@pytest.mark.parametrize("count", [0, 1, 2, 5, 8])
+def test_outputs_come_with_or_without_a_batch_and_either_way_round(
+    count: int, batch: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also of one point, and of as many as a descriptor has values."""
+    rng, values = np.random.default_rng(count), 5
+    points = rng.uniform(10, 90, (count, 2)).astype(np.float32)
+    descriptors, scores = rng.standard_normal((count, values)).astype(np.float32), np.arange(count, 0, -1.0)
+    descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-9)
+    settings = OnnxFeatureSettings(network=LocalNetwork(scores="scores"))
+    for table in (descriptors, descriptors.T):
+        given = [points, table, scores]
+        monkeypatch.setattr(
+            OnnxFeatureSettings, "run", lambda *_, given=given: [one[None] if batch else one for one in given]
+        )
+        found = settings(np.zeros((100, 100), np.uint8))
+        np.testing.assert_allclose(found.points, points, atol=1e-4)
+        np.testing.assert_array_equal(found.descriptors, as_bytes(descriptors))
+
+
 @pytest.mark.parametrize(
     ("yaml", "message"),
     [
         ("points: descriptors\n", "output descriptors has 32 x 300 values of float32.* for points"),
         ("descriptors: scores\n", "output scores has 300 values .* for descriptors"),
-        ("scores: keypoints\n", "output keypoints has 300 x 2 .* for scores"),
+        ("scores: keypoints\n", "output keypoints has 1 x 300 x 2 .* for scores"),
         ("points: nowhere\n", "output nowhere is not there. There are: keypoints, scores, descriptors"),
         ("diameter_px: 0\n", "diameter_px must be a number"),
         ("colour: rgb\nmean: [0, 0, 0]\nstd: [1, 1, 1]\n", "cannot be run on an image"),

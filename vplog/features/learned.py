@@ -20,6 +20,8 @@ from vplog.features.sift import depth_at, thumbnail_of_image
 
 _LENGTH = np.float32(512)
 """Length of a descriptor, as of SIFT's by OpenCV, for which thresholds are meant."""
+_ALIKE = 0.01
+"""Share by which lengths of descriptors that a network normalises differ at most, in half precision, too."""
 _MOST_VALUES = 1024
 """Values of a descriptor: four times SuperPoint's."""
 
@@ -57,7 +59,11 @@ class OnnxFeatureSettings(NetworkSettings):
         network, (height, width) = self.network, image.shape
         names = [name for name in (network.points, network.descriptors, network.scores) if name]
         pixels = np.repeat(image[..., None], 1 if network.colour == "grey" else 3, axis=2)
-        found = [one[0] if one.ndim > 1 and len(one) == 1 else one for one in self.run(pixels, names)]
+        axes = (2, 2, 1)  # without that of a batch, which networks may give or not
+        found = [
+            one[0] if one.ndim == axis + 1 and len(one) == 1 else one
+            for one, axis in zip(self.run(pixels, names), axes, strict=False)
+        ]
         points, descriptors = self._paired(found[0], found[1])
         order = np.arange(len(points))
         if network.scores:
@@ -85,7 +91,7 @@ class OnnxFeatureSettings(NetworkSettings):
         shapes or types, and values that are not finite."""
         if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
             raise self._wrong("points", points)
-        if descriptors.ndim == 2 and len(descriptors) != len(points):
+        if descriptors.ndim == 2 and (len(descriptors) != len(points) or _are_columns(descriptors)):
             descriptors = descriptors.T
         fits = descriptors.ndim == 2 and descriptors.dtype.kind == "f" and len(descriptors) == len(points)
         if not fits or not 1 <= descriptors.shape[1] <= _MOST_VALUES or not np.isfinite(descriptors).all():
@@ -98,6 +104,14 @@ class OnnxFeatureSettings(NetworkSettings):
             f"{self.model}: output {getattr(self.network, name)} has {shape} values of {found.dtype}, which have the "
             f"wrong shape or type for {name} or are not finite. Name the right outputs in its .yaml."
         )
+
+
+def _are_columns(descriptors: NDArray[Any]) -> bool:
+    """Whether as many descriptors as each has values are the columns: these are equally long, and the rows are not."""
+    if descriptors.shape[0] != descriptors.shape[1]:
+        return False
+    of_rows, of_columns = (np.linalg.norm(descriptors.astype(np.float64), axis=axis) for axis in (1, 0))
+    return bool(np.ptp(of_columns) <= _ALIKE * of_columns.mean() and np.ptp(of_rows) > _ALIKE * of_rows.mean())
 
 
 def as_bytes(descriptors: NDArray[Any]) -> Bytes:
