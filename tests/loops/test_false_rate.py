@@ -15,6 +15,7 @@ from vplog.features.sift import SiftSettings, mirrored
 from vplog.loops.candidate import Drive, VerifySettings
 from vplog.loops.false_rate import (
     FalseRateSettings,
+    are_unrated,
     at_rate,
     certain_pairs,
     mirrored_evidence,
@@ -61,6 +62,16 @@ def test_a_rate_is_given_the_pairs_that_it_needs(rate: float) -> None:
     count = null_pairs(candidates, FalseRateSettings(rate=rate))
     assert count >= null_pairs(candidates, FalseRateSettings()) == 200
     assert (p_false(candidates, np.zeros(count, np.int64), np.zeros(800))[:200] <= rate).all()
+
+
+def test_without_mirrored_pairs_few_others_leave_candidates_unrated() -> None:
+    candidates, none = np.array([100] * 20 + [0] * 180), FalseRateSettings(null_pairs=0)
+    assert null_pairs(candidates, none) == null_pairs(candidates, FalseRateSettings(null_pairs=0, rate=0.01)) == 0
+    assert are_unrated(candidates, 19, none)
+    assert not are_unrated(candidates, 20, none)
+    assert p_false(candidates, np.zeros(20, np.int64), np.zeros(200))[0] < 0.5
+    assert not are_unrated(candidates, 0, FalseRateSettings(null_pairs=0, rate=0.01)), "a rate is held"
+    assert not are_unrated(candidates, 0, FalseRateSettings())
 
 
 def test_more_evidence_is_never_likelier_to_be_false() -> None:

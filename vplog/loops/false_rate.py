@@ -50,7 +50,8 @@ class FalseRateSettings(Settings):
     drift model (`noise`), whatever the log claims: with 2 % of drift, 10 %."""
     null_pairs: int = Field(default=200, ge=0, le=100_000)
     """Pairs that are no closures, at least, and as many as `rate` (1 in 20 without one) needs; where odometry rules out
-    fewer, as in a room, candidates with the query mirrored make up for them, which costs their verification."""
+    fewer, as in a room, candidates with the query mirrored make up for them, which costs their verification. 0: no
+    candidate is mirrored."""
     certain_pairs: int = Field(default=200, ge=0, le=100_000)
     """Pairs of neighbouring keyframes, most, whose verified poses are held against the odometry between them: how many
     are wrong at so many inliers, with depth or stereo; 0 takes every pose of a right place for right."""
@@ -70,8 +71,17 @@ def evidence(closures: Closures) -> Ints:
 def null_pairs(found: Ints, settings: FalseRateSettings) -> int:
     """Pairs that are no closures, enough for `rate`, or for strong evidence of what is verified: by K of them the least
     false rate of candidates with evidence (C,) is C / verified / K."""
+    if settings.null_pairs == 0:
+        return 0
     rate = _STRONG if settings.rate is None else settings.rate
     return max(settings.null_pairs, math.ceil(_FINER * len(found) / max(int((found > 0).sum()), 1) / rate))
+
+
+def are_unrated(found: Ints, null: int, settings: FalseRateSettings) -> bool:
+    """Whether candidates with evidence (C,) stay without `p_false`: where none is mirrored, so few pairs that are no
+    closures (`null`) would leave the best of them above a half, and the solver would take all for false."""
+    least = len(found) / max(int((found > 0).sum()), 1) / 0.5
+    return settings.rate is None and settings.null_pairs == 0 and null < least
 
 
 def mirrored_evidence(proposals: Proposals, later: Drive, earlier: Drive, execution: Execution) -> Ints:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from vplog.loops.candidate import Drive
 from vplog.loops.false_rate import (
     MOST_APART,
     FalseRateSettings,
+    are_unrated,
     at_rate,
     certain_pairs,
     evidence,
@@ -65,6 +66,8 @@ def rate_closures(
         return closures
     reach_m, settings, noise = views[0].settings.metric.max_distance_m, rating.false_rate, rating.noise
     ruled_out = beyond_drift(closures, views[0].keyframes, odometry, noise, reach_m, settings.sigmas)
+    if are_unrated(evidence(closures), int(ruled_out.sum()), settings):
+        return replace(closures, p_false=np.where(ruled_out & (evidence(closures) > 0), 1.0, closures.p_false))
     left = np.flatnonzero(~ruled_out)
     count = min(max(null_pairs(evidence(closures), settings) - int(ruled_out.sum()), 0), len(left))
     chosen = left[np.linspace(0, len(left) - 1, count).astype(np.int64)]

@@ -11,7 +11,9 @@ import numpy as np
 from tests.graph.drive import ledger
 from vplog.data import Closures, Verdict
 from vplog.execution.execution import Execution
+from vplog.features.learned import OnnxFeatureSettings
 from vplog.graph.joint import JoinSettings
+from vplog.loops.false_rate import FalseRateSettings
 from vplog.loops.propose import Proposals
 from vplog.maps.joining import inter_session
 from vplog.pipeline import Pipeline
@@ -30,7 +32,11 @@ def proposals() -> Proposals:
 
 
 def looked_at(
-    monkeypatch: pytest.MonkeyPatch, same_place: set[int], calibrated: bool = True, settings: JoinSettings | None = None
+    monkeypatch: pytest.MonkeyPatch,
+    same_place: set[int],
+    calibrated: bool = True,
+    settings: JoinSettings | None = None,
+    pipeline: Pipeline | None = None,
 ) -> tuple[list[np.ndarray], Closures]:
     """The queries of each look, and the ledger, where geometry holds for the bests of these queries."""
     looks: list[np.ndarray] = []
@@ -39,15 +45,19 @@ def looked_at(
         looks.append(some.query)
         found = ledger(some.query, some.match, np.tile(np.eye(4), (len(some.query), 1, 1)))
         held = [int(query) in same_place and not rank for query, rank in zip(some.query, some.rank, strict=True)]
-        return replace(
-            found, rank=some.rank, verdict=[Verdict.ACCEPTED if h else Verdict.TOO_FEW_MATCHES for h in held]
-        )
+        verdict = [Verdict.ACCEPTED if h else Verdict.TOO_FEW_MATCHES for h in held]
+        return replace(found, rank=some.rank, inliers=np.full(len(held), 50, np.int32), verdict=verdict)
 
     monkeypatch.setattr(inter_session, "verify_between", verify)
     drive: Any = SimpleNamespace(camera=SimpleNamespace(matrix=np.eye(3) if calibrated else None))
-    monkeypatch.setattr(inter_session, "mirrored_evidence", lambda some, *_: np.zeros(len(some.query), np.int64))
-    pipeline = Pipeline(join=settings or JoinSettings())
-    return looks, inter_session.closures_between(proposals(), drive, drive, pipeline, 0.0, Execution())
+
+    def mirror(some: Proposals, *_: Any) -> np.ndarray:
+        assert chosen.features.kind == "sift" or not len(some.query)
+        return np.zeros(len(some.query), np.int64)
+
+    monkeypatch.setattr(inter_session, "mirrored_evidence", mirror)
+    chosen = (pipeline or Pipeline()).model_copy(update={"join": settings or JoinSettings()})
+    return looks, inter_session.closures_between(proposals(), drive, drive, chosen, 0.0, Execution())
 
 
 def test_drives_that_do_not_meet_cost_one_look_at_the_highest_scores(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,3 +80,14 @@ def test_where_drives_meet_every_best_is_looked_at_and_all_that_is_around(monkey
 def test_without_metres_the_bests_are_all(monkeypatch: pytest.MonkeyPatch) -> None:
     looks, _ = looked_at(monkeypatch, {20}, calibrated=False)
     assert [len(look) for look in looks] == [50, 350]
+
+
+def test_descriptors_of_networks_are_not_mirrored(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Closures have no `p_false` then, and are left out where a rate is to be held."""
+    network = Pipeline(features=OnnxFeatureSettings())
+    held = network.model_copy(update={"false_rate": FalseRateSettings(rate=0.1)})
+    for pipeline, verdict in ((network, Verdict.ACCEPTED), (held, Verdict.NOT_SIGNIFICANT)):
+        looks, found = looked_at(monkeypatch, {20}, calibrated=False, pipeline=pipeline)
+        assert looks
+        assert found.verdict[20] is verdict
+        assert np.isnan(found.p_false[20]) == (pipeline is network)

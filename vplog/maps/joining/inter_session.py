@@ -12,7 +12,15 @@ import numpy as np
 
 from vplog.data import Bools, Closures, Int32s, Ints, SharedReferences, Verdict
 from vplog.execution.execution import Execution
-from vplog.loops.false_rate import FalseRateSettings, at_rate, evidence, mirrored_evidence, null_pairs, with_p_false
+from vplog.loops.false_rate import (
+    FalseRateSettings,
+    are_unrated,
+    at_rate,
+    evidence,
+    mirrored_evidence,
+    null_pairs,
+    with_p_false,
+)
 from vplog.loops.propose import Proposals, ProposeSettings, propose
 from vplog.loops.verify import Drive, no_closures, verify_between
 from vplog.places.sequence import rank_places
@@ -229,9 +237,10 @@ def closures_between(
             others[best] = False
             verify_rows(np.flatnonzero(others))
     ledger = merged([ledger for _, ledger in verified], [rows for rows, _ in verified])
-    return (
-        _with_false_rate(ledger, later, earlier, pipeline.false_rate, execution) if evidence(ledger).any() else ledger
-    )
+    settings, found = pipeline.rating.false_rate, evidence(ledger)
+    if not found.any() or are_unrated(found, 0, settings):
+        return ledger
+    return _with_false_rate(ledger, later, earlier, settings, execution)
 
 
 def _with_false_rate(
