@@ -23,6 +23,7 @@ from vplog.geometry.tum import read_tum
 from vplog.logs.formats.container import Channel
 from vplog.logs.topic_selection import Candidate, Selection, TopicChoice, further_cameras
 from vplog.loops.propose import Proposals
+from vplog.pipeline import load_pipeline, run
 from vplog.results import tables
 from vplog.results.mcap_read import read_pictures
 from vplog.results.run_cameras import CameraPictures
@@ -123,6 +124,17 @@ def test_a_camera_that_cannot_be_used_is_left_out_with_a_line(
     record = read_run_json(tmp_path / "run" / "run.json")
     assert record["cameras"] == [IMAGE]
     assert any(REAR in line and "mask" in line for line in record["warnings"])
+
+
+def test_vectors_of_a_file_are_those_of_the_first_camera(rig: Path, tmp_path: Path) -> None:
+    """Both cameras have as many frames, at the same stamps."""
+    frames = len(logs.open(rig / "drive.mcap").stamps())
+    np.save(tmp_path / "own.npy", np.random.default_rng(0).standard_normal((frames, 8)).astype(np.float32))
+    quick = [one for one in QUICK if one != "--set" and "neighbours" not in one]
+    places = ("places.kind=vectors", f"places.file={tmp_path / 'own.npy'}")
+    done = run(rig / "drive.mcap", tmp_path / "run", load_pipeline("default", [*quick, *places]))
+    assert done.record["cameras"] == [IMAGE]
+    assert any(REAR in line and "vectors" in line for line in done.record["warnings"])
 
 
 def candidate(name: str, role: str = "image", **more: Any) -> Candidate:

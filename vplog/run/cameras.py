@@ -10,7 +10,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from vplog.loops.verify import VerifySettings, verify_between
 from vplog.loops.verify_rig import Rig, verify_together
 from vplog.places.reference_choice import LibrarySettings
 from vplog.places.sequence import SequenceSettings, rank_places
+from vplog.places.vectors import VectorsSettings
 from vplog.results.run_cameras import CameraPictures
 from vplog.run.cache.codecs import closures_codec
 from vplog.run.cache.steps import Steps, step
@@ -33,6 +34,9 @@ from vplog.run.reference_library import own_images, own_references
 from vplog.run.verification import DriveFeatures, calibrated, for_verification, merged
 from vplog.stages import Log, PlaceState
 from vplog.storage.input_hashes import files_of
+
+if TYPE_CHECKING:
+    from vplog.places import PlaceSettings
 
 _log = logging.getLogger(__name__)
 VIEW_BY_VIEW = SequenceSettings(length=1)
@@ -44,6 +48,8 @@ class RigSettings(Extraction, Protocol):
 
     @property
     def library(self) -> LibrarySettings: ...
+    @property
+    def places(self) -> PlaceSettings: ...
     @property
     def propose(self) -> ProposeSettings: ...
     @property
@@ -92,6 +98,9 @@ def read_cameras(
 ) -> list[View]:  # fmt: skip
     """The pictures of the other cameras, extracted; a camera that cannot be used is left out with a warning."""
     found = list[View]()
+    if isinstance(settings.places, VectorsSettings):
+        _log.warning("%s not used: vectors from a file do not say of which camera they are.", ", ".join(others))
+        return found
     for topic, choice in others.items():
         try:
             other = logs.open_drive(files_of(steps.cache.drive), choice)
