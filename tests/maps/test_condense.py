@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +15,8 @@ import pytest
 import vplog
 from tests.maps.bucket import serving
 from tests.maps.joining.test_join import digests
-from vplog.data import Ranking
+from tests.maps.runs import write_run
+from vplog.data import Boxes, Ranking
 from vplog.execution.execution import Execution
 from vplog.maps.condensation.own_queries import PASSES, OwnPlaces, later_passes
 from vplog.maps.condensation.redundancy import OwnQueries, RemovalCandidates, remove_cross_validated, remove_redundant
@@ -28,6 +30,7 @@ from vplog.places.bobb import NO_REFERENCE
 from vplog.places.code_search import build_lists
 from vplog.results import tables
 from vplog.results.run_record import write_run_json
+from vplog.run.figures.closure_view import find_boxes
 from vplog.testing.pictures import reference
 
 if TYPE_CHECKING:
@@ -209,7 +212,10 @@ def check_rows(whole: Path, small: Path, drive: str, count: int) -> None:
     left = {reference for row in now for reference in row}
     for row, keyframe in zip(now, after["keyframe"].to_pylist(), strict=True):
         assert row == {reference: found for reference, found in was[keyframe].items() if reference in left}
-    changed = ("drive.json", "run.json", "descriptors.parquet")
+    ledgers = [pq.read_table(Store(root).run(drive) / "closures.parquet") for root in (whole, small)]
+    assert ledgers[0].equals(ledgers[1])
+    assert ledgers[1].schema.metadata[b"vplog.library"] == after.schema.metadata[b"vplog.library"]
+    changed = ("drive.json", "run.json", "descriptors.parquet", "closures.parquet")
     for path in Store(whole).run(drive).iterdir():
         if path.is_file() and path.name not in changed:
             assert (Store(small).run(drive) / path.name).read_bytes() == path.read_bytes()
@@ -228,6 +234,30 @@ def named(root: Path, places: list[dict[str, list[int]]]) -> list[dict[Any, tupl
         }
         for place in places
     ]
+
+
+def test_closures_have_the_numbers_of_the_references_that_are_left(tmp_path: Path) -> None:
+    path, rng = write_run(tmp_path / "run", "drive") / "closures.parquet", np.random.default_rng(5)
+    before, about = pq.read_table(path), tables.read_metadata(path)
+    shared = [np.unique(rng.integers(0, 9, count)).astype(np.uint16) for count in rng.integers(0, 6, len(before))]
+    overlap = [rng.random(len(one)).astype(np.float32) for one in shared]
+    closures = replace(tables.read_closures(path), shared_references=shared, shared_overlap=overlap)
+    keyframes = tables.read_keyframes(tmp_path / "run" / "keyframes.parquet")[0]
+    tables.write_closures(path, closures, keyframes, tables.TableMetadata({}, about["vplog.library"]))
+    before, left = pq.read_table(path), [1, 4, 8]
+    tables.renumber_references(path, np.array([-1, 0, -1, -1, 1, -1, -1, -1, 2]), "another")
+    after, found = pq.read_table(path), tables.read_closures(path)
+    names = ["shared_references", "shared_overlap"]
+    assert after.schema.equals(before.schema)
+    assert after.drop_columns(names).equals(before.drop_columns(names))
+    assert tables.read_metadata(path)["vplog.library"] == "another"
+    for row, (known, share) in enumerate(zip(shared, overlap, strict=True)):
+        there = np.isin(known, left)
+        assert [left[number] for number in found.shared_references[row]] == known[there].tolist()
+        np.testing.assert_array_equal(found.shared_overlap[row], share[there])
+    boxes = Boxes(np.array([1, 4]), np.zeros((2, 1, 4)))
+    state: Any = SimpleNamespace(boxes=lambda _: boxes)
+    assert find_boxes(state, None, None, [8]) == [], "a view described again may have other references"
 
 
 def test_drives_that_nothing_joins_are_condensed_each_for_itself(whole: Path, tmp_path: Path, verb: Verb) -> None:

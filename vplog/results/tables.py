@@ -273,6 +273,26 @@ def write_closures(path: Path, closures: Closures, keyframes: Keyframes, metadat
     _write(path, "closures", _table(CLOSURES, _ledger_columns(closures, keyframes, keyframes)), metadata)
 
 
+def renumber_references(path: Path, numbers: Ints, library: str) -> None:
+    """Write closures.parquet again with its shared references by their numbers in a library of this hash: row r of
+    `numbers` (R,) is that of r, and without those that are -1, which it lacks. Raises ResultError."""
+    with reading(path), open_table(path) as file:
+        _check_name(path, "closures", file.schema_arrow)
+        table = read_table(path, file, file.schema_arrow.names)
+    found = {name: _lists(table, name) for name in ("shared_references", "shared_overlap")}
+    numbers = np.concatenate([numbers, np.full(2**16 - len(numbers), -1)])
+    there = [numbers[row] >= 0 for row in found["shared_references"]]
+    found["shared_references"] = [numbers[row] for row in found["shared_references"]]
+    for name, lists in found.items():
+        field = CLOSURES.field(name)
+        of_library = [row[known] for row, known in zip(lists, there, strict=True)]
+        table = table.set_column(table.schema.names.index(name), field, _array(of_library, field))
+    header = {key: value for key, value in (table.schema.metadata or {}).items() if key != VERSION_KEY.encode()}
+    header[b"vplog.library"] = library.encode()
+    with replacing(path) as stream:
+        write_table(stream, table.replace_schema_metadata(header), ROWS_PER_GROUP, compression="zstd")
+
+
 def write_joins(path: Path, ledgers: Sequence[tuple[Keyframes, Keyframes, Closures]], metadata: TableMetadata) -> None:
     """joins.parquet: the ledgers of pairs of drives, the later one (its keyframes are the queries) and the earlier."""
     _write(path, "joins", _joins(ledgers), metadata)

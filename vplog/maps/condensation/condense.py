@@ -11,14 +11,15 @@ import math
 import os
 import shutil
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vplog.data import Bools
-from vplog.errors import SettingsError
+from vplog.data import Bools, Ints
+from vplog.errors import ResultError, SettingsError
 from vplog.execution.execution import Execution
 from vplog.maps.condensation.own_queries import (
     OwnAnswers,
@@ -63,6 +64,8 @@ class Condensed:
     """Queries that lose their right answer with the places removed, by cross-validation."""
     state: PlaceState
     """The recogniser with the references that stay."""
+    references: Ints
+    """The numbers that these had before, increasing; empty where it has none."""
     whole: PlaceState
     """The recogniser of the map before."""
     whole_answers: OwnAnswers
@@ -105,10 +108,12 @@ def condense_places(
 ) -> Condensed:  # fmt: skip
     """Choose the references that stay, and then the places: all without another within `distance_m`, unless faded, and
     at least one of each camera of a drive."""
-    posed, whole_answers, small = places.frame >= 0, answers, state
+    posed, whole_answers, small, references = places.frame >= 0, answers, state, np.zeros(0, np.int64)
     most_lost = math.floor(loss * int(posed.sum()) + 1e-9)  # .01 of 300 is 3
     if isinstance(state, CodedState):
-        places, answers, small = remove_references(places, answers, state, distance_m, most_lost // 2, execution)
+        places, answers, small, references = remove_references(
+            places, answers, state, distance_m, most_lost // 2, execution
+        )
     every = np.arange(len(posed))
     removable, along_m = near_another(places, distance_m) | (posed & answers.faded), np.cumsum(places.steps_m())
     total = int(removable.sum())
@@ -120,7 +125,7 @@ def condense_places(
         lambda done: execution.progress("remove", done, total),
     )  # fmt: skip
     retained = ~np.isin(every, removal.places)
-    return Condensed(places, answers, distance_m, retained, lost, small, state, whole_answers)
+    return Condensed(places, answers, distance_m, retained, lost, small, references, state, whole_answers)
 
 
 def _write(store: Store, new: Store, found: Condensed) -> None:
@@ -164,6 +169,10 @@ def _write_drive(store: Store, new: Store, record: Mapping[str, Any], found: Con
         table = made / "descriptors.parquet"
         tables.write_some_descriptors(table, table, retained, column, library)
     if other:
+        numbers = np.full(int(found.references.max()) + 1, -1)
+        numbers[found.references] = np.arange(len(found.references))
+        with suppress(ResultError):  # a damaged one is copied as it is
+            tables.renumber_references(made / "closures.parquet", numbers, library)
         about = {"hash": library, "from": library_of(new.library(library))}
         account = run_record.read_run_json(made / "run.json")
         run_record.write_run_json(made / "run.json", {**account, "library": about})

@@ -29,23 +29,23 @@ _LAST = 0.01
 def remove_references(
     places: OwnPlaces, answers: OwnAnswers, state: CodedState, distance_m: float, most_lost: int,
     execution: Execution = Execution(),
-) -> tuple[OwnPlaces, OwnAnswers, CodedState]:  # fmt: skip
-    """The places by the references that stay, their answers, and the recogniser with these. No more than so many
-    queries fewer are answered rightly."""
+) -> tuple[OwnPlaces, OwnAnswers, CodedState, Ints]:  # fmt: skip
+    """The places by the references that stay, their answers, the recogniser with these, and their numbers before. No
+    more than so many queries fewer are answered rightly."""
     order = removal_order(state.lists(*places.columns), state.references)
 
-    def without(count: int) -> tuple[OwnPlaces, OwnAnswers, CodedState]:
+    def without(count: int) -> tuple[OwnPlaces, OwnAnswers, CodedState, Ints]:
         retained = np.sort(order[count:])
         small = state.subset(retained, execution)
         own = replace(places, columns=[state.on_subset(column, retained) for column in places.columns])
         search = search_in_memory(own, small, execution)
-        return own, query_own_places(own, search, small, distance_m, execution), small
+        return own, query_own_places(own, search, small, distance_m, execution), small, retained
 
     def lost(count: int) -> int:
         return len(answers.place) - len(without(count)[1].place)
 
     count = bisect_right(range(1, len(order)), most_lost, key=lost)
-    return without(count) if count else (places, answers, state)
+    return without(count) if count else (places, answers, state, np.arange(len(order)))
 
 
 def removal_order(lists: CodeLists, references: Sequence[Reference]) -> Ints:

@@ -109,7 +109,10 @@ def find_boxes(state: BoxState, query: Any, match: Any, references: list[int]) -
     result: list[SharedBoxes] = []
     used: list[int] = []
     for reference in references[:SHOWN]:
-        [rank], [other] = (np.flatnonzero(boxes.references == reference) for boxes in (mine, theirs))
+        ranks, others = (np.flatnonzero(boxes.references == reference) for boxes in (mine, theirs))
+        if not (len(ranks) and len(others)):  # described again with a condensed library
+            continue
+        rank, other = ranks[0], others[0]
         here, there = mine.corners[rank], theirs.corners[other]
         common = _common(here, there)
         if not (common > 0).any():
