@@ -21,6 +21,7 @@ from vplog.execution.execution import Execution
 from vplog.maps.search import exact as map_search
 from vplog.maps.search import index as map_index
 from vplog.maps.search import query as map_query
+from vplog.maps.search import sequences
 from vplog.maps.search.exact import RankedPlaces, best_places, no_answers
 from vplog.maps.search.index import update_index
 from vplog.maps.search.query import MapQuery, search
@@ -315,3 +316,19 @@ def test_a_segment_of_another_version_is_not_called_damaged(made: Map) -> None:
         assert warning.startswith(str(raised.value))
         assert "\n" not in warning
         assert part.path.read_bytes() == data
+
+
+def test_places_of_a_condensed_drive_are_as_many_as_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though the best one stands for most keyframes."""
+    nearest = np.concatenate([np.full(300, 4), np.arange(5, 12)])
+
+    class Index:
+        def scores(self, *_: Any) -> np.ndarray:
+            return np.where(np.arange(12) == 4, 9, np.arange(12) / 12).astype(np.float32)
+
+    on_keyframes = sequences._OnKeyframes(cast("Any", Index()), nearest)
+    monkeypatch.setattr(sequences, "drive_indexes", lambda *_: [(0, on_keyframes, nearest)])
+    nothing = cast("Any", None)
+    found = sequences.best_lines(nothing, {3: "condensed"}, nothing, [0], 5, LineSearch(), Execution())
+    assert found.keyframe.tolist() == [[4, 11, 10, 9, 8]]
+    assert found.count.tolist() == [5]

@@ -67,7 +67,7 @@ def best_lines(
     )
     for number, (begin, index, nearest) in parts:
         stops = np.full(len(descriptors), len(index), np.int64)
-        most = top if nearest is None else top * -(-len(nearest) // (int(nearest[-1]) + 1))
+        most = top if nearest is None else top * int(np.bincount(nearest).max())
         found = no_answers(len(descriptors), top)
         found.drive[:] = number
         with ExitStack() as stack:
