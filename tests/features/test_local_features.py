@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from tests.places.pictures import texture
 from vplog.data import Camera, Frame, Reference, Verdict
 from vplog.errors import LibraryError, VplogError
 from vplog.execution.execution import Execution
+from vplog.features import onnx_model
 from vplog.features.learned import LocalNetwork, OnnxFeatureSettings, as_bytes
 from vplog.features.matching import MatchSettings, match_features
 from vplog.features.store import FeatureStore
@@ -76,6 +79,23 @@ def test_points_are_in_px_of_the_image_whatever_the_network_gets(network: Path, 
     depth = np.tile(np.arange(320, dtype=np.float32), (200, 1))
     deep = OnnxFeatureSettings(model=str(network))(texture(0), depth)
     np.testing.assert_array_equal(deep.depth_m, np.rint(deep.points[:, 0]))
+
+
+def test_a_network_is_loaded_once_for_all_threads(
+    settings: OnnxFeatureSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    onnx_model._session.cache_clear()
+    content, loaded = onnx_model._content, []
+
+    def slow(path: Path) -> bytes:
+        loaded.append(path)
+        time.sleep(0.1)
+        return content(path)
+
+    monkeypatch.setattr(onnx_model, "_content", slow)
+    with ThreadPoolExecutor(4) as pool:
+        assert len({len(found) for found in pool.map(settings, [texture(0)] * 4)}) == 1
+    assert len(loaded) == 1
 
 
 def test_bytes_keep_the_distances_of_like_descriptors() -> None:

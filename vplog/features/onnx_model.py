@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import threading
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -30,6 +31,7 @@ _MAX_BYTES = 2**31
 _MAX_PIXELS = 2**24
 """px that a network gets, 4096 x 4096: some layers need a thousand times as many bytes."""
 _INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC}
+_LOADING = threading.Lock()
 _DTYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 
@@ -132,7 +134,8 @@ class NetworkSettings(Settings):
     def run(self, image: Bytes, outputs: list[str]) -> list[NDArray[Any]]:
         """Outputs of these names for (H, W, C) pixels, the only one for an empty name. Raises LibraryError where the
         network cannot be loaded or does not take them."""
-        session = _session(self.model, self.sha256)
+        with _LOADING:  # the first frames of all threads wait for one
+            session = _session(self.model, self.sha256)
         inputs = {one.name: one for one in session.get_inputs()}
         known = [one.name for one in session.get_outputs()]
         name = _chosen(self.network.input, list(inputs), f"{self.model}: input")
