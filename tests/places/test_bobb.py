@@ -29,6 +29,15 @@ def learned(references: list[Reference]) -> BobbState:
     return TINY.learn(references, Execution(2))
 
 
+def test_without_a_floor_matches_that_agree_with_none_name_no_reference(references: list[Reference]) -> None:
+    """A view of one feature has none beside it."""
+    state = BobbSettings(references=4, features=250, agreement_floor=0.0).learn(references, Execution())
+    features = [replace(noisy(one.features, 1), thumbnail=None) for one in references]
+    for one in features:
+        assert (state.describe(one.rows(slice(1))).references == NO_REFERENCE).all()
+        assert state.describe(one).weights[0] == 255
+
+
 def test_a_place_of_the_defaults_is_stored_in_120_bytes(references: list[Reference]) -> None:
     state = BobbSettings().learn(references, Execution())
     column = state.to_arrow([state.describe(r.features) for r in references])

@@ -225,7 +225,8 @@ class BobbState(RecordState):
                 break
             here, there, agreed = self.agreed(matches, reference)
             explained = float(agreed.sum(dtype=np.float64) * rarity[reference])
-            found.append((reference, explained, here, there, agreed))
+            if explained > 0.0:  # with a floor of 0 matches that agree with none have no weight
+                found.append((reference, explained, here, there, agreed))
         if s.own > 0 and matches.itself >= 0:
             best = max((explained for _, explained, *_ in found), default=1.0)
             found.insert(0, (matches.itself, s.own * best, *self.agreed(matches, matches.itself)))
