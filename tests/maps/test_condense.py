@@ -21,6 +21,7 @@ from vplog.execution.execution import Execution
 from vplog.maps.condensation.own_queries import PASSES, OwnPlaces, later_passes
 from vplog.maps.condensation.redundancy import OwnQueries, RemovalCandidates, remove_cross_validated, remove_redundant
 from vplog.maps.condensation.references import removal_order
+from vplog.maps.joining import candidate_drives
 from vplog.maps.joining.candidate_drives import places_of
 from vplog.maps.joining.joint_record import read_joint
 from vplog.maps.search.query import open_map
@@ -234,6 +235,23 @@ def named(root: Path, places: list[dict[str, list[int]]]) -> list[dict[Any, tupl
         }
         for place in places
     ]
+
+
+@pytest.mark.parametrize("first", [[0, 1, 2, 3], [0, 1], [0, 2], [1, 3], [2]])
+def test_the_first_camera_has_a_place_at_each_keyframe_beside_others(
+    first: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of four that it has after a condensation, and two pictures of the second camera."""
+    nearest = tables.on_keyframes(np.array(first, np.int32))
+    rows = {0: (slice(0, len(first)), nearest), 1: (slice(len(first), len(first) + 2), None)}
+    column = pa.array([*first, 100, 101])
+    monkeypatch.setattr(candidate_drives, "read_column", lambda *_: column)
+    monkeypatch.setattr(candidate_drives, "rows_on_keyframes", lambda *_: rows)
+    store: Any = SimpleNamespace(rows=lambda *_: 4)
+    state: Any = SimpleNamespace(from_arrow=lambda one: one.to_pylist())
+    places = places_of(store, "drive", state)
+    assert places[4:] == [100, 101]
+    assert all(abs(place - row) == min(abs(row - one) for one in first) for row, place in enumerate(places[:4]))
 
 
 def test_closures_have_the_numbers_of_the_references_that_are_left(tmp_path: Path) -> None:

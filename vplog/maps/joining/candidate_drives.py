@@ -33,10 +33,11 @@ def places_of(store: Store, drive: str, state: PlaceState) -> Sequence[Any]:
     """The place of each keyframe of a drive, in a condensed map the nearest that it has; then those of the pictures of
     further cameras. Raises DamagedDriveError where they are of another recogniser."""
     column, rows_of = read_column(store, drive, state), rows_on_keyframes(store, drive)
-    _, nearest = rows_of.get(0, (None, None))
-    if nearest is not None and len(rows_of) > 1:  # pictures of further cameras come after those of all keyframes
-        more = store.rows("keyframes", drive) - len(nearest)
-        nearest = np.concatenate([nearest, np.repeat(nearest[-1:], more)])
+    own_rows, nearest = rows_of.get(0, (slice(0, 0), None))
+    if len(rows_of) > 1:  # pictures of further cameras come after those of all keyframes
+        known = np.arange(own_rows.stop - own_rows.start) if nearest is None else nearest
+        if more := store.rows("keyframes", drive) - len(known):
+            nearest = np.concatenate([known, np.repeat(known[-1:], more)])
     with reading_drive(drive):
         found = {camera: state.from_arrow(column[rows]) for camera, (rows, _) in rows_of.items() if camera}
         first = column if not found else column[rows_of[0][0]]
