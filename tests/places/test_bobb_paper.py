@@ -15,7 +15,7 @@ from tests.places.literal import all_boxes
 from tests.places.pictures import SMALL, noisy, nothing, reference
 from vplog.errors import LibraryError, SettingsError
 from vplog.execution.execution import Execution
-from vplog.places import rvp
+from vplog.places import bobb_paper, rvp
 from vplog.places.bobb_paper import PaperBobbSettings, PaperBobbState
 from vplog.places.overlap import BoxPlace
 
@@ -27,6 +27,12 @@ if TYPE_CHECKING:
 
 def _equal(a: BoxPlace, b: BoxPlace) -> bool:
     return np.array_equal(a.references, b.references) and np.array_equal(a.boxes, b.boxes)
+
+
+def test_no_more_references_than_the_ledger_can_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bobb_paper.lib, "build_library", lambda *_: range(65_535))
+    with pytest.raises(LibraryError, match="may have 65534 reference images, this one 65535"):
+        SMALL.learn([], Execution())
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ from vplog.errors import LibraryError
 from vplog.execution.execution import Execution
 from vplog.places import library as lib
 from vplog.places import rvp
+from vplog.places.bobb import NO_REFERENCE
 from vplog.places.columns import RecordState
 from vplog.places.library_files import RelearnedSettings
 from vplog.places.overlap import BoxIndex, BoxPlace, list_shared
@@ -69,6 +70,11 @@ class PaperBobbSettings(lib.WordSettings, RelearnedSettings):
             raise LibraryError(
                 f"The library has {len(library)} reference images, but places.references is {self.references}. "
                 "Add images, or set places.references lower."
+            )
+        if len(library) >= NO_REFERENCE:  # the ledger has their numbers in two bytes
+            raise LibraryError(
+                f"A library may have {NO_REFERENCE - 1} reference images, this one {len(library)}. Set library.size "
+                "lower."
             )
         patterns = list(execution.map(lambda row: _prepare(library, row, self), range(len(library))))
         return PaperBobbState(self, library, patterns)
