@@ -74,11 +74,10 @@ def logs_of(drives: Sequence[Path]) -> dict[str, Any]:
 @contextmanager
 def library_at(folder: Path, record: dict[str, Any]) -> Iterator[Path]:
     """The library of a run by its run.json: in its folder, or where it is from. Raises LogError, ResultError."""
-    library = folder / "library"
-    if not (library / "library.json").is_file():
-        about = record.get("library")
-        if not isinstance(about, dict) or not isinstance(about.get("from"), str):
-            raise ResultError(f"{folder}/run.json lacks library.from. Run `vplog run` again.")
+    library, about = folder / "library", record.get("library")
+    if not isinstance(about, dict) or not isinstance(about.get("from"), str):
+        raise ResultError(f"{folder}/run.json lacks library.from. Run `vplog run` again.")
+    if about["from"] != OWN_LIBRARY:
         library = located(about["from"])
     with local_copy(library) as here:
         yield here

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vplog import logs
-from vplog.data import Bytes, Camera, Closures, Features, Keyframes
+from vplog.data import USED, Bytes, Camera, Closures, Features, Keyframes
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
@@ -72,9 +72,12 @@ def explain(
 def _chosen(closure: tuple[int, ...] | None, closures: Closures, keyframes: Keyframes) -> int:
     """Row of the ledger."""
     if closure is None:
-        if not np.isfinite(closures.residual_after).any():
-            raise ResultError("No closure of this run was given to the solver. Name one with --closure K.")
-        return int(np.nanargmax(closures.residual_after))
+        if not len(closures):
+            raise ResultError("No closure was proposed in this run: no keyframe has older ones to compare it with.")
+        for among in (closures.of(*USED), np.isfinite(closures.residual_after)):
+            if np.isfinite(residual := np.where(among, closures.residual_after, np.nan)).any():
+                return int(np.nanargmax(residual))
+        return int(np.argmax(closures.inliers))
     if len(closure) == 1:
         return closure[0]
     rows = [row_of(keyframes, one) for one in closure]

@@ -168,6 +168,7 @@ def command(path: Path, topics: TopicChoice) -> str:
     """The command that runs on this log with these topics."""
     chosen = {name: value for name, value in topics if name in OPTIONS and value is not None}
     options = [f"--{OPTIONS[name]} {shlex.quote(str(value))}" for name, value in chosen.items()]
+    options += [f"--image-topic {shlex.quote(topic)}" for topic in topics.cameras or ()]
     options += [f"--mask {shlex.quote(f'{name}={path}' if name else str(path))}" for name, path in topics.masks.items()]
     options += [f"--mask-topic {shlex.quote(f'{name}={masks}')}" for name, masks in topics.mask_topics.items()]
     log = "LOG" if address(path) != str(path) else shlex.quote(str(path))  # a URL with its query is shown nowhere
