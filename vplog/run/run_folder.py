@@ -169,8 +169,8 @@ def _check_same_logs(out: Path, files: Sequence[Path]) -> None:
     for one in drives or [record]:
         if one and not _is_of(one, files, several=bool(drives)):
             raise SettingsError(
-                f"{original(out)} is the run of {_named(one)}, and {given} is another log, or has changed since. Choose "
-                "another folder with -o, or replace that run with --force."
+                f"{original(out)} is the run of {_named(one)}, and {given} is another log, or has changed since. "
+                "Choose another folder with -o, or replace that run with --force."
             )
 
 
