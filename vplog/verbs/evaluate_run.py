@@ -109,7 +109,7 @@ def recorded_topics(record: dict[str, Any], topics: logs.TopicChoice | None) -> 
     """The topics of a run, those given in their place; without files beside the log, which may be gone."""
     known = logs.TopicChoice.read(record.get("topics") or {}, "run.json").model_dump(exclude=_BESIDE)
     given = {} if topics is None else topics.model_dump(exclude_defaults=True)
-    return logs.TopicChoice(**known | given)
+    return logs.TopicChoice.model_validate(known | given)
 
 
 def log_truth(record: dict[str, Any], topics: logs.TopicChoice | None, options: TruthOptions) -> Trajectory | Gps:
