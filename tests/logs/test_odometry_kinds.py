@@ -164,10 +164,13 @@ def ackermann() -> Messages:
     return topic("/ackermann", "ackermann_msgs/msg/AckermannDriveStamped", stamped("base_link", fields))
 
 
-def wheels() -> Messages:
+def wheels(*names: str) -> Messages:
+    """Of joints with these names the first two are wheels."""
     left, right = ((SPEED + side * TURN * TRACK_M / 2) / RADIUS_M for side in (-1, 1))
-    names = ["front_left_wheel", "front_right_wheel"]
-    fields = [{"name": names, "velocity": np.array(both)} for both in zip(left, right, strict=True)]
+    names = names or ("front_left_wheel", "front_right_wheel")
+    others = np.random.default_rng(6).normal(0, 1, (COUNT, len(names) - 2))
+    each = np.column_stack([left, right, others])
+    fields = [{"name": [*names], "velocity": one} for one in each]
     return topic("/joint_states", "sensor_msgs/msg/JointState", stamped("base_link", fields))
 
 
@@ -262,6 +265,31 @@ def test_wheels_without_their_measures_are_no_odometry_and_name_them(tmp_path: P
     assert "--wheelbase-m make odometry of /ackermann" in log.without_odometry()
     with pytest.raises(LogError, match="--wheel-radius-m and --track-m"):
         opened(tmp_path, wheels(), odometry="/joint_states")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("l_wheel_joint", "r_wheel_joint", "l_gripper_finger_joint", "r_gripper_finger_joint"),
+        ("wheel_left_joint", "wheel_right_joint", "caster_left_wheel_joint", "left_1_joint", "head_1_joint"),
+        ("left_motor", "right_motor", "LeftElbow", "arm_right_2_joint", "front_left_steering"),
+    ],
+)
+def test_other_joints_with_a_side_are_no_wheels(names: tuple[str, ...], tmp_path: Path) -> None:
+    check(opened(tmp_path, wheels(*names), wheel_radius_m=RADIUS_M, track_m=TRACK_M), 0.05, 0.01)
+
+
+@pytest.mark.parametrize("names", [("l_gripper_finger_joint", "r_gripper_finger_joint"), ("torso_lift_joint",)])
+def test_joints_of_another_publisher_are_neither_wheels_nor_lost(names: tuple[str, ...], tmp_path: Path) -> None:
+    each = stamped("", [{"name": [*names], "velocity": np.ones(len(names))}] * COUNT, STAMPS + 1000)
+    arm = topic("/joint_states", "sensor_msgs/msg/JointState", each, STAMPS + 1000)
+    measures = {"wheel_radius_m": RADIUS_M, "track_m": TRACK_M}
+    log = opened(tmp_path, wheels(), arm, **measures)
+    check(log, 0.05, 0.01)
+    assert log.warnings == ["/joint_states: the odometry is its velocities, integrated."]
+    log = opened(tmp_path, arm, **measures)
+    assert log.odometry() is None
+    assert log.warnings == ["/joint_states: none of its messages gives a motion."]
 
 
 def test_velocities_are_taken_on_request_where_there_are_poses(tmp_path: Path) -> None:
