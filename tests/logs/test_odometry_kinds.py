@@ -201,7 +201,7 @@ def fixes(sigma_m: float, rate: int = 10) -> Messages:
     return topic("/fix", "sensor_msgs/msg/NavSatFix", stamped("gps", fields, STAMPS[rows]), STAMPS[rows])
 
 
-def gyroscope(bias: float) -> Messages:
+def gyroscope(bias: float, name: str = "/imu") -> Messages:
     """On its side: the body's z is its -x."""
     rates = -(TURN + bias) + np.random.default_rng(5).normal(0, 0.002, COUNT)
     fields = [{"angular_velocity": {"x": float(rate)}} for rate in rates]
@@ -210,7 +210,7 @@ def gyroscope(bias: float) -> Messages:
     kind = "tf2_msgs/msg/TFMessage"
     transforms = [message("geometry_msgs/msg/TransformStamped", **mounted)]
     return [
-        *topic("/imu", "sensor_msgs/msg/Imu", stamped("imu", fields)),
+        *topic(name, "sensor_msgs/msg/Imu", stamped("imu", fields)),
         *topic("/tf_static", kind, [{"transforms": transforms}], STAMPS[:1]),
     ]
 
@@ -312,6 +312,21 @@ def test_a_gyroscope_turns_velocities_less_its_bias_at_rest(tmp_path: Path) -> N
     assert "less a bias of 1.0" in " ".join(log.warnings)
     with pytest.raises(AssertionError):
         check(opened(tmp_path, bad, gyroscope(bias), imu=""), 1.0, 0.05)
+
+
+def accelerometer(name: str) -> Messages:
+    """As RealSense has it beside a topic of the gyroscope."""
+    fields = [{"linear_acceleration": {"z": 9.8}}] * COUNT
+    return topic(name, "sensor_msgs/msg/Imu", stamped("imu", fields))
+
+
+def test_an_accelerometer_turns_no_velocities(tmp_path: Path) -> None:
+    log = opened(tmp_path, twists(), accelerometer("/camera/accel/sample"))
+    check(log, 0.05, 0.01)
+    assert "turns by the gyroscope" not in " ".join(log.warnings)
+    for name in ("/camera/accel/sample", "/a"):
+        both = accelerometer(name), gyroscope(0.0, "/camera/gyro/sample")
+        check(opened(tmp_path, twists(scale=1.3), *both), 0.1, 0.01)
 
 
 @pytest.mark.parametrize("sigma_m", [0.02, 0.5])

@@ -14,6 +14,7 @@ other parts the first by these rules does, unless TopicChoice names another:
 - odometry: the source with the highest score once the log is read (`odometry_sources.py`): pose topics, and tf, whose
   chain from its root to the body is taken;
 - gps: sentences of NMEA last, then most messages, then name;
+- imu: accelerometers alone last, then most messages, then name;
 - lidar: clouds that are another sensor's or were computed by their name last, then most messages, then name. It is read
   where it is requested as the odometry, or no topic of poses or velocities is there.
 """
@@ -128,7 +129,7 @@ class Candidate:
     size: tuple[int, int] = (0, 0)
     """Width and height in px of the first image, 0 where only decoding tells it."""
     supported: bool = True
-    """Whether images of its encoding can be decoded to grey."""
+    """Whether images of its encoding can be decoded to grey; of an IMU, whether it measures turns."""
 
 
 _PARTS = ("image", "depth", "camera_info", "odometry", "gps", "right", "right_info", "imu", "mask", "lidar")
@@ -216,7 +217,8 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     sources = _sources(usable, kind, requested, geometry)
     turned = kind == "twist" or all(short_type(c.channel.type) in (*TWISTS, *GEOMETRY) for c in sources)
     visual = image is not None and choice.odometry_file is None and (kind == "visual" or not (sources or kind))
-    found["odometry"], found["imu"] = requested, pick("imu") if (sources and turned) or visual else None
+    found["odometry"] = requested
+    found["imu"] = pick("imu", key=lambda c: not c.supported) if (sources and turned) or visual else None
     found["gps"] = pick("gps", key=lambda c: short_type(c.channel.type) == NMEA)
     if kind == "lidar" or (not kind and all(c.role == "tf" for c in sources)):
         found["lidar"] = _lidar(usable, choice)

@@ -18,7 +18,7 @@ from vplog.logs.formats.container import Channel, Notes
 from vplog.logs.messages.decode import Poses
 from vplog.logs.messages.nmea import SENTENCES
 from vplog.logs.messages.records import FixMessage, ImuMessage, PoseMessage
-from vplog.logs.stamps import Stamps
+from vplog.logs.stamps import NONE, Stamps
 from vplog.logs.tf_odometry import are_usable, frame_name
 
 _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
@@ -194,9 +194,11 @@ class ImuTrack:
             self._values.extend((*message.gyro, *message.accel))
 
     def finish(self, notes: Notes) -> tuple[Ints, Floats]:
-        """Increasing stamps (K,), and (K, 6) rates in rad/s about the axes of its frame, accelerations in m/s^2."""
+        """Increasing stamps (K,), and (K, 6) rates in rad/s about the axes of its frame, accelerations in m/s^2. Of an
+        accelerometer alone, whose rates are zero, nothing."""
         stamp_ns, rows = self.stamps.order(self.topic, notes)
-        return stamp_ns, np.frombuffer(self._values).reshape(-1, 6)[rows]
+        values = np.frombuffer(self._values).reshape(-1, 6)[rows]
+        return (stamp_ns, values) if values[:, :3].any() else (NONE, values[:0])
 
 
 class FixTrack:
