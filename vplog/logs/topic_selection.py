@@ -201,7 +201,7 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     """The topics to use by the rules above. Raises LogError where a topic named in `choice` cannot play its part."""
     _check_files(choice)
     _check_mask_topics(candidates, choice)
-    candidates = sorted(candidates, key=lambda c: (-c.count, c.channel))
+    candidates = sorted(candidates, key=lambda c: (c.role == "imu" and not c.supported, -c.count, c.channel))
     usable, pick = [c for c in candidates if c.count], partial(_pick, candidates, choice, log)
     image = pick("image", "depth", lambda c: _image_order(c, usable))
     for topic in choice.cameras or ():
@@ -217,8 +217,7 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     sources = _sources(usable, kind, requested, geometry)
     turned = kind == "twist" or all(short_type(c.channel.type) in (*TWISTS, *GEOMETRY) for c in sources)
     visual = image is not None and choice.odometry_file is None and (kind == "visual" or not (sources or kind))
-    found["odometry"] = requested
-    found["imu"] = pick("imu", key=lambda c: not c.supported) if (sources and turned) or visual else None
+    found["odometry"], found["imu"] = requested, pick("imu") if (sources and turned) or visual else None
     found["gps"] = pick("gps", key=lambda c: short_type(c.channel.type) == NMEA)
     if kind == "lidar" or (not kind and all(c.role == "tf" for c in sources)):
         found["lidar"] = _lidar(usable, choice)
