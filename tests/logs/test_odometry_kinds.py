@@ -272,6 +272,7 @@ def test_wheels_without_their_measures_are_no_odometry_and_name_them(tmp_path: P
     [
         ("l_wheel_joint", "r_wheel_joint", "l_gripper_finger_joint", "r_gripper_finger_joint"),
         ("wheel_left_joint", "wheel_right_joint", "caster_left_wheel_joint", "left_1_joint", "head_1_joint"),
+        ("wheel_FL_joint", "wheel_FR_joint"),
         ("left_motor", "right_motor", "LeftElbow", "arm_right_2_joint", "front_left_steering"),
     ],
 )

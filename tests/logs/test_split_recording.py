@@ -58,11 +58,13 @@ def test_files_in_any_order_are_the_whole_drive(kind: str, tmp_path: Path) -> No
         assert log.warnings == whole.warnings
 
 
-def test_a_folder_of_a_split_ros1_bag_is_one_drive(tmp_path: Path) -> None:
+@pytest.mark.parametrize("ending", ["", ".active"])
+def test_a_folder_of_a_split_ros1_bag_is_one_drive(ending: str, tmp_path: Path) -> None:
+    """The last part has another name while it is recorded, and keeps it where that ends with the power."""
     folder = tmp_path / "monday"
     folder.mkdir()
-    for i, part in enumerate((FIRST, SECOND)):
-        KINDS["ros1"](folder, i, part)
+    _, last = (KINDS["ros1"](folder, i, part) for i, part in enumerate((FIRST, SECOND)))
+    last.rename(f"{last}{ending}")
     log = logs.open(folder)
     assert (log.name, log.info().kind, log.info().path) == ("monday", "ros1", str(folder))
     np.testing.assert_array_equal([f.decode().image for f in log.frames(log.stamps())], DRIVE.images)

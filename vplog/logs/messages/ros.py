@@ -36,8 +36,8 @@ _UNKNOWN_COVARIANCE = 0
 _RADIUS_95, _NORMAL_95 = 2.448, 1.960
 """Sigmas that 95 % of errors are below, in the plane and along an axis."""
 _UNKNOWN_VARIANCES = (math.nan,) * 6
-_SIDE = re.compile(r"(left|right|(?<![a-z])[lr](?![a-z]))", re.IGNORECASE)
-"""The side of a wheel in the name of its joint."""
+_SIDE = re.compile(r"(left|right)|(?<![a-z])[bfmr]?([lr])(?![a-z])", re.IGNORECASE)
+"""The side of a wheel in the name of its joint, there alone or behind back, front, middle or rear: `fl_wheel_joint`."""
 _NOT_DRIVEN = re.compile(
     r"steer|cast[eo]r|^(?!.*wheel).*(gripper|finger|hand|arm|shoulder|elbow|wrist|hip|knee|ankle|leg|eye)",
     re.IGNORECASE,
@@ -207,7 +207,7 @@ def _wheels(fields: _Fields) -> Record:
     driven = [one for one in zip(names, speeds.tolist(), strict=False) if not _NOT_DRIVEN.search(one[0])]
     for name, speed in [one for one in driven if "wheel" in one[0].lower()] or driven:
         if side := _SIDE.search(name):
-            sides[side[1][0].lower()].append(speed)
+            sides[(side[1] or side[2])[0].lower()].append(speed)
     if not (sides["l"] and sides["r"]):
         return []
     left, right = (sum(one) / len(one) for one in (sides["l"], sides["r"]))
