@@ -304,17 +304,6 @@ def test_velocities_are_taken_on_request_where_there_are_poses(tmp_path: Path) -
     check(log, 0.05, 0.01)
 
 
-def test_a_gyroscope_turns_velocities_less_its_bias_at_rest(tmp_path: Path) -> None:
-    bad, bias = twists(scale=1.3), np.radians(1.0)
-    with pytest.raises(AssertionError):
-        check(opened(tmp_path, bad), 1.0, 0.05)
-    log = opened(tmp_path, bad, gyroscope(bias))
-    check(log, 0.1, 0.01)
-    assert "less a bias of 1.0" in " ".join(log.warnings)
-    with pytest.raises(AssertionError):
-        check(opened(tmp_path, bad, gyroscope(bias), imu=""), 1.0, 0.05)
-
-
 def accelerometer(name: str) -> Messages:
     """As RealSense has it beside a topic of the gyroscope."""
     fields = [{"linear_acceleration": {"z": 9.8}}] * COUNT
@@ -328,6 +317,17 @@ def test_an_accelerometer_turns_no_velocities(tmp_path: Path) -> None:
     for name in ("/camera/accel/sample", "/a"):
         both = accelerometer(name), gyroscope(0.0, "/camera/gyro/sample")
         check(opened(tmp_path, twists(scale=1.3), *both), 0.1, 0.01)
+
+
+def test_a_gyroscope_turns_velocities_less_its_bias_at_rest(tmp_path: Path) -> None:
+    bad, bias = twists(scale=1.3), np.radians(1.0)
+    with pytest.raises(AssertionError):
+        check(opened(tmp_path, bad), 1.0, 0.05)
+    log = opened(tmp_path, bad, gyroscope(bias))
+    check(log, 0.1, 0.01)
+    assert "less a bias of 1.0" in " ".join(log.warnings)
+    with pytest.raises(AssertionError):
+        check(opened(tmp_path, bad, gyroscope(bias), imu=""), 1.0, 0.05)
 
 
 @pytest.mark.parametrize("sigma_m", [0.02, 0.5])

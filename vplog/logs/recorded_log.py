@@ -183,6 +183,19 @@ class RecordedLog:
         gyro, accel = values[finite, :3], values[finite, 3:]
         return Imu(topic, stamp_ns[finite], gyro, accel, camera.body_from_camera @ placed)
 
+    def _body_from_calibrated_imu(self) -> Floats:
+        """(4, 4) of the IMU that a calibration file has as the body, by the static transforms; else, noted where an
+        odometry moves another frame, the identity."""
+        if self.odometry() is None:
+            return np.eye(4)
+        body = self._body or BODY
+        imus = [c for c in self._candidates if c.role == "imu" and self._choice.imu in (None, c.channel.topic)]
+        for one in sorted(imus, key=lambda c: -c.count):
+            if one.frame and (placed := self._content.tree.between(body, one.frame)) is not None:
+                return placed
+        self._notes.add(f"No static transforms place an IMU on {body}; the calibration's IMU is taken to be {body}.")
+        return np.eye(4)
+
     def truth(self) -> Trajectory | Gps | None:
         """Ground truth of the data set, else the poses of a topic that is called ground truth."""
         if self._contents.truth is not None or not self._truth_name:
@@ -291,19 +304,6 @@ class RecordedLog:
             placed = body_from_camera(content.tree, body, frame, notes, ahead)
             camera = replace(camera, body_from_camera=placed)
         return camera, frame
-
-    def _body_from_calibrated_imu(self) -> Floats:
-        """(4, 4) of the IMU that a calibration file has as the body, by the static transforms; else, noted where an
-        odometry moves another frame, the identity."""
-        if self.odometry() is None:
-            return np.eye(4)
-        body = self._body or BODY
-        imus = [c for c in self._candidates if c.role == "imu" and self._choice.imu in (None, c.channel.topic)]
-        for one in sorted(imus, key=lambda c: -c.count):
-            if one.frame and (placed := self._content.tree.between(body, one.frame)) is not None:
-                return placed
-        self._notes.add(f"No static transforms place an IMU on {body}; the calibration's IMU is taken to be {body}.")
-        return np.eye(4)
 
     @cached_property
     def _pair(self) -> Pair | None:
