@@ -204,7 +204,7 @@ def fixes(sigma_m: float, rate: int = 10) -> Messages:
 def gyroscope(bias: float, name: str = "/imu") -> Messages:
     """On its side: the body's z is its -x."""
     rates = -(TURN + bias) + np.random.default_rng(5).normal(0, 0.002, COUNT)
-    fields = [{"angular_velocity": {"x": float(rate)}} for rate in rates]
+    fields = [{"angular_velocity": {"x": float(rate)}, "linear_acceleration": {"x": -9.8}} for rate in rates]
     placed = {"rotation": dict(zip("xyzw", Rotation.from_euler("y", 90, degrees=True).as_quat(), strict=True))}
     mounted = {"header": header(START_NS, "base_link"), "child_frame_id": "imu", "transform": placed}
     kind = "tf2_msgs/msg/TFMessage"
