@@ -164,10 +164,13 @@ def ackermann() -> Messages:
     return topic("/ackermann", "ackermann_msgs/msg/AckermannDriveStamped", stamped("base_link", fields))
 
 
-def wheels() -> Messages:
+def wheels(*names: str) -> Messages:
+    """Of joints with these names the first two are wheels."""
     left, right = ((SPEED + side * TURN * TRACK_M / 2) / RADIUS_M for side in (-1, 1))
-    names = ["front_left_wheel", "front_right_wheel"]
-    fields = [{"name": names, "velocity": np.array(both)} for both in zip(left, right, strict=True)]
+    names = names or ("front_left_wheel", "front_right_wheel")
+    others = np.random.default_rng(6).normal(0, 1, (COUNT, len(names) - 2))
+    each = np.column_stack([left, right, others])
+    fields = [{"name": [*names], "velocity": one} for one in each]
     return topic("/joint_states", "sensor_msgs/msg/JointState", stamped("base_link", fields))
 
 
@@ -198,16 +201,16 @@ def fixes(sigma_m: float, rate: int = 10) -> Messages:
     return topic("/fix", "sensor_msgs/msg/NavSatFix", stamped("gps", fields, STAMPS[rows]), STAMPS[rows])
 
 
-def gyroscope(bias: float) -> Messages:
+def gyroscope(bias: float, name: str = "/imu") -> Messages:
     """On its side: the body's z is its -x."""
     rates = -(TURN + bias) + np.random.default_rng(5).normal(0, 0.002, COUNT)
-    fields = [{"angular_velocity": {"x": float(rate)}} for rate in rates]
+    fields = [{"angular_velocity": {"x": float(rate)}, "linear_acceleration": {"x": -9.8}} for rate in rates]
     placed = {"rotation": dict(zip("xyzw", Rotation.from_euler("y", 90, degrees=True).as_quat(), strict=True))}
     mounted = {"header": header(START_NS, "base_link"), "child_frame_id": "imu", "transform": placed}
     kind = "tf2_msgs/msg/TFMessage"
     transforms = [message("geometry_msgs/msg/TransformStamped", **mounted)]
     return [
-        *topic("/imu", "sensor_msgs/msg/Imu", stamped("imu", fields)),
+        *topic(name, "sensor_msgs/msg/Imu", stamped("imu", fields)),
         *topic("/tf_static", kind, [{"transforms": transforms}], STAMPS[:1]),
     ]
 
@@ -264,6 +267,32 @@ def test_wheels_without_their_measures_are_no_odometry_and_name_them(tmp_path: P
         opened(tmp_path, wheels(), odometry="/joint_states")
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("l_wheel_joint", "r_wheel_joint", "l_gripper_finger_joint", "r_gripper_finger_joint"),
+        ("wheel_left_joint", "wheel_right_joint", "caster_left_wheel_joint", "left_1_joint", "head_1_joint"),
+        ("wheel_FL_joint", "wheel_FR_joint"),
+        ("left_motor", "right_motor", "LeftElbow", "arm_right_2_joint", "front_left_steering"),
+    ],
+)
+def test_other_joints_with_a_side_are_no_wheels(names: tuple[str, ...], tmp_path: Path) -> None:
+    check(opened(tmp_path, wheels(*names), wheel_radius_m=RADIUS_M, track_m=TRACK_M), 0.05, 0.01)
+
+
+@pytest.mark.parametrize("names", [("l_gripper_finger_joint", "r_gripper_finger_joint"), ("torso_lift_joint",)])
+def test_joints_of_another_publisher_are_neither_wheels_nor_lost(names: tuple[str, ...], tmp_path: Path) -> None:
+    each = stamped("", [{"name": [*names], "velocity": np.ones(len(names))}] * COUNT, STAMPS + 1000)
+    arm = topic("/joint_states", "sensor_msgs/msg/JointState", each, STAMPS + 1000)
+    measures = {"wheel_radius_m": RADIUS_M, "track_m": TRACK_M}
+    log = opened(tmp_path, wheels(), arm, **measures)
+    check(log, 0.05, 0.01)
+    assert log.warnings == ["/joint_states: the odometry is its velocities, integrated."]
+    log = opened(tmp_path, arm, **measures)
+    assert log.odometry() is None
+    assert log.warnings == ["/joint_states: none of its messages gives a motion."]
+
+
 def test_velocities_are_taken_on_request_where_there_are_poses(tmp_path: Path) -> None:
     along = [pose(np.eye(4) + 5 * row / COUNT * np.eye(4, k=3)) for row in range(COUNT)]
     both = [{"child_frame_id": "base_link", "pose": {"pose": one}, "twist": {"twist": twist}} for one, twist in
@@ -273,6 +302,21 @@ def test_velocities_are_taken_on_request_where_there_are_poses(tmp_path: Path) -
     assert kind_of(opened(tmp_path, messages)) == "poses"
     log = opened(tmp_path, messages, odometry="twist")
     check(log, 0.05, 0.01)
+
+
+def accelerometer(name: str) -> Messages:
+    """As RealSense has it beside a topic of the gyroscope."""
+    fields = [{"linear_acceleration": {"z": 9.8}}] * COUNT
+    return topic(name, "sensor_msgs/msg/Imu", stamped("imu", fields))
+
+
+def test_an_accelerometer_turns_no_velocities(tmp_path: Path) -> None:
+    log = opened(tmp_path, twists(), accelerometer("/camera/accel/sample"))
+    check(log, 0.05, 0.01)
+    assert "turns by the gyroscope" not in " ".join(log.warnings)
+    for name in ("/camera/accel/sample", "/a"):
+        both = accelerometer(name), gyroscope(0.0, "/camera/gyro/sample")
+        check(opened(tmp_path, twists(scale=1.3), *both), 0.1, 0.01)
 
 
 def test_a_gyroscope_turns_velocities_less_its_bias_at_rest(tmp_path: Path) -> None:

@@ -182,6 +182,7 @@ class TopicCollector:
             self._add_poses(channel)
         for message in self._paths.values():
             self._add_message(message, self._messages)
+        self.poses = {source: track.of_most() for source, track in self.poses.items()}
         if self.fixes:
             self.fixes.add_sentences()
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vplog.data import Bytes, Camera, Gps, Imu, Ints, Lidar, LogInfo, Odometry, Scan, Topic, Trajectory
+from vplog.data import Bytes, Camera, Floats, Gps, Imu, Ints, Lidar, LogInfo, Odometry, Scan, Topic, Trajectory
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.calibration_file import SidecarFiles
@@ -161,19 +161,40 @@ class RecordedLog:
         return self._content.gps
 
     def imu(self) -> Imu | None:
-        """By the static transforms; noted where they do not place it."""
+        """By the static transforms, else the calibration file; noted where neither places it."""
         content = self._content
         if content.imu is None or content.chosen.imu is None or self.odometry() is not None:
             return None
         (camera, camera_frame), (frame, stamp_ns, values) = self._left, content.imu
         topic, placed = content.chosen.imu.topic, content.tree.between(camera_frame, frame)
-        finite = np.isfinite(values).all(axis=1)
+        known = self._sidecar.camera(self._image_channel().topic)
+        if placed is None and known is not None and known.body_from_camera is not None:
+            placed = se3.inverse(known.body_from_camera)
+            self._notes.add(f"{topic} is taken to be the IMU of the calibration.")
+        finite = np.isfinite(values).all(axis=1) & values[:, 3:].any(axis=1)  # zero of a gyroscope alone
         if placed is None or not finite.any():
-            why = "the static transforms do not place it beside the camera" if placed is None else "it has no numbers"
+            why = (
+                "the static transforms do not place it beside the camera"
+                if placed is None
+                else "it does not measure both turns and accelerations"
+            )
             self._notes.add(f"{topic}: {why}; visual odometry does without its measurements.")
             return None
         gyro, accel = values[finite, :3], values[finite, 3:]
         return Imu(topic, stamp_ns[finite], gyro, accel, camera.body_from_camera @ placed)
+
+    def _body_from_calibrated_imu(self) -> Floats:
+        """(4, 4) of the IMU that a calibration file has as the body, by the static transforms; else, noted where an
+        odometry moves another frame, the identity."""
+        if self.odometry() is None:
+            return np.eye(4)
+        body = self._body or BODY
+        imus = [c for c in self._candidates if c.role == "imu" and self._choice.imu in (None, c.channel.topic)]
+        for one in sorted(imus, key=lambda c: -c.count):
+            if one.frame and (placed := self._content.tree.between(body, one.frame)) is not None:
+                return placed
+        self._notes.add(f"No static transforms place an IMU on {body}; the calibration's IMU is taken to be {body}.")
+        return np.eye(4)
 
     def truth(self) -> Trajectory | Gps | None:
         """Ground truth of the data set, else the poses of a topic that is called ground truth."""
@@ -276,7 +297,7 @@ class RecordedLog:
         named = body and frame and content.tree.between(body, frame) is not None
         visual = camera.matrix is not None or self._contents.names is None
         if known is not None and known.body_from_camera is not None and not named:
-            camera = replace(camera, body_from_camera=known.body_from_camera)
+            camera = replace(camera, body_from_camera=self._body_from_calibrated_imu() @ known.body_from_camera)
         elif self.odometry() is not None or content.chosen.lidar is not None or visual:
             ahead = self.odometry() is None  # it is computed then
             ahead |= any(source.used and source.kind in ("gps", "twist") for source in content.sources)

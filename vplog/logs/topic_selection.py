@@ -14,6 +14,7 @@ other parts the first by these rules does, unless TopicChoice names another:
 - odometry: the source with the highest score once the log is read (`odometry_sources.py`): pose topics, and tf, whose
   chain from its root to the body is taken;
 - gps: sentences of NMEA last, then most messages, then name;
+- imu: accelerometers alone last, then most messages, then name;
 - lidar: clouds that are another sensor's or were computed by their name last, then most messages, then name. It is read
   where it is requested as the odometry, or no topic of poses or velocities is there.
 """
@@ -128,7 +129,7 @@ class Candidate:
     size: tuple[int, int] = (0, 0)
     """Width and height in px of the first image, 0 where only decoding tells it."""
     supported: bool = True
-    """Whether images of its encoding can be decoded to grey."""
+    """Whether images of its encoding can be decoded to grey; of an IMU, whether it measures turns."""
 
 
 _PARTS = ("image", "depth", "camera_info", "odometry", "gps", "right", "right_info", "imu", "mask", "lidar")
@@ -200,7 +201,7 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     """The topics to use by the rules above. Raises LogError where a topic named in `choice` cannot play its part."""
     _check_files(choice)
     _check_mask_topics(candidates, choice)
-    candidates = sorted(candidates, key=lambda c: (-c.count, c.channel))
+    candidates = sorted(candidates, key=lambda c: (c.role == "imu" and not c.supported, -c.count, c.channel))
     usable, pick = [c for c in candidates if c.count], partial(_pick, candidates, choice, log)
     image = pick("image", "depth", lambda c: _image_order(c, usable))
     for topic in choice.cameras or ():
