@@ -41,6 +41,7 @@ class LogContent:
     """Calibrations that are set and differ from the one before: the first is the camera's, a later one that of images
     behind its stamp."""
     right_calibration: CalibrationMessage | None
+    depth_calibration: CalibrationMessage | None
     odometry: Odometry | None
     frames: list[str]
     """Names of the odometry's frames, from the one that stands still to the body; empty names where it has none."""
@@ -145,8 +146,9 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     imu = (read.imu.frame, *read.imu.finish(notes)) if chosen.imu is not None and odometry is None else None
     calibrations = read.calibrations(chosen.camera_info, "image", notes)
     right_calibration = next(iter(read.calibrations(chosen.right_info, "right", notes)), None)
+    depth_calibration = next(iter(read.calibrations(chosen.depth_info, "depth", notes)), None)
     return LogContent(
         stamp_ns, places, read.images["image"].stream, rows, scan_ns, scan_places, companions, calibrations,
-        right_calibration, odometry, frames, gps, imu, tree, read.clock_offset_ms(), chosen,
+        right_calibration, depth_calibration, odometry, frames, gps, imu, tree, read.clock_offset_ms(), chosen,
         [source for source, _ in sources], rates_hz,
     )  # fmt: skip

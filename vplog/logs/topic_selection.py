@@ -131,7 +131,19 @@ class Candidate:
     """Whether images of its encoding can be decoded to grey."""
 
 
-_PARTS = ("image", "depth", "camera_info", "odometry", "gps", "right", "right_info", "imu", "mask", "lidar")
+_PARTS = (
+    "image",
+    "depth",
+    "camera_info",
+    "odometry",
+    "gps",
+    "right",
+    "right_info",
+    "depth_info",
+    "imu",
+    "mask",
+    "lidar",
+)
 
 
 @dataclass(frozen=True)
@@ -146,6 +158,8 @@ class Selection:
     gps: Channel | None = None
     right: Channel | None = None
     right_info: Channel | None = None
+    depth_info: Channel | None = None
+    """The calibration of the depth, where it has one of its own."""
     imu: Channel | None = None
     """The IMU whose gyroscope turns velocities, where these are the odometry, or which visual odometry takes."""
     mask: Channel | None = None
@@ -252,11 +266,13 @@ def _of_image(
                 "not both. Leave out --depth-topic or --right-topic."
             )
         right = None
+    info, depth_info = _calibration(image, usable), None if depth is None else _calibration(depth, usable)
+    found = {"depth": depth, "right": right, "depth_info": None if depth_info is info else depth_info}
     if choice.calibration_file is not None:
-        return {"depth": depth, "right": right}
+        return found
     right_info = _calibration(right, usable) if right is not None else None
-    info = _calibration(image, usable) if choice.camera_info is None else pick("camera_info")
-    return {"depth": depth, "right": right, "right_info": right_info, "camera_info": info}
+    info = info if choice.camera_info is None else pick("camera_info")
+    return found | {"right_info": right_info, "camera_info": info}
 
 
 def _odometry_kind(candidates: list[Candidate], choice: TopicChoice) -> str:
