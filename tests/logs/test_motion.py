@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from tests.logs.drives import START_NS, Written, matrices, matrix, store, write_foxglove, write_ros1, write_ros2
 from vplog import logs
+from vplog.data import Trajectory
 from vplog.errors import LogError
 from vplog.geometry.tum import write_tum
 from vplog.logs import TopicChoice
@@ -158,6 +159,24 @@ def test_transforms_that_never_change_are_static_in_logs_without_tf_static(tmp_p
     np.testing.assert_allclose(log.camera().body_from_camera, CAMERA, atol=1e-9)
 
 
+@pytest.mark.parametrize("source", ["found", "topic", "file"])
+def test_mounts_on_tf_count_beside_static_ones_which_come_first(source: str, tmp_path: Path) -> None:
+    """A camera driver's own frames on /tf_static, its mount again and again on /tf, as tf1's publisher has it."""
+    mount, wrong = matrix(np.array([0.2, 0.1, 0.5]), Rotation.from_euler("z", 0.4)), POSES[3]
+    kind = "nav_msgs/msg/Odometry"
+    found = [tf(2, "/tf_static", START_NS, ("camera_link", "camera", CAMERA))]
+    for stamp, pose in zip(STAMPS.tolist(), POSES, strict=True):
+        found.append(Written("/odom", kind, stamp, pose_message(kind, stamp, pose)))
+        edges = ("base_link", "camera_link", mount), ("camera_link", "camera", wrong), ("base_link", "wheel", pose)
+        found += [tf(2, "/tf", stamp, *edges), image(2, stamp)]
+    path, file = write_ros2(tmp_path / "drive", found), tmp_path / "odometry.tum"
+    write_tum(file, Trajectory(STAMPS, POSES))
+    choice = {"found": {}, "topic": {"odometry": "/odom"}, "file": {"odometry_file": file}}[source]
+    log = logs.open(path, TopicChoice.model_validate(choice))
+    np.testing.assert_allclose(log.camera().body_from_camera, mount @ CAMERA, atol=1e-9)
+    assert next(topic.part for topic in log.info().topics if topic.name == "/tf") == "tf"
+
+
 @pytest.mark.parametrize("several", [False, True])
 def test_foxglove_transforms(several: bool, tmp_path: Path) -> None:
     found = []
@@ -192,8 +211,6 @@ def test_odometry_comes_before_tf_unless_tf_is_asked_for(tmp_path: Path) -> None
 
 
 def test_a_file_beside_the_log(tmp_path: Path) -> None:
-    from vplog.data import Trajectory
-
     path = write_ros2(tmp_path / "drive", [image(2, stamp) for stamp in STAMPS.tolist()])
     assert logs.open(path).odometry() is None
     file = tmp_path / "odometry.tum"

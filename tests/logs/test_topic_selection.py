@@ -113,14 +113,11 @@ def test_the_sources_of_odometry_are_all_poses_and_the_transforms() -> None:
     assert sources(*moving, static, *poses, odometry="/tf") == ["/tf"]
     assert sources(*moving, static, *poses, odometry="") == []
     topics = TopicChoice(odometry="/a")
-    assert select([*moving, static, *poses], topics, "a").tf == ()
-    assert [c.topic for c in select([*moving, *poses], topics, "a").tf] == [
-        "/tf",
-        "/arm/tf",
-    ]  # static ones may be there
-    chosen = select([*moving, static, *poses], TopicChoice(), "a")
-    assert chosen.with_odometry(chosen.sources[0]).tf == ()
-    assert len(chosen.with_odometry(moving[0].channel).tf) == 2
+    chosen = select([*moving, static, *poses], topics, "a")
+    assert [c.topic for c in chosen.tf] == ["/tf", "/arm/tf"]  # static ones may be there
+    assert len(chosen.with_odometry(chosen.sources[0], has_static=True).tf) == 2
+    assert chosen.with_odometry(chosen.sources[0], has_static=False).tf == ()
+    assert len(chosen.with_odometry(moving[0].channel, has_static=False).tf) == 2
 
 
 def test_choice_overrides_and_empty_means_none() -> None:

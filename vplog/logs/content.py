@@ -107,13 +107,14 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     found = read_sources(read, chosen) | other_sources(gps, contents, chosen)
     sources = rank_sources(found, read.images["image"].finish(Notes())[0])
     rates_hz = read.rates_hz()
-    chosen = chosen.with_odometry(choose_odometry(sources, chosen, notes))
+    still = read.dynamic.static()
+    chosen = chosen.with_odometry(choose_odometry(sources, chosen, notes), bool(still))
     sources = [(replace(one, used=source == chosen.odometry), source) for one, source in sources]
     read.poses = {source: track for source, track in read.poses.items() if source == chosen.odometry}
     for (reason, topic), runs in read.lost.items():
         if topic in {channel.topic for channel in chosen.channels}:
             notes.account.add(reason, {topic: runs.messages}, (topic, 0), runs.spans)
-    tree = FrameTree([*(read.dynamic.static() if chosen.tf else ()), *read.transforms])
+    tree = FrameTree([*still, *read.transforms])
     if tree.dropped:
         notes.add(f"{plural(tree.dropped, 'static transform')} with NaN or without a rotation left out.")
     stamp_ns, places, rows = read.images["image"].finish(notes)

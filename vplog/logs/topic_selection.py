@@ -173,7 +173,7 @@ class Selection:
     """Factors of the linear and angular velocities of sources that are wheel speeds."""
     tf_static: tuple[Channel, ...] = ()
     tf: tuple[Channel, ...] = ()
-    """Transforms over time: read where odometry may come from them, or where no topic is of static ones alone."""
+    """Transforms over time: odometry may come from them, and those that never change are static ones."""
 
     @property
     def parts(self) -> dict[Channel, str]:
@@ -191,9 +191,9 @@ class Selection:
     def channels(self) -> list[Channel]:
         return list(dict.fromkeys((*self.parts, *self.sources)))
 
-    def with_odometry(self, odometry: Channel | None) -> Selection:
-        """The selection once the source of odometry is known."""
-        tf = self.tf if odometry in self.tf or not self.tf_static else ()
+    def with_odometry(self, odometry: Channel | None, has_static: bool) -> Selection:
+        """The selection once the source of odometry is known, and whether transforms over time never change."""
+        tf = self.tf if odometry in self.tf or has_static else ()
         return replace(self, odometry=odometry, sources=(), tf=tf)
 
 
@@ -235,8 +235,7 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     if kind == "lidar" or (not kind and all(c.role == "tf" for c in sources)):
         found["lidar"] = _lidar(usable, choice)
     static = tuple(sorted(c.channel for c in candidates if c.role == "tf_static"))
-    moving = tuple(c.channel for c in usable if c.role == "tf")
-    tf = moving if not static or any(c.role == "tf" for c in sources) else ()
+    tf = tuple(c.channel for c in usable if c.role == "tf")
     channels = {part: c.channel for part, c in found.items() if c is not None}
     return Selection(
         **channels, sources=tuple(c.channel for c in sources), tf_static=static, tf=tf, kind=kind, geometry=geometry
