@@ -286,6 +286,42 @@ def test_a_gyroscope_turns_velocities_less_its_bias_at_rest(tmp_path: Path) -> N
         check(opened(tmp_path, bad, gyroscope(bias), imu=""), 1.0, 0.05)
 
 
+def transforms(parent: str, child: str, values: np.ndarray) -> Messages:
+    """The same frame again and again."""
+    fields = []
+    for stamp, value in zip(STAMPS.tolist(), values, strict=True):
+        at = pose(value)
+        moved = {"translation": at["position"], "rotation": at["orientation"]}
+        one = {"header": header(stamp, parent), "child_frame_id": child, "transform": moved}
+        fields.append({"transforms": [message("geometry_msgs/msg/TransformStamped", **one)]})
+    return topic("/tf", "tf2_msgs/msg/TFMessage", fields)
+
+
+def images() -> Messages:
+    fields = [{"height": 48, "width": 64, "step": 64, "encoding": "mono8", "data": np.zeros(48 * 64, np.uint8)}] * COUNT
+    return topic("/camera/image", "sensor_msgs/msg/Image", stamped("camera", fields))
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_transforms_of_joints_and_mounts_leave_the_imu(turns: bool, tmp_path: Path) -> None:
+    """To velocities, and to visual odometry; where the transforms are the odometry it is not used."""
+    turned = matrices(np.zeros((COUNT, 3)), Rotation.from_rotvec(np.outer(SECONDS * turns, [0, 1, 0])))
+    joints = transforms("base_link", "wheel", turned)
+    log = opened(tmp_path, twists(scale=1.3), gyroscope(0.0), joints)
+    check(log, 0.1, 0.01)
+    assert "turns by the gyroscope" in " ".join(log.warnings)
+    log = opened(
+        tmp_path, images(), gyroscope(0.0), joints, transforms("base_link", "camera", turned[:1].repeat(COUNT, 0))
+    )
+    assert log.odometry() is None
+    assert (imu := log.imu()) is not None and imu.name == "/imu"
+    assert {topic.name: topic.part for topic in log.info().topics}["/imu"] == "imu"
+    log = opened(tmp_path, images(), gyroscope(0.0), transforms("odom", "base_link", POSES))
+    check(log, 0.05, 0.01)
+    assert log.imu() is None
+    assert {topic.name: topic.part for topic in log.info().topics}["/imu"] == ""
+
+
 @pytest.mark.parametrize("sigma_m", [0.02, 0.5])
 def test_fixes_alone_are_odometry_with_their_noise(sigma_m: float, tmp_path: Path) -> None:
     log = opened(tmp_path, fixes(sigma_m))

@@ -107,14 +107,14 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     found = read_sources(read, chosen) | other_sources(gps, contents, chosen)
     sources = rank_sources(found, read.images["image"].finish(Notes())[0])
     rates_hz = read.rates_hz()
-    still = read.dynamic.static()
-    chosen = chosen.with_odometry(choose_odometry(sources, chosen, notes), bool(still))
-    sources = [(replace(one, used=source == chosen.odometry), source) for one, source in sources]
+    static, source = read.dynamic.static(), choose_odometry(sources, chosen, notes)
+    chosen = chosen.with_odometry(source, bool(static), source is None or found[source].kind == "twist")
+    sources = [(replace(one, used=known == source), known) for one, known in sources]
     read.poses = {source: track for source, track in read.poses.items() if source == chosen.odometry}
     for (reason, topic), runs in read.lost.items():
         if topic in {channel.topic for channel in chosen.channels}:
             notes.account.add(reason, {topic: runs.messages}, (topic, 0), runs.spans)
-    tree = FrameTree([*still, *read.transforms])
+    tree = FrameTree([*static, *read.transforms])
     if tree.dropped:
         notes.add(f"{plural(tree.dropped, 'static transform')} with NaN or without a rotation left out.")
     stamp_ns, places, rows = read.images["image"].finish(notes)

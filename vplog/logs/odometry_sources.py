@@ -21,7 +21,7 @@ from vplog.logs.gather import TopicCollector
 from vplog.logs.messages.records import short_type
 from vplog.logs.stamps import NONE
 from vplog.logs.tf_odometry import FrameTree, frame_name
-from vplog.logs.topic_selection import SOURCES, Selection
+from vplog.logs.topic_selection import COMMAND, SOURCES, Selection
 from vplog.logs.tracks import PoseTrack
 
 TRUTH = Channel("truth", "ground truth", "")
@@ -54,11 +54,6 @@ _BODIES = ("base_link", "base_footprint", "base", "body", "robot", "chassis", "v
 """Frames that move: what is placed in them is a part of the robot."""
 _TRUTH = re.compile(r"ground_?truth|(^|[/_])gt([/_]|$)|vicon|optitrack|mocap|qualisys", re.IGNORECASE)
 """Names of ground truth and of the systems that measure it."""
-_COMMAND = re.compile(
-    "(?<![a-z])(goal|set_?point|target|desired|reference|command|cmd|ref|plan|way_?point|initial_?pose|clicked)s?(?![a-z])",
-    re.IGNORECASE,
-)
-"""Words for where a robot is to be, or is commanded to be."""
 _COMMANDED, _MAYBE_COMMANDED = "is a command by its name", "may be a command by its name"
 COVERED = 0.9
 """Share of the camera's time that odometry covers in a usual log: recorders start and stop within seconds."""
@@ -195,7 +190,8 @@ def choose_odometry(sources: list[tuple[OdometrySource, Channel]], chosen: Selec
             f"{commands[0].topic} takes it."
         )
     if not fit:
-        return None if sources or chosen.kind in SOURCES else requested or next(iter(chosen.sources), None)
+        others = (source for source in chosen.sources if source not in chosen.tf)  # which have mounts and joints, too
+        return None if sources or chosen.kind in SOURCES else requested or next(others, None)
     best, source = fit[0]
     _note_doubts(best, requested is not None, chosen.image is not None, notes)
     return source
@@ -260,7 +256,7 @@ def _evidence_by_name(topic: str, kind: str, frames: list[str], source_kind: str
         found[f"moves {child}, not base_link"] = 0.9
     if is_truth(topic, *frames):
         found["is ground truth by its name"] = _LEAST_FACTOR
-    if _COMMAND.search(topic):  # a goal names the frame that it lies in, none that moves
+    if COMMAND.search(topic):  # a goal names the frame that it lies in, none that moves
         found |= {_MAYBE_COMMANDED: 0.1} if child else {_COMMANDED: _LEAST_FACTOR}
     return {what: factor for what, factor in found.items() if factor < 1.0}
 

@@ -39,6 +39,11 @@ EVERY_IMAGE = "*"
 SOURCES = ("twist", "gps", "truth", "visual", "lidar")
 """Odometry that no topic is chosen for: velocities added up, positions of fixes, the ground truth of a data set, and
 that of the images and of a lidar, which a run computes."""
+COMMAND = re.compile(
+    "(?<![a-z])(goal|set_?point|target|desired|reference|command|cmd|ref|plan|way_?point|initial_?pose|clicked)s?(?![a-z])",
+    re.IGNORECASE,
+)
+"""Words for where a robot is to be, or is commanded to be."""
 OPTIONS = {
     "image": "image-topic", "depth": "depth-topic", "right": "right-topic", "camera_info": "camera-info-topic",
     "odometry": "odometry-topic", "gps": "gps-topic", "odometry_file": "odometry-file",
@@ -191,10 +196,11 @@ class Selection:
     def channels(self) -> list[Channel]:
         return list(dict.fromkeys((*self.parts, *self.sources)))
 
-    def with_odometry(self, odometry: Channel | None, has_static: bool) -> Selection:
-        """The selection once the source of odometry is known, and whether transforms over time never change."""
+    def with_odometry(self, odometry: Channel | None, has_static: bool, turned: bool) -> Selection:
+        """The selection once the source of odometry is known, whether transforms over time never change, and whether
+        the odometry is velocities or still to be computed, which take an IMU."""
         tf = self.tf if odometry in self.tf or has_static else ()
-        return replace(self, odometry=odometry, sources=(), tf=tf)
+        return replace(self, odometry=odometry, sources=(), tf=tf, imu=self.imu if turned else None)
 
 
 _NAMES = {
@@ -228,11 +234,13 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     requested = pick("odometry", "tf") if kind == "topic" and choice.odometry_file is None and choice.odometry else None
     geometry = {c.channel: factors for c in candidates if (factors := _geometry(c, choice))}
     sources = _sources(usable, kind, requested, geometry)
-    turned = kind == "twist" or all(short_type(c.channel.type) in (*TWISTS, *GEOMETRY) for c in sources)
-    visual = image is not None and choice.odometry_file is None and (kind == "visual" or not (sources or kind))
-    found["odometry"], found["imu"] = requested, pick("imu") if (sources and turned) or visual else None
+    # whether tf has odometry, and a command is one, shows when they are read
+    posed = [c for c in sources if kind or (c.role != "tf" and not COMMAND.search(c.channel.topic))]
+    turned = kind == "twist" or all(short_type(c.channel.type) in (*TWISTS, *GEOMETRY) for c in posed)
+    visual = image is not None and choice.odometry_file is None and (kind == "visual" or not (posed or kind))
+    found["odometry"], found["imu"] = requested, pick("imu") if (posed and turned) or visual else None
     found["gps"] = pick("gps", key=lambda c: short_type(c.channel.type) == NMEA)
-    if kind == "lidar" or (not kind and all(c.role == "tf" for c in sources)):
+    if kind == "lidar" or not (kind or posed):
         found["lidar"] = _lidar(usable, choice)
     static = tuple(sorted(c.channel for c in candidates if c.role == "tf_static"))
     tf = tuple(c.channel for c in usable if c.role == "tf")
