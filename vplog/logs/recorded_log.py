@@ -14,7 +14,7 @@ from vplog.data import Bytes, Camera, Gps, Imu, Ints, Lidar, LogInfo, Odometry, 
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.calibration_file import SidecarFiles
-from vplog.logs.cameras import BODY, body_from_camera, camera_of
+from vplog.logs.cameras import BODY, body_from_camera, camera_of, optical_frame
 from vplog.logs.content import LogContent, read_content
 from vplog.logs.depth_registration import DepthRegistration, registration_of
 from vplog.logs.formats.container import Channel, Container, Contents, Notes
@@ -242,7 +242,7 @@ class RecordedLog:
             if first is None or depth is None:
                 return None
             own = camera_of(depth.topic, self._content.depth_calibration, (first.shape[1], first.shape[0]), Notes())
-            frames = self._left[1], known.frame if (known := self._candidate(depth)) else ""
+            frames = self._left[1], self._optical(known.frame) if (known := self._candidate(depth)) else ""
             return depth, registration_of(own, camera, frames, self._content.tree, self._notes)
         except LogError as error:
             self._notes.add(f"Depth is not used: {error}")
@@ -268,14 +268,15 @@ class RecordedLog:
         """The camera of the images as they come, and its frame."""
         image = self._image_channel()
         content, notes = self._content, self._notes
-        frame, size = self._images.first(image, [*content.places], self._path.name)
+        logged, size = self._images.first(image, [*content.places], self._path.name)
+        frame = self._optical(logged)
         known = self._sidecar.camera(image.topic)
         calibration = known.calibration if known else content.calibration
         camera = camera_of(image.topic, calibration, size, notes)
         for masks in self._masks:
             masks.check(content.stamp_ns.tolist(), size, notes)
         body = self._body
-        named = body and frame and content.tree.between(body, frame) is not None
+        named = body and frame and frame == logged and content.tree.between(body, frame) is not None
         visual = camera.matrix is not None or self._contents.names is None
         if known is not None and known.body_from_camera is not None and not named:
             camera = replace(camera, body_from_camera=known.body_from_camera)
@@ -285,6 +286,12 @@ class RecordedLog:
             placed = body_from_camera(content.tree, body, frame, notes, ahead)
             camera = replace(camera, body_from_camera=placed)
         return camera, frame
+
+    def _optical(self, frame: str) -> str:
+        """Frame of a camera, by the frame_id of its images; those of a data set are optical."""
+        if self._contents.body or not frame:
+            return frame
+        return optical_frame(self._content.tree, self._body or BODY, frame, self.odometry(), self._notes)
 
     @cached_property
     def _pair(self) -> Pair | None:
@@ -303,7 +310,7 @@ class RecordedLog:
             if own is None or theirs is None:
                 raise NoPairError(f"{right.topic} has no calibration")
             other, size = self._images.first(right, content.companions["right"], self._path.name)
-            camera = camera_of(right.topic, theirs, size, self._notes)
+            camera, other = camera_of(right.topic, theirs, size, self._notes), self._optical(other)
             if other and frame and self._choice.cameras is not None and self._are_apart(frame, other):
                 return None  # the other is a camera by itself
             right_from_left = content.tree.between(other, frame) if other and frame else None
