@@ -80,6 +80,7 @@ def registration_of(
     return None
 
 
+@np.errstate(all="ignore")  # of a damaged calibration NaN comes, which is no depth
 def _registration(depth: Camera, camera: Camera, camera_from_depth: Floats) -> DepthRegistration:
     px = np.stack(np.meshgrid(np.arange(depth.width), np.arange(depth.height)), axis=-1).reshape(-1, 1, 2)
     px, matrix, lens, zero = px.astype(np.float64), np.asarray(depth.matrix), depth.distortion, np.zeros(3)
