@@ -330,6 +330,86 @@ def test_a_gyroscope_turns_velocities_less_its_bias_at_rest(tmp_path: Path) -> N
         check(opened(tmp_path, bad, gyroscope(bias), imu=""), 1.0, 0.05)
 
 
+def transforms(parent: str, child: str, values: np.ndarray) -> Messages:
+    """The same frame again and again."""
+    fields = []
+    for stamp, value in zip(STAMPS.tolist(), values, strict=True):
+        at = pose(value)
+        moved = {"translation": at["position"], "rotation": at["orientation"]}
+        one = {"header": header(stamp, parent), "child_frame_id": child, "transform": moved}
+        fields.append({"transforms": [message("geometry_msgs/msg/TransformStamped", **one)]})
+    return topic("/tf", "tf2_msgs/msg/TFMessage", fields)
+
+
+def images() -> Messages:
+    fields = [{"height": 48, "width": 64, "step": 64, "encoding": "mono8", "data": np.zeros(48 * 64, np.uint8)}] * COUNT
+    return topic("/camera/image", "sensor_msgs/msg/Image", stamped("camera", fields))
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_transforms_of_joints_and_mounts_leave_the_imu(turns: bool, tmp_path: Path) -> None:
+    """To velocities, and to visual odometry; where the transforms are the odometry it is not used."""
+    turned = matrices(np.zeros((COUNT, 3)), Rotation.from_rotvec(np.outer(SECONDS * turns, [0, 1, 0])))
+    joints = transforms("base_link", "wheel", turned)
+    log = opened(tmp_path, twists(scale=1.3), gyroscope(0.0), joints)
+    check(log, 0.1, 0.01)
+    assert "turns by the gyroscope" in " ".join(log.warnings)
+    log = opened(
+        tmp_path, images(), gyroscope(0.0), joints, transforms("base_link", "camera", turned[:1].repeat(COUNT, 0))
+    )
+    assert log.odometry() is None
+    assert (imu := log.imu()) is not None and imu.name == "/imu"
+    assert {topic.name: topic.part for topic in log.info().topics}["/imu"] == "imu"
+    log = opened(tmp_path, images(), gyroscope(0.0), transforms("odom", "base_link", POSES))
+    check(log, 0.05, 0.01)
+    assert log.imu() is None
+    assert {topic.name: topic.part for topic in log.info().topics}["/imu"] == ""
+
+
+def of_receiver(kind: str) -> Messages:
+    """Velocities in the world's axes, of TwistStamped with the rates of the body or without, or positions alone."""
+    if kind == "positions":
+        fields = [
+            {"pose": {"position": dict(zip("xyz", one[:3, 3].tolist(), strict=True)), "orientation": {"w": 1.0}}}
+            for one in POSES
+        ]
+        return topic("/place", "geometry_msgs/msg/PoseStamped", stamped("map", fields))
+    velocity = (POSES[:, :3, :3] @ (SPEED[:, None] * [1.0, 0.0, 0.0])[:, :, None])[:, :, 0]
+    rates = TURN if kind == "rates" else np.zeros(COUNT)
+    each = zip(velocity.tolist(), rates.tolist(), strict=True)
+    fields = [{"twist": {"linear": {"x": x, "y": y}, "angular": {"z": rate}}} for (x, y, _), rate in each]
+    return topic("/vel", "geometry_msgs/msg/TwistStamped", stamped("gps", fields))
+
+
+@pytest.mark.parametrize("kind", ["velocities", "rates", "positions"])
+@pytest.mark.parametrize("gyro", [False, True])
+def test_what_a_receiver_measures_has_no_heading(kind: str, gyro: bool, tmp_path: Path) -> None:
+    """Its velocities are not those of the body, turned by a gyroscope or not, and its positions alone no poses."""
+    beside = [gyroscope(0.0)] if gyro else []
+    log = opened(tmp_path, of_receiver(kind), *beside, fixes(0.02))
+    assert kind_of(log) == "gps"
+    log = opened(tmp_path, of_receiver(kind), *beside)
+    assert log.odometry() is None
+    assert "moves every way without turning" in " ".join(log.warnings)
+    name = "/place" if kind == "positions" else "/vel"
+    assert f"--odometry-topic {name} takes it" in " ".join(log.warnings)
+    assert opened(tmp_path, of_receiver(kind), *beside, odometry=name).odometry() is not None
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_what_moves_sideways_keeps_its_odometry(seed: int, tmp_path: Path) -> None:
+    """A platform that drives every way as it turns, a straight drive out and back, and one that hardly turns."""
+    rng = np.random.default_rng(seed)
+    way = rng.normal(0, 1, (12, 3)) * [0.7, 0.7, rng.choice([0.02, 0.3])]
+    moving = np.repeat(way, COUNT // 12, axis=0)
+    fields = [{"twist": {"linear": {"x": x, "y": y}, "angular": {"z": rate}}} for x, y, rate in moving.tolist()]
+    log = opened(tmp_path, topic("/twist", "geometry_msgs/msg/TwistStamped", stamped("base_link", fields)))
+    assert kind_of(log) == "twist"
+    there = [{"twist": velocities(1.5 * math.copysign(1.0, x), 0.0)} for x in moving[:, 0].tolist()]
+    log = opened(tmp_path, topic("/twist", "geometry_msgs/msg/TwistStamped", stamped("base_link", there)))
+    assert kind_of(log) == "twist"
+
+
 @pytest.mark.parametrize("sigma_m", [0.02, 0.5])
 def test_fixes_alone_are_odometry_with_their_noise(sigma_m: float, tmp_path: Path) -> None:
     log = opened(tmp_path, fixes(sigma_m))

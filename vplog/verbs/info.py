@@ -50,6 +50,7 @@ _PART_WORDS = {
     "depth": "depth",
     "camera_info": "calibration",
     "right_info": "calibration of the right camera",
+    "depth_info": "calibration of the depth",
     "odometry": "odometry",
     "gps": "satellite fixes",
     "imu": "IMU of the odometry",
