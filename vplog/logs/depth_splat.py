@@ -9,6 +9,9 @@ import numba
 _OVERLAP_PX = 0.25
 """px by which a measurement reaches over its own edge: on a slope neighbours drift apart by a part of a px and would
 leave holes. At the edge of something near, it is as much too large."""
+_MOST_PX = 16.0
+"""Most px of the images to each side that one of the depth covers: four times what 160 of them have in 1280. What lies in
+the camera itself, or a damaged calibration, would write the whole image for every px."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -29,7 +32,8 @@ def splat(depth_m, rays, shift_m, pinhole, lens, scales, result):
             column, row = round(x), round(y)
             u = lens[row, column, 0] + scales[0] * (x - column)
             v = lens[row, column, 1] + scales[1] * (y - row)
-            half_u, half_v = 0.5 * scales[2] * depth / z + _OVERLAP_PX, 0.5 * scales[3] * depth / z + _OVERLAP_PX
+            half_u = min(0.5 * scales[2] * depth / z, _MOST_PX) + _OVERLAP_PX
+            half_v = min(0.5 * scales[3] * depth / z, _MOST_PX) + _OVERLAP_PX
             for r in range(max(math.ceil(v - half_v), 0), min(math.floor(v + half_v), height - 1) + 1):
                 for c in range(max(math.ceil(u - half_u), 0), min(math.floor(u + half_u), width - 1) + 1):
                     if not result[r, c] <= z:
