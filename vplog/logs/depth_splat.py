@@ -10,8 +10,8 @@ _OVERLAP_PX = 0.25
 """px by which a measurement reaches over its own edge: on a slope neighbours drift apart by a part of a px and would
 leave holes. At the edge of something near, it is as much too large."""
 _MOST_PX = 16.0
-"""Most px of the images to each side that one of the depth covers: four times what 160 of them have in 1280. What lies in
-the camera itself, or a damaged calibration, would write the whole image for every px."""
+"""Most px of the images to each side that one of the depth covers: four times what 160 of them have in 1280. What lies
+in the camera itself, or a damaged calibration, would write the whole image for every px."""
 
 
 @numba.njit(cache=True, nogil=True)

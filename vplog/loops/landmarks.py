@@ -84,8 +84,8 @@ def landmarks_of(
     matches: PairMatches,
     settings: LandmarkSettings,
 ) -> Landmarks:
-    """The landmarks of the `count` strongest features of keyframe `row`: from depth where enough have one, else from
-    motion, by their matches in the neighbouring keyframes, unless that tells fewer."""
+    """The landmarks of the `count` strongest features of keyframe `row`: from depth where enough have one or none is
+    enough, else from motion, by their matches in the neighbouring keyframes."""
     own = features(row).rows(slice(count))
     rays = undistort.rays(camera, own.points)
     measured = None
@@ -102,7 +102,7 @@ def landmarks_of(
     motion = se3.between(keyframes.odom_from_body[rows], keyframes.odom_from_body[row])
     views = se3.inverse(camera.body_from_camera) @ motion @ camera.body_from_camera
     moved = from_motion(rays, observed, views, camera, settings)
-    return moved if measured is None or moved.known.sum() >= measured.known.sum() else measured
+    return moved if measured is None or moved.known.sum() >= _ENOUGH else measured
 
 
 def from_depth(rays: Floats, depth_m: Floats, camera: Camera, settings: LandmarkSettings) -> Landmarks:

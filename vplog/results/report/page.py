@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -15,6 +14,7 @@ from vplog.errors import plural
 from vplog.geometry import geodesy, se3
 from vplog.results.html import figure, mapping, render
 from vplog.results.report import charts
+from vplog.results.run_record import command_of
 
 if TYPE_CHECKING:
     from vplog.results.geo import Earth
@@ -375,11 +375,11 @@ def _views(content: ReportContent) -> tuple[dict[str, Any], dict[str, str]]:
 def _audit(content: ReportContent, drawn: dict[str, Any]) -> dict[str, Any]:
     """Data of the page's script."""
     views, references = _views(content)
-    closures, log = content.closures, content.record.get("log")
+    closures = content.closures
     order = np.lexsort((-closures.score.astype(np.float64), ~closures.of(*USED)))
     columns = _columns(content, sorted(order[:_MOST_ROWS].tolist()))
     start_ns = int(content.tracks.after.stamp_ns[0])
-    command = f"vplog run {shlex.quote(str(log))} -o RUN --decisions decisions.csv"
+    command = command_of(content.record, "RUN", "--decisions", "decisions.csv")
     return {
         "columns": columns,
         "scales": _scales(columns, drawn["error_m"]),
