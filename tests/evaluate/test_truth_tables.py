@@ -149,6 +149,8 @@ def test_labels_by_table(tmp_path: Path) -> None:
     assert found(f"{path},{other}") == [[0]]
     with pytest.raises(TruthError, match="covers none of the 3 frames of the query day"):
         found(table(tmp_path, "image,label\nx.png,hall\n"))
+    with pytest.raises(TruthError, match=r":3 has an empty label"):
+        found(table(tmp_path, "image,label\nday/68.png,hall\nday/1150.png,\n"))
 
 
 def test_positions_in_names() -> None:

@@ -37,9 +37,9 @@ def read_table(path: Path) -> tuple[list[str], list[tuple[str, str, str]]]:
     lines = read_lines(path, (["query", "match"], ["image", "label"]))
     _, header = next(lines, ("", []))
     rows = [(first, second, where) for where, (first, second) in lines]
-    for first, _, where in rows:
-        if not first:
-            raise TruthError(f"{where} has an empty first field. {_CSV}")
+    for first, second, where in rows:
+        if not first or (not second and header == ["image", "label"]):
+            raise TruthError(f"{where} has an empty {'label' if first else 'first field'}. {_CSV}")
     if not rows:
         raise TruthError(f"{path} holds no pair. {_CSV}")
     return header, rows

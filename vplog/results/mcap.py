@@ -313,10 +313,10 @@ def _graph(stamp_ns: int, world_from_body: Floats, graph: PoseGraph, closures: C
 
 
 def _rejected(stamp_ns: int, world_from_body: Floats, closures: Closures) -> SceneUpdate:
-    """Candidates that geometry rejected, faint and on a topic of their own, since they are many."""
+    """Candidates that are not in the graph, faint and on a topic of their own, since they are many."""
     given = closures.of(*(one for verdicts, _ in _VERDICT_COLOURS.values() for one in verdicts))
     ends = closures.lines(world_from_body[:, :3, 3], ~given)
-    return foxglove.lines(stamp_ns, [("candidates rejected by geometry", ends, foxglove.FAINT_RED)])
+    return foxglove.lines(stamp_ns, [("candidates not in the graph", ends, foxglove.FAINT_RED)])
 
 
 def _loop_closure(

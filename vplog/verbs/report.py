@@ -89,7 +89,7 @@ def judge(
         judged.curves,
         judged.at_place,
         error_m,
-        np.where(at.known[closures.match] & at.known[closures.query], apart_m, np.nan),
+        np.where(at.known[closures.match] & at.known[closures.query] & found.truth.oriented, apart_m, np.nan),
     )
 
 

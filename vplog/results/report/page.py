@@ -214,7 +214,7 @@ def _questions(content: ReportContent) -> list[list[Any]]:
             (row := one.rows[0]),
             *(str(int(end[row])) for end in (closures.query, closures.match)),
             closures.verdict[row].value,
-            figure(closures.p_false[row], 3),
+            "-" if np.isnan(closures.p_false[row]) else f"{closures.p_false[row]:.3g}",
             figure(one.p_wrong, 3),
             figure(one.moved_m, 3),
             str(len(one.rows)),
@@ -308,7 +308,7 @@ def _map(content: ReportContent) -> tuple[list[tuple[str, str]], dict[str, Any]]
     false = false_closures(content)
     groups = [
         ("yes", "closures in the solution", closures.of(*USED) & ~false),
-        ("no", "closures the solver or a decision rejected", closures.of(*_AFTER_GEOMETRY)),
+        ("no", "closures the solver, the false rate or a decision rejected", closures.of(*_AFTER_GEOMETRY)),
         ("false", "closures in the solution that are false", false),
         ("before", "candidates that geometry rejected", ~closures.of(*USED, *_AFTER_GEOMETRY)),
     ]
@@ -427,9 +427,10 @@ def _columns(content: ReportContent, rows: list[int]) -> dict[str, list[Any]]:
         columns["change"] = [content.changes.change[row] for row in rows]
     whole = ("query", "match", "rank", "matches", "inliers", "reverse_inliers", "support")
     whole += () if closures.of_first_camera.all() else ("query_camera", "match_camera")
-    shares = {"residual_before": 2, "residual_after": 2, "p_false": 4, "weight": 3, "score": 4, "spread": 3}
+    shares = {"residual_before": 2, "residual_after": 2, "weight": 3, "score": 4, "spread": 3}
     columns |= {name: getattr(closures, name)[rows].tolist() for name in whole}
     columns |= {name: _rounded(getattr(closures, name)[rows], digits) for name, digits in shares.items()}
+    columns["p_false"] = [float(f"{one:.3g}") if np.isfinite(one) else None for one in closures.p_false[rows].tolist()]
     columns["metres"] = _rounded(np.linalg.norm(closures.match_from_query[rows, :3, 3], axis=1), 2)
     if judged is not None and judged.closure_error_m is not None:
         columns["error_m"] = _rounded(judged.closure_error_m[rows], 2)
