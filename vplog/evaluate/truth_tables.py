@@ -64,6 +64,8 @@ def read_lines(
                     raise error(f"{path}:{number} is longer than {_LINE_LIMIT} characters. {form}")
                 if not line.strip():
                     continue
+                if line.count('"') % 2:
+                    raise error(f"{path}:{number} has a quoted field of several lines, which is not read. {form}")
                 cells = [cell.strip() for cell in next(csv.reader([line]))]
                 if not width and headers and cells not in headers:
                     raise error(f"{path}:{number} is not the header. {form}")

@@ -31,7 +31,7 @@ from vplog.maps.joining.join_states import JoinState, read_states, write_states
 from vplog.maps.joining.members import CameraTrust, Member, member_of
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import damaged_table
-from vplog.maps.storage.layout import PICTURES, folder_name
+from vplog.maps.storage.layout import PICTURES, PLACES_ONLY, folder_name
 from vplog.maps.storage.map_store import Store, reading, writing
 from vplog.maps.storage.snapshot import LostRaceError
 from vplog.pipeline import Pipeline
@@ -168,6 +168,9 @@ def read_drives(store: Store, urls: Mapping[str, str]) -> Drives:
         state = stored.get(drive)
         if about.get(PICTURES):
             reasons[drive] = f"{drive} has no odometry: it can be found, and is joined with no other drive."
+            continue
+        if PLACES_ONLY in about:
+            reasons[drive] = f"{drive} has places alone: it can be found, and is joined with no other drive."
             continue
         if state is None or state.key != about["key"]:
             try:
