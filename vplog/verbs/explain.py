@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,9 @@ def explain(
     siblings = [closures.verdict[one].value for one in np.flatnonzero(closures.query == row["query"])]
     reason = str(run_record.recorded(record, folder / "run.json", dict, "solution").get("reason", ""))
     explanation = explain_text.describe(row, keyframes, world_from_body, siblings, pipeline, reason)
+    if not run_record.has_metres(record):
+        text = f"{explanation.solver} This run has no metres: lengths in m here are in its own unit."
+        explanation = replace(explanation, solver=text)
     shown = None
     if not words_only:
         topics = logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json")

@@ -14,7 +14,7 @@ from vplog.errors import plural
 from vplog.geometry import geodesy, se3
 from vplog.results.html import figure, mapping, render
 from vplog.results.report import charts
-from vplog.results.run_record import command_of
+from vplog.results.run_record import command_of, has_metres
 
 if TYPE_CHECKING:
     from vplog.results.geo import Earth
@@ -175,6 +175,11 @@ def page(content: ReportContent) -> str:
     )
 
 
+def _unit(content: ReportContent) -> str:
+    """Unit of length of the run."""
+    return "m" if has_metres(content.record) else "units of the run"
+
+
 def _tiles(content: ReportContent) -> list[tuple[str, str]]:
     """The drive in seven numbers, each with its label."""
     path_m = float(np.linalg.norm(np.diff(content.tracks.after.world_from_body[:, :3, 3], axis=0), axis=1).sum())
@@ -182,7 +187,7 @@ def _tiles(content: ReportContent) -> list[tuple[str, str]]:
     totals = mapping(content.record.get("totals"))
     return [
         (figure(len(content.tracks.keyframes.stamp_ns)), "keyframes"),
-        (f"{figure(path_m)} m", "path"),
+        (f"{figure(path_m)} {_unit(content)}", "path"),
         (f"{figure((int(stamps[-1]) - int(stamps[0])) / 1e9 if len(stamps) else 0.0)} s", "of drive"),
         (figure(len(content.closures)), "candidates"),
         (figure(int(content.closures.accepted.sum())), "accepted closures"),
@@ -226,12 +231,12 @@ def _questions(content: ReportContent) -> list[list[Any]]:
 def _certainty(content: ReportContent) -> list[str]:
     """The certificate of global optimality, and the uncertainty of the keyframes' positions."""
     found = [str(reason)] if (reason := mapping(content.record.get("certificate")).get("reason")) else []
-    sigma_m = _sigma_m(content.covariance)
+    sigma_m, unit = _sigma_m(content.covariance), _unit(content)
     if len(sigma_m := sigma_m[np.isfinite(sigma_m)]):
         to = "where GPS measures them" if content.record.get("gps") else "the first keyframe"
         found.append(
             f"Positions of keyframes relative to {to}, one sigma along the worst axis: median "
-            f"{figure(float(np.median(sigma_m)), 3)} m, largest {figure(float(sigma_m.max()), 3)} m."
+            f"{figure(float(np.median(sigma_m)), 3)} {unit}, largest {figure(float(sigma_m.max()), 3)} {unit}."
         )
     return found
 
@@ -253,15 +258,16 @@ def _over_time(content: ReportContent) -> list[charts.Chart]:
     poses = [(kind, name, track.world_from_body) for kind, name, track in both]
     yaw = [(kind, name, np.degrees(np.unwrap(np.arctan2(one[:, 1, 0], one[:, 0, 0])))) for kind, name, one in poses]
     speed_s, speed = _speed(sample_s, tracks.after.world_from_body[:, :3, 3])
+    unit = _unit(content)
     used, residual = closures.of(*USED), np.minimum(closures.residual_after, _MOST_SIGMA)
     dots = [("dot yes", "in the solution", used), ("dot no", "other closures", ~used)]
     solved, error_m = np.isfinite(residual), None if judged is None else judged.error_m
     residuals = [(kind, name, np.where(rows, residual, np.nan)[solved]) for kind, name, rows in dots]
     drawn: list[tuple[str, Floats, list[tuple[str, str, Floats]]]] = [
-        ("height, z in m", sample_s, [(kind, name, one[:, 2, 3]) for kind, name, one in poses]),
+        (f"height, z in {unit}", sample_s, [(kind, name, one[:, 2, 3]) for kind, name, one in poses]),
         ("heading, yaw in degrees", sample_s, yaw),
-        ("speed in m/s", speed_s, [("after", "optimised", speed)]),
-        ("position, one sigma in m", keyframe_s, [("after", "one sigma", _sigma_m(content.covariance))]),
+        (f"speed in {unit}/s", speed_s, [("after", "optimised", speed)]),
+        (f"position, one sigma in {unit}", keyframe_s, [("after", "one sigma", _sigma_m(content.covariance))]),
         (
             f"residual of closures in sigma, cut at {_MOST_SIGMA:.0f}",
             keyframe_s[closures.query[solved]],
@@ -383,6 +389,7 @@ def _audit(content: ReportContent, drawn: dict[str, Any]) -> dict[str, Any]:
     return {
         "columns": columns,
         "scales": _scales(columns, drawn["error_m"]),
+        "unit": _unit(content),
         "used": [verdict.value for verdict in USED],
         "sentences": {verdict.value: verdict.sentence for verdict in Verdict},
         "stamps": list(map(str, content.tracks.keyframes.stamp_ns.tolist())),  # beyond 2^53, where JavaScript rounds

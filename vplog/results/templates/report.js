@@ -166,7 +166,7 @@
     }
     const metres = round(120 / view.scale);
     pen.fillStyle = colour("ink"); pen.fillRect(16, height - 16, metres * view.scale, 2);
-    word(+metres.toPrecision(1) + " m", 16, height - 22);
+    word(+metres.toPrecision(1) + " " + data.unit, 16, height - 22);
     const origin = place(view.middle), foot = [width - 60, height - 60];
     for (const [name, axis] of Object.entries(data.map.axes)) {
       const long = name === "N" ? 38 : 26, tip = place(axis.map((value, at) => view.middle[at] + value));
