@@ -197,6 +197,8 @@ def _solved(
                 for number, mount in enumerate([extras.camera.body_from_camera, *extras.further_cameras]):
                     fixed.append((foxglove.BODY, foxglove.camera_frame(number), se3.vectors(mount).tolist()))
                 fixed += [(foxglove.MAP, frame, foxglove.IDENTITY) for frame in (foxglove.REFERENCE, foxglove.CLOSURE)]
+            if extras.gps is not None and extras.gps.antenna_m is not None:
+                fixed.append((foxglove.BODY, foxglove.GPS, [*extras.gps.antenna_m.tolist(), *foxglove.IDENTITY[3:]]))
             yield stamp_ns, "/tf_static", foxglove.transforms(stamp_ns, fixed)
             if extras.earth is not None:
                 tree = geo.feature_collection(extras.earth, world_from_body, keyframes.stamp_ns, closures)
