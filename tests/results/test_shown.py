@@ -334,4 +334,4 @@ def test_points_far_from_the_origin_are_told_to_the_millimetre() -> None:
     message = foxglove.points(0, far, foxglove.GREY)
     origin = message.pose.position
     stored = np.frombuffer(message.data, np.dtype([("position", "<f4", 3), ("color", "u1", 4)]))["position"]
-    np.testing.assert_allclose(stored + [origin.x, origin.y, origin.z], far[:, :3, 3], atol=1e-3)
+    np.testing.assert_allclose(stored + np.array([origin.x, origin.y, origin.z]), far[:, :3, 3], atol=1e-3)
