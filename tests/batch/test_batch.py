@@ -478,6 +478,8 @@ def test_a_moved_log_is_followed_and_a_copy_is_said(whole: Path, logs: list[Path
     # the path decides which is the known one, so the copy is another drive
     assert [(one["drive"], one["state"]) for one in told["drives"]] == [("drive-3", "computed"), ("drive", "unchanged")]
     assert "the same recording, byte for byte" in told["warnings"][0]
+    alone = run_batch([moved], root, load_pipeline("default", QUICK), options=BatchOptions(join=False))
+    assert "it is in the map as drive-3 and drive" in alone["warnings"][0], "of an earlier batch, too"
     told = run_batch([moved], Path(shutil.copytree(whole, tmp_path / "other")), load_pipeline("default", QUICK))
     assert [(one["drive"], one["state"]) for one in told["drives"]] == [("drive", "unchanged")]
     with map_store.reading(tmp_path / "other") as store:

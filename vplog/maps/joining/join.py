@@ -159,7 +159,7 @@ def read_drives(store: Store, urls: Mapping[str, str]) -> Drives:
     """Give new drives their place in the order, which stays: a killed join goes on as it began."""
     library = store.head().library or ""
     reasons, known = dict[str, str](), store.drives()
-    stored, states = read_states(store, known), dict[str, JoinState]()
+    stored, states = read_states(store), dict[str, JoinState]()
 
     def read(drive: str) -> Member:
         return member_of(store, {**known[drive], "log": urls.get(drive, known[drive]["log"])})
@@ -187,8 +187,10 @@ def read_drives(store: Store, urls: Mapping[str, str]) -> Drives:
     last = max((one.position for one in states.values()), default=-1)
     for number, drive in enumerate([drive for drive, one in states.items() if one.position < 0], start=last + 1):
         states[drive] = replace(states[drive], position=number)
-    if changed := {drive for drive, one in states.items() if one is not stored.get(drive)}:
-        write_states(store, states.values(), changed)
+    changed = {drive for drive, one in states.items() if one is not stored.get(drive)}
+    gone = [one for drive, one in stored.items() if drive not in states]
+    if changed or gone:
+        write_states(store, states.values(), changed, gone)
     order = sorted(states.keys() - reasons.keys(), key=lambda drive: (states[drive].position, drive))
     others = [one for drive, one in states.items() if drive in reasons]
     return Drives([states[one] for one in order], known, reasons, library, cache(lambda at: read(order[at])), others)
