@@ -77,10 +77,11 @@ def logs_of(drives: Sequence[Path]) -> dict[str, Any]:
 def library_at(folder: Path, record: dict[str, Any]) -> Iterator[Path]:
     """The library of a run by its run.json: in its folder, or where it is from. Raises LogError, ResultError."""
     library, about = folder / "library", record.get("library")
-    if not isinstance(about, dict) or not isinstance(about.get("from"), str):
-        raise ResultError(f"{folder}/run.json lacks library.from. Run `vplog run` again.")
-    if about["from"] != OWN_LIBRARY:
-        library = located(about["from"])
+    origin = about.get("from") if isinstance(about, dict) else None
+    if isinstance(origin, str) and origin != OWN_LIBRARY:  # one in the folder is that of a run before
+        library = located(origin)
+    elif not (library / "library.json").is_file():
+        raise ResultError(f"{folder} has no library. Run `vplog run` again.")
     with local_copy(library) as here:
         yield here
 
