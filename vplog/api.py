@@ -279,6 +279,8 @@ def evaluate(
     if (place / "map.json").exists():
         from vplog.batch.evaluate_map import evaluate_map
 
+        if (chosen := _topics(topics)) is not None and chosen.model_dump(exclude_defaults=True):
+            raise SettingsError("The drives of a map have topics of their own. Leave out the topics, or name a drive.")
         return evaluate_map(place, os.fspath(truth), TruthOptions(**options))
     with local_copy(place) as folder:
         return evaluate_run(folder, os.fspath(truth), _topics(topics), TruthOptions(**options))

@@ -431,8 +431,8 @@ class Topic:
     use for it."""
     used: bool
     part: str = ""
-    """Its use: `image`, `right`, `depth`, `camera_info`, `right_info`, `odometry`, `gps`, `lidar`, `tf_static`,
-    `tf`; empty where it is not used."""
+    """Its use: `image`, `right`, `depth`, `camera_info`, `right_info`, `depth_info`, `odometry`, `gps`, `lidar`,
+    `tf_static`, `tf`; empty where it is not used."""
     pixels: str = ""
     """Pixel layout or format of images, by the first message."""
     width: int = 0

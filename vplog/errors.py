@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import os
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EMFILE)
 
 
 class VplogError(Exception):
@@ -55,6 +59,12 @@ def causes(error: BaseException | None) -> Iterator[BaseException]:
         yield error
         visited.add(id(error))
         error = error.__cause__ or error.__context__
+
+
+def is_of_disk(error: BaseException) -> bool:
+    """Whether an error, or what is behind it, is a disk that is full, failing, or not to be written to: another attempt
+    or machine may do."""
+    return any(isinstance(one, OSError) and one.errno in _DISK for one in causes(error))
 
 
 def plural(count: int, noun: str) -> str:

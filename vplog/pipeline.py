@@ -174,6 +174,7 @@ def run(
     log = logs.open_drive(files_of(path), topics)
     check_library(library, pipeline)
     head = provenance.head(pipeline, path, execution.threads, topics)
+    head["arguments"] = provenance.arguments(files_of(path), topics, pipeline, library)
     with (
         staged_run(out, head, files_of(path), library, topics, cache=cache) as folder,
         Steps(path, cache.folder or (out if cache.use else folder) / CACHE, execution, use_cache=cache.use) as do,

@@ -489,6 +489,8 @@ def test_a_moved_log_is_followed_and_a_copy_is_said(whole: Path, logs: list[Path
     # the path decides which is the known one, so the copy is another drive
     assert [(one["drive"], one["state"]) for one in told["drives"]] == [("drive-3", "computed"), ("drive", "unchanged")]
     assert "the same recording, byte for byte" in told["warnings"][0]
+    alone = run_batch([moved], root, load_pipeline("default", QUICK), options=BatchOptions(join=False))
+    assert "it is in the map as drive-3 and drive" in alone["warnings"][0], "of an earlier batch, too"
     told = run_batch([moved], Path(shutil.copytree(whole, tmp_path / "other")), load_pipeline("default", QUICK))
     assert [(one["drive"], one["state"]) for one in told["drives"]] == [("drive", "unchanged")]
     with map_store.reading(tmp_path / "other") as store:
@@ -560,7 +562,9 @@ def test_a_dry_run_writes_nothing_and_reckons_by_the_drives_of_the_map(
 ) -> None:
     new, before = Path(shutil.copyfile(logs[0], tmp_path / "new.mcap")), files(whole)
     dry = (*logs, new, tmp_path / "gone.bag", "--dry-run", "--cost-per-cpu-hour", 3600, *OPTIONS)
-    found = verb("batch", *dry, "-o", whole, "--json").json
+    said = verb("batch", *dry, "-o", whole, "--json")
+    assert (said.code, "1 of 4 drives would fail" in said.err) == (1, True)
+    found = json.loads(said.out)
     assert files(whole) == before
     states = ["unchanged", "unchanged", "compute", "failed"]
     assert [one["state"] for one in found["drives"]] == states
@@ -576,7 +580,11 @@ def test_a_dry_run_writes_nothing_and_reckons_by_the_drives_of_the_map(
         map_store.annotate(store, "drive", {"log": str(new)})
     assert verb("batch", new, "--dry-run", "-o", root, "--json", *OPTIONS).json["compute"] == 1, "of another time"
     said = verb("batch", *dry, "-o", tmp_path / "map")
-    assert (said.code, "3 of 4 drives to compute" in said.out, (tmp_path / "map").exists()) == (0, True, False)
+    assert (said.code, "3 of 4 drives to compute" in said.out, (tmp_path / "map").exists()) == (1, True, False)
+    for option in (("--dry-run", "--metrics", tmp_path / "a.prom"), ("--cost-per-cpu-hour", 1)):
+        assert "--dry-run" in verb("batch", *logs, "-o", whole, *option).error
+    assert "whose files stay as they are" in verb("report", whole / "runs" / "drive=drive").error
+    assert "have topics of their own" in verb("evaluate", whole, "--truth", "gps", "--gps-topic", "/rtk").error
 
 
 def test_logs_that_are_refused_leave_no_map(whole: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:

@@ -603,6 +603,14 @@ def test_what_cannot_be_compared_is_said_in_one_line(
     assert said in verb("compare", *named, *methods, *QUICK).error
 
 
+def test_what_a_comparison_would_ignore_is_refused(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
+    options = (*traversals, "--truth", "index", "--methods", "bobb", *QUICK)
+    assert "see --library-size" in verb("compare", *options, "--set", "library.size=5").error
+    library = tmp_path / "library"
+    assert verb("library", traversals[1], "-o", library, *QUICK, "--set", "library.size=4").code == 0
+    assert "leave out --library-size" in verb("compare", *options, "--library", library, "--library-size", 4).error
+
+
 def test_another_programs_comparison_is_not_replaced(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
     own = {"compare.json": '{"mine": 1}', "answers.csv": "mine", "curves.png": "mine"}
     for name, text in own.items():

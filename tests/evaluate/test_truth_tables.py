@@ -100,6 +100,7 @@ def test_a_table_of_names(tmp_path: Path) -> None:
         ("0,1\n", ":1 is not the header"),
         ("query;match\n0;1\n", ":1 is not the header"),
         ("query,match\n0,1\n2\n", ":3 does not hold 2 fields"),
+        ('query,match\n0,"1\n2"\n', ":2 has a quoted field of several lines"),
         ("query,match\n0,1\n,2\n", ":3 has an empty first field"),
         ("query,match\n\n0,1.5\n", ":3: '1.5' is neither a frame number nor an image of the map night"),
         ("query,match\n-1,1\n", ":2: '-1' is neither a frame number nor an image of the query day"),
@@ -149,6 +150,8 @@ def test_labels_by_table(tmp_path: Path) -> None:
     assert found(f"{path},{other}") == [[0]]
     with pytest.raises(TruthError, match="covers none of the 3 frames of the query day"):
         found(table(tmp_path, "image,label\nx.png,hall\n"))
+    with pytest.raises(TruthError, match=r":3 has an empty label"):
+        found(table(tmp_path, "image,label\nday/68.png,hall\nday/1150.png,\n"))
 
 
 def test_positions_in_names() -> None:

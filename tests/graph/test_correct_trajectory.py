@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -70,3 +72,15 @@ def test_one_keyframe_moves_everything() -> None:
     one = Keyframes("", keyframes.stamp_ns[:1], keyframes.odom_from_body[:1])
     result = correct_trajectory(odometry, one, one.odom_from_body)
     np.testing.assert_allclose(result.world_from_body, odometry.odom_from_body, atol=1e-9)
+
+
+def test_samples_beside_a_break_move_with_their_own_piece() -> None:
+    """The second piece is moved by 50 m: no sample lies on the way between the two."""
+    odometry, keyframes = drive(0)
+    begin = 31
+    odometry = replace(odometry, breaks=np.array([begin]))
+    second = keyframes.stamp_ns >= STAMPS[begin]
+    moved = np.where(second[:, None, None], se3.pose(np.eye(3), np.array([50.0, 0.0, 0.0])), np.eye(4))
+    result = correct_trajectory(odometry, keyframes, moved @ keyframes.odom_from_body).world_from_body
+    np.testing.assert_allclose(result[:begin], odometry.odom_from_body[:begin], atol=1e-9)
+    np.testing.assert_allclose(result[begin:], moved[-1] @ odometry.odom_from_body[begin:], atol=1e-9)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from vplog.data import EdgeKind, PoseGraph
@@ -63,3 +65,16 @@ def test_a_few_closures_at_one_place_move_nothing() -> None:
 def test_without_a_break_nothing_changes() -> None:
     graph, _ = ring(0, 30)
     assert pieces_placed(graph, np.zeros(0, np.int64)) is graph
+
+
+def test_a_closure_that_a_person_accepted_places_a_piece_against_false_ones_that_agree() -> None:
+    graph, truth = ring(0, 30)
+    loops = np.flatnonzero(~graph.odometry)
+    a_from_b = graph.a_from_b.copy()
+    away = se3.pose(np.eye(3), np.array([0.0, 0.0, 20.0]))
+    a_from_b[loops[:-1]] = se3.between(truth[graph.a[loops[:-1]]], away @ truth[graph.b[loops[:-1]]])
+    kind = [*graph.kind[:-1], EdgeKind.KNOWN_LOOP]
+    placed = pieces_placed(replace(graph, a_from_b=a_from_b, kind=kind), np.array([BREAK]))
+    assert off_m(placed.world_from_body, truth) < 1.0
+    without = pieces_placed(replace(graph, a_from_b=a_from_b), np.array([BREAK]))
+    assert off_m(without.world_from_body, truth) > 10.0

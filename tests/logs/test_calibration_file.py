@@ -11,7 +11,8 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.logs.drives import HEIGHT, WIDTH, Drive, ros_messages, write_ros2
+from tests.logs.drives import HEIGHT, WIDTH, Drive, Written, ros_messages, write_ros2
+from tests.logs.test_odometry_kinds import header, message
 from tests.logs.test_rectification import BASELINE_M, PINHOLES, RIGHT_FROM_LEFT, SIZE, check, drive
 from vplog import logs
 from vplog.errors import LogError
@@ -20,6 +21,8 @@ from vplog.logs.calibration_file import camera_for, read_calibrations
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from vplog.stages import Log
 
 K = [[150.0, 0.0, 31.0], [0.0, 151.0, 22.0], [0.0, 0.0, 1.0]]
 D = [-0.1, 0.02, 0.001, -0.002, 0.0]
@@ -110,6 +113,48 @@ def test_where_the_camera_sits_is_the_logs_word_first(tmp_path: Path) -> None:
     found = [m for m in ros_messages(drive, 2) if m.topic != "/tf_static"]
     bare = logs.open(write_ros2(tmp_path / "bare", found), topics)
     np.testing.assert_allclose(bare.camera().body_from_camera, RIGHT_FROM_LEFT, atol=1e-9)
+
+
+def imu_messages(frame: str, gravity: float) -> list[Written]:
+    kind, values = "sensor_msgs/msg/Imu", {"angular_velocity": {"x": 0.1}, "linear_acceleration": {"z": gravity}}
+    stamps = Drive().stamp_ns.tolist()
+    return [Written("/imu", kind, stamp, message(kind, header=header(stamp, frame), **values)) for stamp in stamps]
+
+
+def with_imu(folder: Path, found: list[Written], frame: str = "imu", gravity: float = 9.8) -> Log:
+    """A log with an IMU of this frame, and the file that Kalibr makes of the two."""
+    tree = {"cam0": kalibr()["cam0"] | {"T_cam_imu": np.linalg.inv(RIGHT_FROM_LEFT).tolist()}}
+    ordered = sorted([*found, *imu_messages(frame, gravity)], key=lambda m: m.stamp_ns)
+    file = write(folder / "chain.yaml", tree)
+    return logs.open(write_ros2(folder / "drive", ordered), TopicChoice(calibration_file=file))
+
+
+@pytest.mark.parametrize("gravity", [9.8, 0.0])
+def test_kalibrs_imu_is_the_logs_where_no_transform_places_it(gravity: float, tmp_path: Path) -> None:
+    """Unless it is a gyroscope alone."""
+    found = [m for m in ros_messages(Drive(), 2) if m.topic not in ("/tf_static", "/odom", "/fix")]
+    log = with_imu(tmp_path, found, gravity=gravity)
+    imu = log.imu()
+    if not gravity:
+        assert imu is None
+        assert "/imu: it does not measure both turns and accelerations" in " ".join(log.warnings)
+        return
+    assert imu is not None
+    np.testing.assert_allclose(imu.body_from_imu, np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(log.camera().body_from_camera, RIGHT_FROM_LEFT, atol=1e-9)
+    assert "/imu is taken to be the IMU of the calibration." in log.warnings
+
+
+@pytest.mark.parametrize(("placed", "frame"), [("imu", "imu"), ("", "base_link"), ("", "imu")])
+def test_kalibrs_imu_is_placed_on_the_body_of_the_odometry(placed: str, frame: str, tmp_path: Path) -> None:
+    """By the transforms, by its frame, or with a note."""
+    drive, found = Drive(), ros_messages(Drive(), 2)
+    found[0].message.transforms[1].child_frame_id = placed
+    found = found if placed else found[1:]
+    log = with_imu(tmp_path, found, frame)
+    body_from_imu = drive.body_from_camera if placed else np.eye(4)
+    np.testing.assert_allclose(log.camera().body_from_camera, body_from_imu @ RIGHT_FROM_LEFT, atol=1e-9)
+    assert ("calibration's IMU is taken to be base_link" in " ".join(log.warnings)) == (not placed and frame == "imu")
 
 
 def test_camchain_makes_a_pair_without_any_calibration_in_the_log(tmp_path: Path) -> None:

@@ -117,6 +117,12 @@ def test_rows_of_kitti_belong_to_the_numbers_of_images(tmp_path: Path) -> None:
     check_frames(logs.open(tmp_path, TopicChoice(right="")), stamps[[1, 2, 4, 5]], images(0)[[1, 2, 4, 5]])
 
 
+def test_a_copy_among_the_images_of_kitti_is_left_out(tmp_path: Path) -> None:
+    stamps = kitti(tmp_path)
+    write_images(tmp_path / "sequences" / "07" / "image_0", ["000001 (1).png"], images(0)[5:])
+    check_frames(logs.open(tmp_path, TopicChoice(right="")), stamps, images(0))
+
+
 def test_images_of_kitti_that_are_none_are_counted(tmp_path: Path) -> None:
     kitti(tmp_path)
     for row in (1, 4):
@@ -331,7 +337,7 @@ def write_video(path: Path, pictures: np.ndarray, codec: str, turn_deg: int = 0)
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=25)
         stream.width, stream.height = pictures.shape[2], pictures.shape[1]
-        stream.pix_fmt = "gray" if codec == "ffv1" else "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        stream.pix_fmt = "gray" if codec in ("ffv1", "rawvideo") else "yuvj420p" if codec == "mjpeg" else "yuv420p"
         stream.time_base = stream.codec_context.time_base = Fraction(1, 100)
         for time, picture in zip(times, pictures, strict=True):
             frame = av.VideoFrame.from_ndarray(picture, "gray").reformat(format=stream.pix_fmt)
@@ -365,6 +371,15 @@ def test_a_video_has_its_own_time_stamps(name: str, codec: str, tmp_path: Path) 
     np.testing.assert_array_equal(some, np.array(means)[[1, 7, 9]])
     again = next(iter(log.frames(wanted[:1]))).decode().image.mean()  # back in time
     assert again == some[0]
+
+
+@pytest.mark.parametrize(("name", "codec"), [("a.mkv", "ffv1"), ("a.avi", "ffv1"), ("b.avi", "rawvideo")])
+def test_grey_video_keeps_its_black_and_white(name: str, codec: str, tmp_path: Path) -> None:
+    picture = np.tile(np.linspace(0, 255, 64), (32, 1)).astype(np.uint8)
+    write_video(tmp_path / name, np.stack([picture] * 3), codec)
+    log = logs.open(tmp_path / name)
+    for frame in log.frames(log.stamps()):
+        assert np.abs(frame.decode().image.astype(int) - picture).mean() < 1
 
 
 @pytest.mark.parametrize(("matrix", "turns"), [((0, 1, -1, 0), -1), ((-1, 0, 0, -1), 2), ((0, -1, 1, 0), 1)])

@@ -14,12 +14,15 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from tests.logs.drives import START_NS, Written, matrices, matrix, store, write_foxglove, write_ros1, write_ros2
 from vplog import logs
+from vplog.data import Trajectory
 from vplog.errors import LogError
 from vplog.geometry.tum import write_tum
 from vplog.logs import TopicChoice
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from vplog.stages import Log
 
 COUNT, PERIOD_NS = 20, 100_000_000
 RNG = np.random.default_rng(11)
@@ -158,6 +161,71 @@ def test_transforms_that_never_change_are_static_in_logs_without_tf_static(tmp_p
     np.testing.assert_allclose(log.camera().body_from_camera, CAMERA, atol=1e-9)
 
 
+@pytest.mark.parametrize("source", ["found", "topic", "file"])
+def test_mounts_on_tf_count_beside_static_ones_which_come_first(source: str, tmp_path: Path) -> None:
+    """A camera driver's own frames on /tf_static, its mount again and again on /tf, as tf1's publisher has it."""
+    mount, wrong = matrix(np.array([0.2, 0.1, 0.5]), Rotation.from_euler("z", 0.4)), POSES[3]
+    kind = "nav_msgs/msg/Odometry"
+    found = [tf(2, "/tf_static", START_NS, ("camera_link", "camera", CAMERA))]
+    for stamp, pose in zip(STAMPS.tolist(), POSES, strict=True):
+        found.append(Written("/odom", kind, stamp, pose_message(kind, stamp, pose)))
+        edges = ("base_link", "camera_link", mount), ("camera_link", "camera", wrong), ("base_link", "wheel", pose)
+        found += [tf(2, "/tf", stamp, *edges), image(2, stamp)]
+    path, file = write_ros2(tmp_path / "drive", found), tmp_path / "odometry.tum"
+    write_tum(file, Trajectory(STAMPS, POSES))
+    choice = {"found": {}, "topic": {"odometry": "/odom"}, "file": {"odometry_file": file}}[source]
+    log = logs.open(path, TopicChoice.model_validate(choice))
+    np.testing.assert_allclose(log.camera().body_from_camera, mount @ CAMERA, atol=1e-9)
+    assert next(topic.part for topic in log.info().topics if topic.name == "/tf") == "tf"
+
+
+AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+DRIVE = matrices(np.outer(np.arange(COUNT), [1.0, 0.1, 0.0]), Rotation.from_rotvec(np.zeros((COUNT, 3))))
+"""Along x."""
+
+
+def camera_placed(folder: Path, frame: str, mount: np.ndarray, poses: np.ndarray = DRIVE, **choice: Any) -> Log:
+    kind = "nav_msgs/msg/Odometry"
+    found = [tf(2, "/tf_static", START_NS, ("base_link", frame, mount))]
+    for stamp, pose in zip(STAMPS.tolist(), poses, strict=True):
+        found += [image(2, stamp), Written("/odom", kind, stamp, pose_message(kind, stamp, pose))]
+        found[-2].message.header.frame_id = frame
+    return logs.open(write_ros2(folder, found), TopicChoice(**choice))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_camera_whose_frame_has_x_ahead_does_not_look_up(seed: int, tmp_path: Path) -> None:
+    """As of usb_cam, placed by its position, yaw and a little pitch; beside cameras that are as they are named."""
+    rng = np.random.default_rng(seed)
+    turn = Rotation.from_euler("ZY", [rng.uniform(-np.pi, np.pi), rng.uniform(-0.35, 0.35)])
+    mount = matrix(rng.normal(size=3), turn)
+    log = camera_placed(tmp_path / "link", "head_camera", mount)
+    np.testing.assert_allclose(log.camera().body_from_camera, mount @ AHEAD, atol=1e-9)
+    assert "head_camera looks up by the static transforms" in " ".join(log.warnings)
+    down = mount @ matrix(np.zeros(3), Rotation.from_euler("x", np.pi))
+    every = {"up_optical": mount, "ahead": mount @ AHEAD, "down": down}
+    for frame, placed in every.items():
+        log = camera_placed(tmp_path / frame, frame, placed)
+        np.testing.assert_allclose(log.camera().body_from_camera, placed, atol=1e-9)
+        assert "looks up" not in " ".join(log.warnings)
+    along_z = DRIVE.copy()
+    along_z[:, :3, 3] = DRIVE[:, [1, 2, 0], 3]
+    log = camera_placed(tmp_path / "axes", "cam0", mount, along_z)  # a base_link with the axes of a camera
+    np.testing.assert_allclose(log.camera().body_from_camera, mount, atol=1e-9)
+
+
+def test_a_calibration_file_places_a_camera_that_does_look_up(tmp_path: Path) -> None:
+    up = matrix(np.array([0.0, 0.0, 1.0]), Rotation.from_euler("z", 0.2))
+    file = tmp_path / "sensor.yaml"
+    file.write_text(
+        f"sensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n  data: {up.ravel().tolist()}\nresolution: [10, 8]\n"
+        "camera_model: pinhole\nintrinsics: [9, 9, 4.5, 3.5]\ndistortion_model: radial-tangential\n"
+        "distortion_coefficients: [0, 0, 0, 0]\n"
+    )
+    log = camera_placed(tmp_path / "drive", "camera", np.eye(4), calibration_file=file)
+    np.testing.assert_allclose(log.camera().body_from_camera, up, atol=1e-9)
+
+
 @pytest.mark.parametrize("several", [False, True])
 def test_foxglove_transforms(several: bool, tmp_path: Path) -> None:
     found = []
@@ -192,8 +260,6 @@ def test_odometry_comes_before_tf_unless_tf_is_asked_for(tmp_path: Path) -> None
 
 
 def test_a_file_beside_the_log(tmp_path: Path) -> None:
-    from vplog.data import Trajectory
-
     path = write_ros2(tmp_path / "drive", [image(2, stamp) for stamp in STAMPS.tolist()])
     assert logs.open(path).odometry() is None
     file = tmp_path / "odometry.tum"

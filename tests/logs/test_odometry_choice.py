@@ -161,6 +161,22 @@ def test_a_topic_of_several_bodies_is_followed_for_one(tmp_path: Path) -> None:
     assert "100 poses of other frames than base_link" in " ".join(log.warnings)
 
 
+@pytest.mark.parametrize("kind", [ODOMETRY, POSE])
+@pytest.mark.parametrize("first", [True, False])
+def test_a_topic_of_two_fixed_frames_is_followed_in_that_of_most(first: bool, kind: str, tmp_path: Path) -> None:
+    """Two filters of robot_localization on one topic, or one that names another frame until it knows its place."""
+    robot, other = poses("/filtered", kind, WALK), poses("/filtered", kind, OTHER[1:], STAMPS[1:])
+    for message in other:
+        message.message.header.frame_id = "map"
+        message.stamp_ns += -1 if first else 1
+    log = logs.open(drive(tmp_path, robot, other))
+    odometry = log.odometry()
+    assert odometry is not None
+    np.testing.assert_allclose(odometry.odom_from_body, WALK, atol=1e-9)
+    frames = "base_link in odom" if kind == ODOMETRY else "odom"
+    assert f"/filtered: 99 poses of other frames than {frames} left out." in log.warnings
+
+
 def test_frames_tell_between_equal_types(tmp_path: Path) -> None:
     def frames(parent: str, child: str) -> Any:
         found = poses(f"/{parent}_{child}", ODOMETRY, WALK)

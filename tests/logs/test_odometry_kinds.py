@@ -164,10 +164,13 @@ def ackermann() -> Messages:
     return topic("/ackermann", "ackermann_msgs/msg/AckermannDriveStamped", stamped("base_link", fields))
 
 
-def wheels() -> Messages:
+def wheels(*names: str) -> Messages:
+    """Of joints with these names the first two are wheels."""
     left, right = ((SPEED + side * TURN * TRACK_M / 2) / RADIUS_M for side in (-1, 1))
-    names = ["front_left_wheel", "front_right_wheel"]
-    fields = [{"name": names, "velocity": np.array(both)} for both in zip(left, right, strict=True)]
+    names = names or ("front_left_wheel", "front_right_wheel")
+    others = np.random.default_rng(6).normal(0, 1, (COUNT, len(names) - 2))
+    each = np.column_stack([left, right, others])
+    fields = [{"name": [*names], "velocity": one} for one in each]
     return topic("/joint_states", "sensor_msgs/msg/JointState", stamped("base_link", fields))
 
 
@@ -198,16 +201,16 @@ def fixes(sigma_m: float, rate: int = 10) -> Messages:
     return topic("/fix", "sensor_msgs/msg/NavSatFix", stamped("gps", fields, STAMPS[rows]), STAMPS[rows])
 
 
-def gyroscope(bias: float) -> Messages:
+def gyroscope(bias: float, name: str = "/imu") -> Messages:
     """On its side: the body's z is its -x."""
     rates = -(TURN + bias) + np.random.default_rng(5).normal(0, 0.002, COUNT)
-    fields = [{"angular_velocity": {"x": float(rate)}} for rate in rates]
+    fields = [{"angular_velocity": {"x": float(rate)}, "linear_acceleration": {"x": -9.8}} for rate in rates]
     placed = {"rotation": dict(zip("xyzw", Rotation.from_euler("y", 90, degrees=True).as_quat(), strict=True))}
     mounted = {"header": header(START_NS, "base_link"), "child_frame_id": "imu", "transform": placed}
     kind = "tf2_msgs/msg/TFMessage"
     transforms = [message("geometry_msgs/msg/TransformStamped", **mounted)]
     return [
-        *topic("/imu", "sensor_msgs/msg/Imu", stamped("imu", fields)),
+        *topic(name, "sensor_msgs/msg/Imu", stamped("imu", fields)),
         *topic("/tf_static", kind, [{"transforms": transforms}], STAMPS[:1]),
     ]
 
@@ -264,6 +267,32 @@ def test_wheels_without_their_measures_are_no_odometry_and_name_them(tmp_path: P
         opened(tmp_path, wheels(), odometry="/joint_states")
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("l_wheel_joint", "r_wheel_joint", "l_gripper_finger_joint", "r_gripper_finger_joint"),
+        ("wheel_left_joint", "wheel_right_joint", "caster_left_wheel_joint", "left_1_joint", "head_1_joint"),
+        ("wheel_FL_joint", "wheel_FR_joint"),
+        ("left_motor", "right_motor", "LeftElbow", "arm_right_2_joint", "front_left_steering"),
+    ],
+)
+def test_other_joints_with_a_side_are_no_wheels(names: tuple[str, ...], tmp_path: Path) -> None:
+    check(opened(tmp_path, wheels(*names), wheel_radius_m=RADIUS_M, track_m=TRACK_M), 0.05, 0.01)
+
+
+@pytest.mark.parametrize("names", [("l_gripper_finger_joint", "r_gripper_finger_joint"), ("torso_lift_joint",)])
+def test_joints_of_another_publisher_are_neither_wheels_nor_lost(names: tuple[str, ...], tmp_path: Path) -> None:
+    each = stamped("", [{"name": [*names], "velocity": np.ones(len(names))}] * COUNT, STAMPS + 1000)
+    arm = topic("/joint_states", "sensor_msgs/msg/JointState", each, STAMPS + 1000)
+    measures = {"wheel_radius_m": RADIUS_M, "track_m": TRACK_M}
+    log = opened(tmp_path, wheels(), arm, **measures)
+    check(log, 0.05, 0.01)
+    assert log.warnings == ["/joint_states: the odometry is its velocities, integrated."]
+    log = opened(tmp_path, arm, **measures)
+    assert log.odometry() is None
+    assert log.warnings == ["/joint_states: none of its messages gives a motion."]
+
+
 def test_velocities_are_taken_on_request_where_there_are_poses(tmp_path: Path) -> None:
     along = [pose(np.eye(4) + 5 * row / COUNT * np.eye(4, k=3)) for row in range(COUNT)]
     both = [{"child_frame_id": "base_link", "pose": {"pose": one}, "twist": {"twist": twist}} for one, twist in
@@ -275,6 +304,21 @@ def test_velocities_are_taken_on_request_where_there_are_poses(tmp_path: Path) -
     check(log, 0.05, 0.01)
 
 
+def accelerometer(name: str) -> Messages:
+    """As RealSense has it beside a topic of the gyroscope."""
+    fields = [{"linear_acceleration": {"z": 9.8}}] * COUNT
+    return topic(name, "sensor_msgs/msg/Imu", stamped("imu", fields))
+
+
+def test_an_accelerometer_turns_no_velocities(tmp_path: Path) -> None:
+    log = opened(tmp_path, twists(), accelerometer("/camera/accel/sample"))
+    check(log, 0.05, 0.01)
+    assert "turns by the gyroscope" not in " ".join(log.warnings)
+    for name in ("/camera/accel/sample", "/a"):
+        both = accelerometer(name), gyroscope(0.0, "/camera/gyro/sample")
+        check(opened(tmp_path, twists(scale=1.3), *both), 0.1, 0.01)
+
+
 def test_a_gyroscope_turns_velocities_less_its_bias_at_rest(tmp_path: Path) -> None:
     bad, bias = twists(scale=1.3), np.radians(1.0)
     with pytest.raises(AssertionError):
@@ -284,6 +328,86 @@ def test_a_gyroscope_turns_velocities_less_its_bias_at_rest(tmp_path: Path) -> N
     assert "less a bias of 1.0" in " ".join(log.warnings)
     with pytest.raises(AssertionError):
         check(opened(tmp_path, bad, gyroscope(bias), imu=""), 1.0, 0.05)
+
+
+def transforms(parent: str, child: str, values: np.ndarray) -> Messages:
+    """The same frame again and again."""
+    fields = []
+    for stamp, value in zip(STAMPS.tolist(), values, strict=True):
+        at = pose(value)
+        moved = {"translation": at["position"], "rotation": at["orientation"]}
+        one = {"header": header(stamp, parent), "child_frame_id": child, "transform": moved}
+        fields.append({"transforms": [message("geometry_msgs/msg/TransformStamped", **one)]})
+    return topic("/tf", "tf2_msgs/msg/TFMessage", fields)
+
+
+def images() -> Messages:
+    fields = [{"height": 48, "width": 64, "step": 64, "encoding": "mono8", "data": np.zeros(48 * 64, np.uint8)}] * COUNT
+    return topic("/camera/image", "sensor_msgs/msg/Image", stamped("camera", fields))
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_transforms_of_joints_and_mounts_leave_the_imu(turns: bool, tmp_path: Path) -> None:
+    """To velocities, and to visual odometry; where the transforms are the odometry it is not used."""
+    turned = matrices(np.zeros((COUNT, 3)), Rotation.from_rotvec(np.outer(SECONDS * turns, [0, 1, 0])))
+    joints = transforms("base_link", "wheel", turned)
+    log = opened(tmp_path, twists(scale=1.3), gyroscope(0.0), joints)
+    check(log, 0.1, 0.01)
+    assert "turns by the gyroscope" in " ".join(log.warnings)
+    log = opened(
+        tmp_path, images(), gyroscope(0.0), joints, transforms("base_link", "camera", turned[:1].repeat(COUNT, 0))
+    )
+    assert log.odometry() is None
+    assert (imu := log.imu()) is not None and imu.name == "/imu"
+    assert {topic.name: topic.part for topic in log.info().topics}["/imu"] == "imu"
+    log = opened(tmp_path, images(), gyroscope(0.0), transforms("odom", "base_link", POSES))
+    check(log, 0.05, 0.01)
+    assert log.imu() is None
+    assert {topic.name: topic.part for topic in log.info().topics}["/imu"] == ""
+
+
+def of_receiver(kind: str) -> Messages:
+    """Velocities in the world's axes, of TwistStamped with the rates of the body or without, or positions alone."""
+    if kind == "positions":
+        fields = [
+            {"pose": {"position": dict(zip("xyz", one[:3, 3].tolist(), strict=True)), "orientation": {"w": 1.0}}}
+            for one in POSES
+        ]
+        return topic("/place", "geometry_msgs/msg/PoseStamped", stamped("map", fields))
+    velocity = (POSES[:, :3, :3] @ (SPEED[:, None] * [1.0, 0.0, 0.0])[:, :, None])[:, :, 0]
+    rates = TURN if kind == "rates" else np.zeros(COUNT)
+    each = zip(velocity.tolist(), rates.tolist(), strict=True)
+    fields = [{"twist": {"linear": {"x": x, "y": y}, "angular": {"z": rate}}} for (x, y, _), rate in each]
+    return topic("/vel", "geometry_msgs/msg/TwistStamped", stamped("gps", fields))
+
+
+@pytest.mark.parametrize("kind", ["velocities", "rates", "positions"])
+@pytest.mark.parametrize("gyro", [False, True])
+def test_what_a_receiver_measures_has_no_heading(kind: str, gyro: bool, tmp_path: Path) -> None:
+    """Its velocities are not those of the body, turned by a gyroscope or not, and its positions alone no poses."""
+    beside = [gyroscope(0.0)] if gyro else []
+    log = opened(tmp_path, of_receiver(kind), *beside, fixes(0.02))
+    assert kind_of(log) == "gps"
+    log = opened(tmp_path, of_receiver(kind), *beside)
+    assert log.odometry() is None
+    assert "moves every way without turning" in " ".join(log.warnings)
+    name = "/place" if kind == "positions" else "/vel"
+    assert f"--odometry-topic {name} takes it" in " ".join(log.warnings)
+    assert opened(tmp_path, of_receiver(kind), *beside, odometry=name).odometry() is not None
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_what_moves_sideways_keeps_its_odometry(seed: int, tmp_path: Path) -> None:
+    """A platform that drives every way as it turns, a straight drive out and back, and one that hardly turns."""
+    rng = np.random.default_rng(seed)
+    way = rng.normal(0, 1, (12, 3)) * [0.7, 0.7, rng.choice([0.02, 0.3])]
+    moving = np.repeat(way, COUNT // 12, axis=0)
+    fields = [{"twist": {"linear": {"x": x, "y": y}, "angular": {"z": rate}}} for x, y, rate in moving.tolist()]
+    log = opened(tmp_path, topic("/twist", "geometry_msgs/msg/TwistStamped", stamped("base_link", fields)))
+    assert kind_of(log) == "twist"
+    there = [{"twist": velocities(1.5 * math.copysign(1.0, x), 0.0)} for x in moving[:, 0].tolist()]
+    log = opened(tmp_path, topic("/twist", "geometry_msgs/msg/TwistStamped", stamped("base_link", there)))
+    assert kind_of(log) == "twist"
 
 
 @pytest.mark.parametrize("sigma_m", [0.02, 0.5])

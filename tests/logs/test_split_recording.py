@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+import zstandard
 
 from tests.logs.drives import (
     START_NS,
@@ -55,6 +56,25 @@ def test_files_in_any_order_are_the_whole_drive(kind: str, tmp_path: Path) -> No
         np.testing.assert_array_equal(log.camera().body_from_camera, whole.camera().body_from_camera)
         assert log.info().messages == whole.info().messages
         assert log.warnings == whole.warnings
+
+
+@pytest.mark.parametrize("ending", ["", ".active"])
+def test_a_folder_of_a_split_ros1_bag_is_one_drive(ending: str, tmp_path: Path) -> None:
+    """The last part has another name while it is recorded, and keeps it where that ends with the power."""
+    folder = tmp_path / "monday"
+    folder.mkdir()
+    _, last = (KINDS["ros1"](folder, i, part) for i, part in enumerate((FIRST, SECOND)))
+    last.rename(f"{last}{ending}")
+    log = logs.open(folder)
+    assert (log.name, log.info().kind, log.info().path) == ("monday", "ros1", str(folder))
+    np.testing.assert_array_equal([f.decode().image for f in log.frames(log.stamps())], DRIVE.images)
+
+
+def test_a_folder_of_a_packed_ros1_bag_is_the_bag(tmp_path: Path) -> None:
+    bag = KINDS["ros1"](tmp_path, 0, slice(None))
+    (tmp_path / "drive.bag.zst").write_bytes(zstandard.compress(bag.read_bytes()))
+    bag.unlink()
+    np.testing.assert_array_equal(logs.open(tmp_path).stamps(), DRIVE.stamp_ns)
 
 
 def test_one_account_of_losses(tmp_path: Path) -> None:

@@ -113,14 +113,31 @@ def test_the_sources_of_odometry_are_all_poses_and_the_transforms() -> None:
     assert sources(*moving, static, *poses, odometry="/tf") == ["/tf"]
     assert sources(*moving, static, *poses, odometry="") == []
     topics = TopicChoice(odometry="/a")
-    assert select([*moving, static, *poses], topics, "a").tf == ()
-    assert [c.topic for c in select([*moving, *poses], topics, "a").tf] == [
-        "/tf",
-        "/arm/tf",
-    ]  # static ones may be there
-    chosen = select([*moving, static, *poses], TopicChoice(), "a")
-    assert chosen.with_odometry(chosen.sources[0]).tf == ()
-    assert len(chosen.with_odometry(moving[0].channel).tf) == 2
+    chosen = select([*moving, static, *poses], topics, "a")
+    assert [c.topic for c in chosen.tf] == ["/tf", "/arm/tf"]  # static ones may be there
+    assert len(chosen.with_odometry(chosen.sources[0], has_static=True, turned=False).tf) == 2
+    assert chosen.with_odometry(chosen.sources[0], has_static=False, turned=False).tf == ()
+    assert len(chosen.with_odometry(moving[0].channel, has_static=False, turned=False).tf) == 2
+
+
+def test_an_imu_and_a_lidar_are_read_beside_transforms_and_commands() -> None:
+    """Which may turn out to be no odometry; where it is another's, the IMU is left out again."""
+    image, imu, cloud = topic("/image"), topic("/imu", "imu"), topic("/points", "lidar")
+    twist = topic("/twist", "odometry", kind="geometry_msgs/msg/TwistStamped")
+    goal, moving = topic("/move_base_simple/goal", "odometry", 2), topic("/tf", "tf", 99, "tf2_msgs/msg/TFMessage")
+
+    def read(*found: Candidate, **choice: str) -> tuple[bool, bool]:
+        chosen = select(list(found), TopicChoice.model_validate(choice), "run.mcap")
+        return chosen.imu is not None, chosen.lidar is not None
+
+    for beside in ([], [moving], [goal], [moving, goal]):
+        assert read(image, imu, cloud, *beside) == (True, True), beside
+        assert read(image, imu, cloud, twist, *beside) == (True, False)
+        assert read(image, imu, cloud, topic("/pose", "odometry"), *beside) == (False, False)
+    assert read(image, imu, cloud, moving, odometry="/tf") == (False, False)
+    assert read(image, imu, cloud, moving, twist, odometry="/twist") == (True, False)
+    chosen = select([image, imu, moving], TopicChoice(), "run.mcap")
+    assert chosen.with_odometry(moving.channel, has_static=False, turned=False).imu is None
 
 
 def test_choice_overrides_and_empty_means_none() -> None:

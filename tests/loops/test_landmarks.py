@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -115,3 +116,18 @@ def test_derivatives_agree_with_differences() -> None:
     for axis in range(6):
         moved, _, _ = linearised(points, views @ se3.exp(step * np.eye(6)[axis]))
         np.testing.assert_allclose(by_view[..., axis], (moved - residual) / step, atol=1e-5)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.9])
+def test_a_few_depths_do_not_replace_the_landmarks_by_motion(share: float) -> None:
+    """In sunlight a depth camera measures a few of hundreds of features."""
+    rng = np.random.default_rng(3)
+    place, lens = scene(rng), camera()
+    poses = [pose(0.4 * step) for step in range(5)]
+    seen = [view(place, one, lens, rng) for one in poses]
+    depth_m = np.full(len(seen[2].points), np.nan, np.float32)
+    depth_m[: round(share * len(depth_m))] = 5.0
+    seen[2] = replace(seen[2], depth_m=depth_m)
+    found = landmarks_of(2, keyframes(poses), lens, seen.__getitem__, *matched(seen.__getitem__), EXACT)
+    assert found.known.sum() > 30
+    assert found.from_depth == (share > 0.5)

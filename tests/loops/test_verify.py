@@ -217,6 +217,9 @@ def test_matches_without_landmarks_and_in_one_corner() -> None:
     lens, frames, _, seen = drive(True)
     holes = [replace(f, depth_m=np.where(np.arange(len(f)) < 5, f.depth_m, np.float32(np.nan))) for f in seen]
     ledger = verify(proposals([(LAP + 3, 3)]), frames, lens, holes.__getitem__, EXACT)
+    assert (ledger.verdict, ledger.scale) == ([Verdict.ACCEPTED], ["odometry"]), "motion tells where depth does not"
+    stands = keyframes([pose(0.0)] * len(seen))
+    ledger = verify(proposals([(LAP + 3, 3)]), stands, lens, holes.__getitem__, EXACT)
     assert ledger.verdict == [Verdict.TOO_FEW_LANDMARKS]
     assert ledger.landmarks[0] <= 5
 

@@ -309,7 +309,9 @@ def test_a_map_on_a_store_is_condensed_as_a_folder_is(whole: Path, tmp_path: Pat
     with serving():
         there = [condensed(whole, "s3://bucket/small"), condensed("s3://bucket/small", "s3://bucket/smaller")]
         info = verb("map", "info", "s3://bucket/smaller", "--check", "--json").json
+        compared = verb("diff", "s3://bucket/small", "s3://bucket/smaller", "--json")
     assert there == here
+    assert compared.code == 0, compared.error
     assert info["problems"] == info["damaged_files"] == []
     assert [sorted(one["drives"]) for one in info["components"]] == [sorted(HALVES)]
 

@@ -207,3 +207,12 @@ def test_parts_without_poses_are_placed_from_their_firsts(tmp_path: Path) -> Non
     edge = "1 0 0 1 0 0 1 0 1\n"
     read = read_g2o(file(tmp_path, f"EDGE_SE2 0 1 {edge}EDGE_SE2 5 6 {edge}VERTEX_SE2 6 10 0 0\n"))
     np.testing.assert_allclose(read.graph.world_from_body[:, 0, 3], [0, 1, 9, 10])
+
+
+def test_what_is_fixed_may_be_no_pose_and_have_a_comment(tmp_path: Path) -> None:
+    lines = ["VERTEX_XY 7 1 2", "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1", "FIX 1  # anchor", ""]
+    assert read_g2o(file(tmp_path, "\n".join(lines))).held == 1
+    lines[2] = "FIX 7"
+    found = read_g2o(file(tmp_path, "\n".join(lines)))
+    assert found.held == 0
+    assert any("FIX 7 is left out" in text for text in found.warnings)

@@ -22,7 +22,7 @@ from tests.results.test_mcap import decode, of
 from vplog.data import USED, Gps, Trajectory, Verdict
 from vplog.errors import ResultError
 from vplog.geometry import se3
-from vplog.results import geo, mcap_read
+from vplog.results import foxglove, geo, mcap_read
 from vplog.results.contracts import TOPICS
 from vplog.results.geo import Earth
 from vplog.results.mcap import McapExtras, ReferenceBoxes, camera_topic, write_mcap
@@ -309,6 +309,29 @@ def test_a_run_without_metres_lies_on_earth_by_a_similarity() -> None:
     earth = earth_of(trajectory, fixes, None, metric=False)
     assert earth is not None
     np.testing.assert_allclose(geo.on_earth(earth, poses), where, atol=1e-5)
+    ahead = np.array([100.0, 0.0, 0.0])  # of the antenna
+    there = geo.on_earth(Earth((49.0, 8.0, 100.0), np.eye(4)), poses @ se3.pose(np.eye(3), ahead))
+    placed = Gps(trajectory.stamp_ns, there[:, 1], there[:, 0], there[:, 2], unknown, ahead)
+    earth = earth_of(trajectory, placed, None)
+    assert earth is not None
+    body = geo.on_earth(Earth((49.0, 8.0, 100.0), np.eye(4)), poses)
+    np.testing.assert_allclose(geo.on_earth(earth, poses)[:, :2], body[:, :2], atol=1e-6)
     still = np.zeros(len(enu))
     frozen = replace(fixes, latitude_deg=still, longitude_deg=still, altitude_m=still)
     assert earth_of(trajectory, frozen, None, metric=False) is None
+
+
+def test_the_antenna_comes_back_with_its_fixes(tmp_path: Path) -> None:
+    write(tmp_path / "r.mcap", replace(SHOWN, gps=replace(GPS, antenna_m=np.array([1.0, 2.0, 3.0]))))
+    for found in (mcap_read.read_fixes(tmp_path / "r.mcap"), mcap_read.read_pictures(tmp_path / "r.mcap").gps):
+        assert found is not None
+        np.testing.assert_array_equal(found.antenna_m, [1.0, 2.0, 3.0])
+
+
+def test_points_far_from_the_origin_are_told_to_the_millimetre() -> None:
+    """As in UTM, whose northings have seven digits."""
+    far = se3.pose(np.eye(3), np.array([[500_123.4567, 5_432_109.8765, 123.4], [500_124.5678, 5_432_111.2345, 123.5]]))
+    message = foxglove.points(0, far, foxglove.GREY)
+    origin = message.pose.position
+    stored = np.frombuffer(message.data, np.dtype([("position", "<f4", 3), ("color", "u1", 4)]))["position"]
+    np.testing.assert_allclose(stored + np.array([origin.x, origin.y, origin.z]), far[:, :3, 3], atol=1e-3)

@@ -233,3 +233,17 @@ def test_a_run_without_metres_is_evaluated_with_a_scale(finished: Path, drive: D
     standing.write_text("".join(f"{line[0]} 1 2 3 {' '.join(line[4:])}\n" for line in lines))
     with pytest.raises(TruthError, match="move"):
         evaluate(folder, str(standing))
+
+
+def test_fixes_without_an_altitude_give_metres() -> None:
+    """As NMEA's RMC: their up is anywhere."""
+    turn = np.linspace(0.0, np.pi, 200)
+    metres = 60.0 * np.stack([np.sin(turn), 1.0 - np.cos(turn), 0.0 * turn], 1)
+    stamp_ns = 100_000_000 * np.arange(200)
+    odometry = Odometry(stamp_ns, se3.pose(np.eye(3), 0.2 * metres), None, metric=False)
+    degrees = geodesy.geodetic(metres, (48.0, 11.0, 0.0))
+    noise = np.tile(np.diag([9.0, 9.0, 1e10]), (200, 1, 1))
+    found = in_metres(odometry, Gps(stamp_ns, degrees[:, 0], degrees[:, 1], 0.0 * turn, noise), SENSOR.camera)
+    assert found is not None
+    way = np.linalg.norm(np.diff(found.odom_from_body[:, :3, 3], axis=0), axis=1).sum()
+    assert abs(way / (60.0 * np.pi) - 1.0) < 0.05

@@ -140,6 +140,13 @@ def test_the_page_holds_views_of_the_solution_first(finished: Path, monkeypatch:
     assert content.closures.of(*USED)[rows].all()
 
 
+def test_a_run_without_metres_has_no_length_in_metres(finished: Path) -> None:
+    text = write_page(gather(finished, {"scale": "unknown"}))
+    assert "<figcaption>Speed in units of the run/s</figcaption>" in text
+    assert ledger(text)["unit"] == "units of the run"
+    assert not re.search(r"[0-9.] m\b|in m\b", re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL))
+
+
 def test_the_certificate_and_the_sigma_of_keyframes_are_told(page: str, finished: Path) -> None:
     assert read_run_json(finished / "run.json")["certificate"]["reason"].split(":")[0] in page
     covariance = tables.read_keyframe_covariance(finished / "keyframes.parquet")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import shlex
 import shutil
 import signal
 import time
@@ -16,11 +17,12 @@ import pytest
 from tests.cli.test_main import no_images, no_messages, no_odometry, wrong_magic
 from tests.forked import VPLOG, Forked
 from tests.verbs.test_resume import OPTIONS, QUICK
+from vplog.cli import main, parser
 from vplog.errors import LogError, ResultError, SettingsError
+from vplog.logs import TopicChoice
 from vplog.pipeline import Pipeline, load_pipeline
-from vplog.results.run_record import read_finished_run, write_run_json
-from vplog.run import run_folder
-from vplog.run.provenance import head
+from vplog.results.run_record import command_of, read_finished_run, write_run_json
+from vplog.run import provenance, run_folder
 from vplog.run.reference_library import build_library
 from vplog.run.run_folder import CacheOptions, staged_run
 from vplog.storage.folders import numbered
@@ -46,7 +48,7 @@ def complete(out: Path, logs: Path | list[Path], force: bool = False, joint: boo
     """A run that has nothing but its account."""
     paths = logs if isinstance(logs, list) else [logs]
     drives: dict[str, Any] = {path.stem: path for path in paths} if joint else {}
-    asked = head(Pipeline(), paths[0] if joint else paths, 1)
+    asked = provenance.head(Pipeline(), paths[0] if joint else paths, 1)
     if joint:
         asked |= run_folder.provenance.logs_of(paths)
     with staged_run(out, asked, paths, drives=drives, cache=CacheOptions(force=force)) as made:
@@ -64,7 +66,7 @@ def complete(out: Path, logs: Path | list[Path], force: bool = False, joint: boo
 
 
 def write(made: Path, paths: list[Path]) -> None:
-    account = {**head(Pipeline(), paths, 1), "finished": True, "inputs": run_folder.hash_inputs(paths)}
+    account = {**provenance.head(Pipeline(), paths, 1), "finished": True, "inputs": run_folder.hash_inputs(paths)}
     (made / "run.json").write_text(json.dumps(account))
 
 
@@ -208,7 +210,7 @@ def test_an_unfinished_run_of_another_log_is_not_dropped(log: Path, other: Path,
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, LogError, ResultError])
 def test_a_run_that_came_to_nothing_leaves_nothing(error: type[BaseException], log: Path, tmp_path: Path) -> None:
-    with pytest.raises(error), staged_run(tmp_path / "new" / "out", head(Pipeline(), log, 1), [log]):
+    with pytest.raises(error), staged_run(tmp_path / "new" / "out", provenance.head(Pipeline(), log, 1), [log]):
         raise error
     assert not (tmp_path / "new").exists()
 
@@ -216,7 +218,7 @@ def test_a_run_that_came_to_nothing_leaves_nothing(error: type[BaseException], l
 def test_a_run_whose_log_cannot_be_used_is_not_to_be_resumed(log: Path, other: Path, tmp_path: Path) -> None:
     """It would fail again; stages that it finished stay for other runs."""
     out = tmp_path / "out"
-    asked = {**head(Pipeline(), log, 1), **run_folder.provenance.logs_of([log, other])}
+    asked = {**provenance.head(Pipeline(), log, 1), **run_folder.provenance.logs_of([log, other])}
     with pytest.raises(LogError) as failed, staged_run(out, asked, [log, other], drives=["a", "b"]):
         written(out / ".cache" / "extract-0.stage", b"a result")
         raise LogError
@@ -228,7 +230,7 @@ def test_a_run_whose_log_cannot_be_used_is_not_to_be_resumed(log: Path, other: P
 def test_a_request_stays_while_it_is_gone_on_with(log: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     for stage in (True, False):
-        with pytest.raises(KeyboardInterrupt), staged_run(out, head(Pipeline(), log, 1), [log]):
+        with pytest.raises(KeyboardInterrupt), staged_run(out, provenance.head(Pipeline(), log, 1), [log]):
             if stage:
                 (out / ".cache" / "extract-0.stage").write_text("a result")
             raise KeyboardInterrupt
@@ -239,8 +241,8 @@ def test_a_run_killed_before_its_first_stage_and_interrupted_again_can_be_gone_o
     log: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    write_run_json(out / ".cache" / "run.json", {**head(Pipeline(), log, 1), "finished": False})
-    with pytest.raises(KeyboardInterrupt) as stopped, staged_run(out, head(Pipeline(), log, 1), [log]):
+    write_run_json(out / ".cache" / "run.json", {**provenance.head(Pipeline(), log, 1), "finished": False})
+    with pytest.raises(KeyboardInterrupt) as stopped, staged_run(out, provenance.head(Pipeline(), log, 1), [log]):
         raise KeyboardInterrupt
     assert stopped.value.__notes__ == [f"Go on with: vplog run --resume -o {out}"]
     assert (out / ".cache" / "run.json").is_file()
@@ -496,3 +498,17 @@ def test_caches_of_an_unfinished_run_of_several_go_with_it(tmp_path: Path) -> No
     patterns = run_folder._results_in(tmp_path, None, {"after": tmp_path / "after.mcap"}, resumable=True)
     found = {path.relative_to(tmp_path).as_posix() for pattern in patterns for path in tmp_path.glob(pattern)}
     assert found == {".cache/before/extract-000000-0.stage"}
+
+
+def test_the_command_of_a_run_has_all_that_it_was_given(tmp_path: Path) -> None:
+    """So that a run with decisions differs from it in these alone."""
+    changed = ["places.references=3", "gps.use=true"]
+    pipeline = load_pipeline("default", [*changed, "decisions.file=d.csv"])
+    topics = TopicChoice(image="/a b", odometry="visual", masks={"": tmp_path / "m.png"})
+    words = provenance.arguments([tmp_path / "1.bag", tmp_path / "2.bag"], topics, pipeline, tmp_path / "library")
+    command = command_of({"arguments": words}, "out", "--decisions", "d.csv")
+    given = main._parser().parse_args(shlex.split(command)[1:])
+    assert parser.topics_of(given) == topics
+    assert (given.logs, given.one_drive) == ([tmp_path / "1.bag", tmp_path / "2.bag"], True)
+    assert given.library == tmp_path / "library"
+    assert parser.pipeline_of(given) == load_pipeline("default", changed)

@@ -107,7 +107,9 @@ def test_a_log_on_s3_reads_as_the_file_does(drive: Demo, bucket: str) -> None:
     assert there.name == "drive"
 
 
-def test_a_run_goes_from_s3_to_s3_and_is_evaluated_there(tiny: Demo, bucket: str, verb: Callable[..., Said]) -> None:
+def test_a_run_goes_from_s3_to_s3_and_is_evaluated_there(
+    tiny: Demo, drive: Demo, bucket: str, verb: Callable[..., Said]
+) -> None:
     put(tiny.log, f"{bucket}/two")
     found = verb("run", f"{bucket}/two/drive.mcap", "-o", f"{bucket}/runs/a", "--threads", 2, "--json", *QUICK).json
     assert found["run"] == f"{bucket}/runs/a"
@@ -121,6 +123,11 @@ def test_a_run_goes_from_s3_to_s3_and_is_evaluated_there(tiny: Demo, bucket: str
     assert verb("evaluate", f"{bucket}/runs/a", "--truth", truth, "--json").json["closures"]["keyframes"] > 20
     assert "Cannot read s3://" in verb("evaluate", f"{bucket}/runs/a", "--truth", f"{truth}.not").error
     assert verb("evaluate", f"{bucket}/runs/a", "--truth", "gps", "--json").json["ate_after"]["rmse_m"] > 0
+    other = verb("run", drive.log, "-o", f"{bucket}/runs/a", "--threads", 2, *QUICK).error
+    assert f"{bucket}/runs/a is the run of" in other
+    assert json.loads((located(f"{bucket}/runs/a") / "run.json").read_text())["log"] == found["log"]
+    for words in (("ask",), ("report",), ("explain", "--closure", 0)):
+        assert "nothing is written beside it" in verb(words[0], f"{bucket}/runs/a", *words[1:]).error
 
 
 def test_a_web_server_is_asked_for_parts(drive: Demo, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ import numpy as np
 
 from vplog.data import Verdict
 from vplog.results import tables
+from vplog.results.run_record import read_run_json
 from vplog.run.decisions import read_decisions
 
 if TYPE_CHECKING:
@@ -46,6 +48,9 @@ def test_questions_are_asked_and_once_answered_the_next_ones(
     answered = first["questions"][0]["closures"]
     assert rows.isdisjoint(answered)
     assert again["decided"] == len(answered)
+    words = shlex.split(again["command"])
+    log, library = read_run_json(finished / "run.json")["log"], ["--decisions", str(path)]
+    assert words == ["vplog", "run", log, "-o", str(finished), *library], "all settings are the defaults"
     assert '"another, like it"' in path.read_text()
     pairs = sorted((int(closures.query[row]), int(closures.match[row])) for row in answered)
     assert read_decisions(path, keyframes).rejected == pairs

@@ -128,3 +128,14 @@ def test_two_maps(halves: Path, verb: Callable[..., Said], tmp_path: Path) -> No
     assert "drives lost" in verb("diff", halves, less).out
     assert verb("diff", halves, less, "--fail-on", "drives<0").code == 1
     assert verb("diff", halves, tmp_path).code == 2
+
+
+def test_a_run_without_metres_is_compared_by_its_shape(finished: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    trajectory, odometry = tables.read_trajectory(out / "trajectory.parquet")
+    own = Trajectory(trajectory.stamp_ns, se3.stretched(trajectory.world_from_body, 0.1))
+    tables.write_trajectory(out / "trajectory.parquet", own, odometry, tables.TableMetadata({}, ""))
+    assert diff(finished, out)["trajectory"]["rmse_m"] > 1.0
+    write_run_json(out / "run.json", read_run_json(out / "run.json") | {"scale": "unknown"})
+    assert diff(finished, out)["trajectory"]["rmse_m"] < 1e-6

@@ -172,7 +172,7 @@ def test_check_is_one_line_and_a_status(verb: Any, drive: Path, tmp_path: Path) 
 
 def test_the_command_runs_with_what_was_asked_for(drive: Path, tmp_path: Path) -> None:
     file = tmp_path / "with space.yaml"
-    topics = TopicChoice(image="/cam/image/compressed", depth="", calibration_file=file)
+    topics = TopicChoice(image="/cam/image/compressed", cameras=("/rear",), depth="", calibration_file=file)
     words = shlex.split(command(drive, topics))
     arguments = main._parser().parse_args(words[1:])
     assert parser.topics_of(arguments) == topics

@@ -11,7 +11,8 @@ from tests.logs.drives import Drive, ros_messages, write_ros2
 from tests.logs.test_datasets import kitti, poses
 from vplog.data import Gps, Trajectory
 from vplog.errors import LogError, TruthError
-from vplog.verbs.evaluate_run import TruthOptions, log_truth
+from vplog.logs import TopicChoice
+from vplog.verbs.evaluate_run import TruthOptions, log_truth, recorded_topics
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -43,3 +44,10 @@ def test_a_log_without_either_is_one_line(tmp_path: Path) -> None:
         log_truth({"log": str(path)}, None, TruthOptions())
     with pytest.raises(LogError, match="no longer exists"):
         log_truth({"log": str(tmp_path / "gone")}, None, TruthOptions())
+
+
+def test_the_truth_of_a_log_is_read_with_the_topics_of_the_run() -> None:
+    record = {"topics": {"gps": "/rtk/fix", "image": "/front", "calibration_file": "/gone.yaml"}}
+    assert (recorded_topics(record, None).gps, recorded_topics(record, None).calibration_file) == ("/rtk/fix", None)
+    other = recorded_topics(record, TopicChoice(gps="/other"))
+    assert (other.gps, other.image) == ("/other", "/front")

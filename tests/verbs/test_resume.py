@@ -449,6 +449,8 @@ def test_nothing_to_resume_is_one_line(log: Path, whole: Path, tmp_path: Path, v
         ["--gps"],
         ["--no-cache"],
         ["--image-topic", "/a"],
+        ["--camera-height-m", "1.5"],
+        ["--start", "1"],
         ["--decisions", "d.csv"],
     ):
         said = verb("run", "--resume", "-o", out, *option)

@@ -137,7 +137,7 @@ def run_batch(
         "warnings": [
             *failures_warning,
             *([] if joined else damage_warnings(store)),
-            *_duplicate_recordings(outcomes, [one.record["inputs"] for one in plan]),
+            *_duplicate_recordings(outcomes, [one.record["inputs"] for one in plan], known),
             *_other_versions([record for drive, record in known.items() if drive not in done], common),
         ],
     }
@@ -167,15 +167,21 @@ def _write_failures(store: Store, done: Mapping[str, DriveState]) -> list[str]:
     return []
 
 
-def _duplicate_recordings(outcomes: Sequence[DriveState], inputs: Sequence[dict[str, str]]) -> list[str]:
-    """A warning for each recording that the map has under several names: closures between them mean nothing."""
-    common: dict[tuple[str, ...], list[DriveState]] = {}
+def _duplicate_recordings(
+    outcomes: Sequence[DriveState], inputs: Sequence[dict[str, str]], known: Mapping[str, Mapping[str, Any]]
+) -> list[str]:
+    """A warning for each recording of a batch that the map has under several names, be it by an earlier batch: closures
+    between them mean nothing."""
+    common: dict[tuple[str, ...], dict[str, str]] = {}
     for one, content in zip(outcomes, inputs, strict=True):
         if content and one.state != "failed" and "://" not in one.log:  # of those the bytes are not known
-            common.setdefault(tuple(sorted(content.values())), []).append(one)
+            common.setdefault(tuple(sorted(content.values())), {})[one.drive] = one.log
+    for drive, record in known.items():
+        if (content := tuple(sorted(record["inputs"].values()))) in common:
+            common[content].setdefault(drive, record["log"])
     return [
-        f"{these[0].log} and {these[1].log} are the same recording, byte for byte: it is in the map as "
-        f"{' and '.join(one.drive for one in these)}."
+        f"{' and '.join(list(these.values())[:2])} are the same recording, byte for byte: it is in the map as "
+        f"{' and '.join(these)}."
         for these in common.values()
         if len(these) > 1
     ]

@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 from vplog.batch.ray_engine import RayEngine
 from vplog.batch.worker import DriveState, Outcome, Task, compute_drive
-from vplog.errors import SettingsError, VplogError
+from vplog.errors import SettingsError, VplogError, is_of_disk
 from vplog.execution.process_limits import OVER_MEMORY, OVER_TIME
 from vplog.execution.process_pool import OwnProcesses, ProcessExpired
 from vplog.storage.urls import shown
@@ -111,7 +111,7 @@ def _outcome_of(engine: Engine, task: Task, future: Future[Outcome]) -> Outcome:
     except OSError as error:  # no process more, or no room for what a machine brings
         return Outcome(f"Cannot begin or fetch the drive: {error.strerror or error}.", "io")
     except VplogError as error:
-        return Outcome(str(error), "input")
+        return Outcome(str(error), "io" if is_of_disk(error) else "input")
     except Exception as error:  # what a worker cannot even begin with
         return Outcome(f"Internal error: {type(error).__name__}: {' '.join(str(error).split())[:200]}.", "internal")
     return outcome

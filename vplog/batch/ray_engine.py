@@ -19,7 +19,7 @@ from typing import Any, cast
 
 from vplog.batch.ray_cluster import ClusterHead, connected, watched_head
 from vplog.batch.worker import Outcome, Task, compute_drive, made_by
-from vplog.errors import SettingsError, VplogError
+from vplog.errors import SettingsError, VplogError, is_of_disk
 from vplog.run.feature_extraction import ExtractionPart, compute_part, missing_parts, parts_of, put_part
 from vplog.storage.remote_path import located, stands_for
 from vplog.storage.scratch import Bytes, files_in, packed, pieces, scratch, unpacked, write_pieces
@@ -300,7 +300,7 @@ def compute_remote_drive(
             stages = _put_files(cache) if task.keep_cache and task.cache is None else ()
             return RemoteOutcome(**ended, files=() if outcome.sent else _put_files(made), cache=stages)
     except VplogError as error:
-        return RemoteOutcome(str(error), "input", worker=where)
+        return RemoteOutcome(str(error), "io" if is_of_disk(error) else "input", worker=where)
     except OSError as error:
         why = f"Cannot write {error.filename or 'a file'} on {where}: {error.strerror}."
         return RemoteOutcome(why, "io", worker=where)

@@ -14,7 +14,7 @@ import numpy as np
 
 from vplog import logs
 from vplog.data import Keyframes
-from vplog.errors import VplogError, causes
+from vplog.errors import VplogError, causes, is_of_disk
 from vplog.execution.cores import limited
 from vplog.execution.execution import Execution
 from vplog.execution.process_limits import process_limits
@@ -150,7 +150,8 @@ def compute_drive(task: Task) -> Outcome:
     except UnreachableError as problem:
         error, fault = str(problem), "network"
     except VplogError as problem:
-        error, fault = str(problem), "network" if _is_of_network(task.log, problem) else "input"
+        fault = "network" if _is_of_network(task.log, problem) else "io" if is_of_disk(problem) else "input"
+        error = str(problem)
     except MemoryError:
         error, fault = "Out of memory. Use fewer --jobs, or a machine with more.", "memory"
     except OSError as problem:

@@ -174,6 +174,8 @@ class _Drives:
             query_traversal = self.traversal_of(self.query, self.query_log, known.query_frames)
         warnings = list(dict.fromkeys(map_traversal.warnings + query_traversal.warnings))
         if isinstance(source, list):
+            if options.library_size is not None or options.library_seed:
+                raise SettingsError(f"{self.library} is a saved library: leave out --library-size and --library-seed.")
             return map_traversal, query_traversal, source, warnings
         itself = self.query_log is self.map_log
         size = options.library_size or (None if itself else PAPER_SIZE if source is not None else MOST)

@@ -11,11 +11,15 @@ from vplog.cli import parser, printing
 from vplog.cli.parser import call, option, place
 from vplog.cli.printing import print_result
 from vplog.cli.progress import Progress
+from vplog.errors import SettingsError
 from vplog.execution.execution import Execution
 
 
 def compare(arguments: argparse.Namespace) -> None:
     """Compare recognisers on two drives, or on one that revisits places."""
+    ignored = [one for one in arguments.set if one.partition(".")[0] not in ("features", "places", "sequence")]
+    if ignored:
+        raise SettingsError(f"--set {ignored[0]}: only features, places and sequence count here; see --library-size.")
     with Progress(arguments) as progress:
         done = call(api.compare, arguments, progress=progress)
     print_result(arguments, done.record, printing.print_comparison)

@@ -11,20 +11,20 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from vplog import api
-from vplog.cli import parser, printing
+from vplog.cli import parser, printing, results
 from vplog.cli.benchmark import add_studies
 from vplog.cli.maps import add_maps
 from vplog.cli.parser import Parser, flag, option, place
 from vplog.cli.printing import print_json, print_result, print_status
 from vplog.cli.progress import Progress, events_of
 from vplog.cli.results import add_results
-from vplog.errors import LogError, ResultError, VplogError, causes, plural, was_interrupted
+from vplog.errors import LogError, ResultError, SettingsError, VplogError, causes, plural, was_interrupted
 from vplog.execution.cores import available, limited
 from vplog.execution.execution import Execution
 from vplog.storage.urls import without_secrets
@@ -97,16 +97,25 @@ def _local_copies(arguments: argparse.Namespace) -> Iterator[None]:
     if not any("://" in str(place) for place in places.values()):
         yield
         return
-    from vplog.storage.remote_path import local_copy, local_output
+    from vplog.storage.remote_path import RemotePath, local_copy, local_output
+
+    writing = arguments.verb in (results.explain, results.ask, results.report)
+    beside = writing and not getattr(arguments, "no_picture", False)
+    if beside and isinstance(places["run"], RemotePath) and places["output"] is None:
+        raise SettingsError(f"{places['run']} is read alone, so nothing is written beside it. Name a place with -o.")
+
+    def copied(place: Path | RemotePath) -> AbstractContextManager[Path | RemotePath]:
+        """A map is read where it is."""
+        return nullcontext(place) if (place / "map.json").is_file() else local_copy(place)
 
     with ExitStack() as stack:
         for name, place in places.items():
             if place is None:
                 continue
             if name == "runs":
-                arguments.runs = [stack.enter_context(local_copy(run)) for run in place]
+                arguments.runs = [stack.enter_context(copied(run)) for run in place]
             else:
-                setattr(arguments, name, stack.enter_context((local_output if name == "output" else local_copy)(place)))
+                setattr(arguments, name, stack.enter_context((local_output if name == "output" else copied)(place)))
         yield
 
 
@@ -237,12 +246,12 @@ def _request(arguments: argparse.Namespace) -> tuple[list[Path], Pipeline, Path 
 
     if "://" in str(arguments.shown):
         arguments.refuse("argument --resume: a run to a URL is uploaded when finished; start it again")
-    fixed = ("pipeline", "set", "library", "gps", "false_rate", "decisions", "mask")
-    names = [name for name in vars(arguments) if name in fixed or name.endswith(("_topic", "_file"))]
+    fixed = ("pipeline", "set", "library", "gps", "false_rate", "decisions", "mask", "one_drive")
+    names = [name for name in vars(arguments) if name in fixed or name.endswith(("_topic", "_file", "_m", "_s"))]
     given = [name for name in names if getattr(arguments, name) not in (None, [], False, "default")]
     if given or not arguments.cache:
-        name = given[0].replace("calibration_file", "calibration").replace("_", "-") if given else "no-cache"
-        arguments.refuse(f"argument --resume: a run is resumed as it began; leave out --{name}")
+        name = given[0].removesuffix("_s").replace("calibration_file", "calibration") if given else "no-cache"
+        arguments.refuse(f"argument --resume: a run is resumed as it began; leave out --{name.replace('_', '-')}")
     request = resume_request(arguments.output, arguments.logs)
     arguments.one_drive = not request.several
     arguments.force = True  # whether it may replace results was settled when it began

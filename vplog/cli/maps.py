@@ -118,10 +118,18 @@ def redescribe_map(arguments: argparse.Namespace) -> None:
 
 def batch(arguments: argparse.Namespace) -> None:
     """Compute many recorded drives into one growing map, each drive in its own process, here or on a Ray cluster."""
+    if arguments.dry_run and arguments.metrics is not None:
+        raise SettingsError("--dry-run computes nothing that --metrics could count. Leave out one of them.")
+    if arguments.cost_per_cpu_hour is not None and not arguments.dry_run:
+        raise SettingsError("--cost-per-cpu-hour is for --dry-run. Leave it out, or add that.")
     with Progress(arguments) as progress:
         found = call(api.batch, arguments, progress=progress, on_drive=progress.print_drive)
     if arguments.dry_run:
         print_result(arguments, found, printing.print_dry_run)
+        if failed := [one["log"] for one in found["drives"] if one["state"] == "failed"]:
+            raise ResultError(
+                f"{len(failed)} of {plural(len(found['drives']), 'drive')} would fail: {failed[0]} first."
+            )
         return
     if arguments.metrics is not None:
         from vplog.batch.metrics import write_metrics

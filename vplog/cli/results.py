@@ -106,6 +106,8 @@ def diff(arguments: argparse.Namespace) -> None:
     maps = [(run / "map.json").is_file() for run in runs]
     if any(maps) and (not all(maps) or arguments.output or arguments.truth):
         arguments.refuse("a map is compared with a map, without --truth and -o")
+    if not arguments.truth and any(getattr(arguments, name) is not None for name in _TRUTH_OPTIONS):
+        arguments.refuse("--distance-m, --heading-deg, --align and --truth-offset-s need a truth: give --truth")
     with one_stage(arguments, "compare"):
         truth = arguments.truth, parser.topics_of(arguments), _truth_options(arguments)
         found = diff_maps(runs[0], runs[1]) if all(maps) else diff_runs(runs[0], runs[1], *truth)
@@ -147,11 +149,13 @@ def open_run(arguments: argparse.Namespace) -> None:
             raise ResultError(f"{opened.viewer} did not open {opened.path}. Choose another with --with.")
 
 
+_TRUTH_OPTIONS = ("distance_m", "heading_deg", "align", "truth_offset_s")
+
+
 def _truth_options(arguments: argparse.Namespace) -> TruthOptions:
     from vplog.verbs.evaluate_run import TruthOptions
 
-    names = ("distance_m", "heading_deg", "align", "truth_offset_s")
-    return TruthOptions(**{name: value for name in names if (value := getattr(arguments, name)) is not None})
+    return TruthOptions(**{name: value for name in _TRUTH_OPTIONS if (value := getattr(arguments, name)) is not None})
 
 
 def _add_truth_options(verb: argparse.ArgumentParser) -> None:
@@ -238,7 +242,7 @@ def _add_explain(sub: argparse.ArgumentParser) -> None:
     which: Any = sub.add_mutually_exclusive_group(required=True)
     text = "row of closures.parquet, or its two keyframes, by row or by stamp in ns"
     option(which, "--closure", _closure, "K|QUERY:MATCH", text)
-    flag(which, "--worst", "the closure that the solved trajectory is furthest from")
+    flag(which, "--worst", "the used closure that the solved trajectory is furthest from, else the nearest miss")
     option(sub, "-o --output", parser.output_file, "PICTURE.png", "picture, .png or .svg (default: RUN/closure-K.png)")
     option(sub, "--log", place, "LOG", "the run's log, where it has moved since")
     flag(sub, "--no-picture", "no picture; the log is not needed")

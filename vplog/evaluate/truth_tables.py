@@ -37,9 +37,9 @@ def read_table(path: Path) -> tuple[list[str], list[tuple[str, str, str]]]:
     lines = read_lines(path, (["query", "match"], ["image", "label"]))
     _, header = next(lines, ("", []))
     rows = [(first, second, where) for where, (first, second) in lines]
-    for first, _, where in rows:
-        if not first:
-            raise TruthError(f"{where} has an empty first field. {_CSV}")
+    for first, second, where in rows:
+        if not first or (not second and header == ["image", "label"]):
+            raise TruthError(f"{where} has an empty {'label' if first else 'first field'}. {_CSV}")
     if not rows:
         raise TruthError(f"{path} holds no pair. {_CSV}")
     return header, rows
@@ -64,6 +64,8 @@ def read_lines(
                     raise error(f"{path}:{number} is longer than {_LINE_LIMIT} characters. {form}")
                 if not line.strip():
                     continue
+                if line.count('"') % 2:
+                    raise error(f"{path}:{number} has a quoted field of several lines, which is not read. {form}")
                 cells = [cell.strip() for cell in next(csv.reader([line]))]
                 if not width and headers and cells not in headers:
                     raise error(f"{path}:{number} is not the header. {form}")

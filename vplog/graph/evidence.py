@@ -492,9 +492,10 @@ class Displacements:
     def near(self, room: float) -> list[list[int]]:
         """Earlier claims with which each agrees more likely than it is anywhere in the room."""
         part, near = self._chain.part, [[] for _ in range(self.count)]
-        one, two = np.triu_indices(self.count, 1)
+        each = np.minimum(np.arange(self.count), _EARLIER)
+        two = np.repeat(np.arange(self.count), each)
+        one = np.arange(len(two)) - np.repeat(np.cumsum(each) - np.arange(self.count), each)
         comparable = (part[self._a[one]] == part[self._a[two]]) & (part[self._b[one]] == part[self._b[two]])
-        comparable &= two - one <= _EARLIER
         one, two = one[comparable], two[comparable]
         for start in range(0, len(one), _PAIRS):
             rows = slice(start, start + _PAIRS)

@@ -169,7 +169,7 @@ def world_from_enu(poses: Floats, fixes: Fixes, weight: Floats) -> Floats:
     target, share = antennas(poses, fixes), weight / weight.sum()
     middle, target_middle = share @ fixes.enu_m, share @ target
     spread = (share[:, None] * (target - target_middle)).T @ (fixes.enu_m - middle)
-    variance = float(np.median(np.trace(fixes.covariance, axis1=1, axis2=2))) / 3.0
+    variance = float(np.median(np.trace(fixes.covariance[:, :2, :2], axis1=1, axis2=2))) / 2.0
     vertical = (poses[fixes.row, :3, :3] @ fixes.up).mean(0)
     spread[:, 2] += vertical * variance / (_VERTICAL_SIGMA**2 * weight.sum())
     left, _, right = np.linalg.svd(spread)

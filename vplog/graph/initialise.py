@@ -141,7 +141,7 @@ def initial_poses(factors: Factors, weight: Floats, bound: float = np.inf) -> Fl
     graph = factors.graph
     robust = is_loop(graph)
     candidates = [graph.world_from_body, odometry_chain(graph)[0]]
-    linear = relaxed(factors, weight, candidates[1]) if (robust & (weight > 0)).any() else None
+    linear = relaxed(factors, weight, candidates[1]) if (~graph.odometry & (weight > 0)).any() else None
     if linear is not None:
         candidates.append(linear)
     costs = []

@@ -21,26 +21,27 @@ _LEAST = np.array([0.001] * 3 + [0.01] * 3)
 
 def pieces_placed(graph: PoseGraph, broken: Ints) -> PoseGraph:
     """The graph with its initial poses, and the motion of the odometry edges `broken`, as the largest set of closures
-    has them that agree with each other, where these are at as many places as join two drives. The edge then has ten
-    times their spread: odometry does not speak against them, and hardly for them. Other pieces stay where they are."""
+    has them that agree with each other, where these are at as many places as join two drives, or known inliers. The
+    edge then has ten times their spread: odometry does not speak against them, and hardly for them. Other pieces stay
+    where they are."""
     stops = np.append(broken[1:] + 1, len(graph.world_from_body))[: len(broken)]
     for edge, stop in zip(broken.tolist(), stops.tolist(), strict=True):
-        leads = is_loop(graph) & (graph.a <= edge) & (graph.b > edge) & (graph.b < stop)
+        leads = ~graph.odometry & (graph.a <= edge) & (graph.b > edge) & (graph.b < stop)
+        vouched = leads & ~is_loop(graph)  # by a person
         if leads.any():
-            graph = _placed(graph, edge, np.flatnonzero(leads))
+            graph = _placed(graph, edge, np.flatnonzero(vouched if vouched.any() else leads), bool(vouched.any()))
     return graph
 
 
-def _placed(graph: PoseGraph, edge: int, loops: Ints) -> PoseGraph:
-    """All poses behind an odometry edge moved as these loops across it have it."""
+def _placed(graph: PoseGraph, edge: int, loops: Ints, vouched: bool) -> PoseGraph:
+    """All poses behind an odometry edge moved as these loops across it have it, at enough places unless `vouched`."""
     poses = graph.world_from_body.copy()
     others = np.flatnonzero(np.arange(len(graph.a)) != edge)
     members, _ = PcmSettings().consistent(subgraph(graph, np.arange(len(poses)), others), loops - 1)
     chosen = members + 1
     rule = JoinSettings()
-    if (
-        min(spaced_apart(ends[chosen].astype(np.int64), rule.spacing) for ends in (graph.a, graph.b))
-        < rule.least_closures
+    if min(spaced_apart(ends[chosen].astype(np.int64), rule.spacing) for ends in (graph.a, graph.b)) < (
+        1 if vouched else rule.least_closures
     ):
         return graph
     first_from_query = se3.between(poses[edge + 1], poses[graph.b[chosen]])

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from vplog.data import Camera, Floats
+from vplog.data import Camera, Floats, Odometry
+from vplog.geometry import se3
 from vplog.logs.formats.container import Notes
 from vplog.logs.messages.records import CalibrationMessage
-from vplog.logs.tf_odometry import FrameTree
+from vplog.logs.tf_odometry import BODIES, FrameTree, frame_name
 
 _LENSES = {
     "plumb_bob": ("plumbbob", "radtan", "radialtangential", "brownconrady", "rationalpolynomial", ""),
@@ -27,6 +28,8 @@ BODY = "base_link"
 """The body's frame where the odometry names none: ROS REP 105."""
 _AHEAD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """body_from_camera of a camera that looks along the body's x, upright: ROS REP 103."""
+_UP = 0.9
+"""Least z of an axis that points up, within 25 degrees: cameras are pitched by less."""
 _LARGEST_PX = 1e7
 """px; a longer focal length is damage: telescopes have 1e6."""
 _SAME_PX = 1.0
@@ -120,6 +123,25 @@ def _fit(camera: Camera, matrix: Floats, calibration: CalibrationMessage, notes:
         return replace(camera, distortion_model="none", distortion=np.zeros(0))
     notes.add(f"The images of {camera.name} have {sizes}; the matrix is scaled to the images.")
     return replace(camera, matrix=resized(x, y) @ matrix)
+
+
+def optical_frame(tree: FrameTree, body: str, frame: str, odometry: Odometry | None, notes: Notes) -> str:
+    """Frame of a camera, z ahead. Where `frame`, that of its images, has x ahead, as of drivers that know no other and
+    are placed without a turn, it is added to the tree, with a note. z is up in a base_link (REP 103), unless it is the
+    way that the odometry mostly goes."""
+    placed = tree.between(body, frame) if body.rsplit("/", 1)[-1] in BODIES and "optical" not in frame else None
+    if placed is None or placed[2, 2] < _UP:
+        return frame
+    if odometry is not None:
+        steps = np.abs(se3.between(odometry.odom_from_body[:-1], odometry.odom_from_body[1:])[:, :3, 3]).sum(0)
+        if np.argmax(steps) == 2 and steps.any():
+            return frame
+    notes.add(
+        f"{frame} looks up by the static transforms; it is taken for a frame with x ahead (REP 103), not an optical "
+        "one. Where the camera does look up, give its mount with --calibration."
+    )
+    tree.add(frame_name(frame), optical := f"{frame_name(frame)} (optical)", _AHEAD)
+    return optical
 
 
 def body_from_camera(tree: FrameTree, body: str, frame: str, notes: Notes, ahead: bool = False) -> Floats:

@@ -41,6 +41,7 @@ class LogContent:
     """Calibrations that are set and differ from the one before: the first is the camera's, a later one that of images
     behind its stamp."""
     right_calibration: CalibrationMessage | None
+    depth_calibration: CalibrationMessage | None
     odometry: Odometry | None
     frames: list[str]
     """Names of the odometry's frames, from the one that stands still to the body; empty names where it has none."""
@@ -106,13 +107,14 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     found = read_sources(read, chosen) | other_sources(gps, contents, chosen)
     sources = rank_sources(found, read.images["image"].finish(Notes())[0])
     rates_hz = read.rates_hz()
-    chosen = chosen.with_odometry(choose_odometry(sources, chosen, notes))
-    sources = [(replace(one, used=source == chosen.odometry), source) for one, source in sources]
+    static, source = read.dynamic.static(), choose_odometry(sources, chosen, notes)
+    chosen = chosen.with_odometry(source, bool(static), source is None or found[source].kind == "twist")
+    sources = [(replace(one, used=known == source), known) for one, known in sources]
     read.poses = {source: track for source, track in read.poses.items() if source == chosen.odometry}
     for (reason, topic), runs in read.lost.items():
         if topic in {channel.topic for channel in chosen.channels}:
             notes.account.add(reason, {topic: runs.messages}, (topic, 0), runs.spans)
-    tree = FrameTree([*(read.dynamic.static() if chosen.tf else ()), *read.transforms])
+    tree = FrameTree([*static, *read.transforms])
     if tree.dropped:
         notes.add(f"{plural(tree.dropped, 'static transform')} with NaN or without a rotation left out.")
     stamp_ns, places, rows = read.images["image"].finish(notes)
@@ -145,8 +147,9 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     imu = (read.imu.frame, *read.imu.finish(notes)) if chosen.imu is not None and odometry is None else None
     calibrations = read.calibrations(chosen.camera_info, "image", notes)
     right_calibration = next(iter(read.calibrations(chosen.right_info, "right", notes)), None)
+    depth_calibration = next(iter(read.calibrations(chosen.depth_info, "depth", notes)), None)
     return LogContent(
         stamp_ns, places, read.images["image"].stream, rows, scan_ns, scan_places, companions, calibrations,
-        right_calibration, odometry, frames, gps, imu, tree, read.clock_offset_ms(), chosen,
+        right_calibration, depth_calibration, odometry, frames, gps, imu, tree, read.clock_offset_ms(), chosen,
         [source for source, _ in sources], rates_hz,
     )  # fmt: skip

@@ -177,9 +177,9 @@ class _Part(NamedTuple):
     contents: Contents
 
 
-def open_drive(paths: Sequence[Path], topics: TopicChoice | None = None) -> RecordedLog:
-    """One drive recorded in several files, in any order. Raises LogError where they overlap in time, lie far apart,
-    differ in kind or have no topic in common."""
+def open_drive(paths: Sequence[Path], topics: TopicChoice | None = None, folder: Path | None = None) -> RecordedLog:
+    """One drive recorded in several files, in any order, which has the name of the first, or of their `folder`. Raises
+    LogError where they overlap in time, lie far apart, differ in kind or have no topic in common."""
     if len(paths) == 1:
         return open(paths[0], topics)
     paths = [located(path) for path in paths]
@@ -199,7 +199,8 @@ def open_drive(paths: Sequence[Path], topics: TopicChoice | None = None) -> Reco
         raise LogError(f"None of the {len(paths)} files can be read. {notes.account.sentences[0]}")
     parts = _in_order_of_time(parts)
     first, chain = parts[0], Chain([part.container for part in parts], notes)
-    return _recorded(first.path, _name(first.path), first.kind, chain, notes, topics or TopicChoice())
+    path, name = (first.path, _name(first.path)) if folder is None else (folder, folder.resolve().name)
+    return _recorded(path, name, first.kind, chain, notes, topics or TopicChoice())
 
 
 def _in_order_of_time(parts: list[_Part]) -> list[_Part]:
@@ -322,12 +323,14 @@ def _files_below(path: Path) -> list[Path]:
 
 def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice, notes: Notes) -> RecordedLog:
     """The logs of a folder without usable metadata."""
-    if len(logs) == 1 and _magic(logs[0]) == "ros1":
+    if len(logs) == 1 and (_magic(logs[0]) == "ros1" or ".bag" in logs[0].suffixes):  # packed, too
         return _open_file(logs[0], choice, notes)
     parts = logs if len(logs) == 1 else split_parts(logs)
     if parts is None:
         names = ", ".join(file.name for file in logs[:_LISTED])
         raise LogError(f"{problem.rstrip('.')}, and the folder holds {len(logs)} logs. Give one of them: {names}.")
+    if all(_magic(part) == "ros1" for part in parts):
+        return open_drive(parts, choice, path)
     notes.add(f"{problem.rstrip('.')}; {plural(len(parts), 'storage file')} found by content.")
     return _open_bag(path, Metadata(parts, [], {}, 0, 0), choice, notes)
 

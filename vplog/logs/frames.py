@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from av import VideoFrame
 
     from vplog.logs.content import LogContent
+    from vplog.logs.depth_registration import DepthRegistration
 
 
 _HALF = 127
@@ -94,6 +95,8 @@ class RecordedFrame:
     """The calibration of the image, where a later one differs from the camera's."""
     mask: Mask | LoggedImage | None = None
     right_mask: Mask | None = None
+    registration: DepthRegistration | None = None
+    """Where the depth is another camera's."""
 
     def decode(self, colour: bool = False) -> Frame:
         """The frame, without depth or right image where that does not decode or fit. Raises LogError where the image
@@ -152,17 +155,21 @@ class RecordedFrame:
 
     def _registered(self, depth: LoggedImage, image: Bytes, affine: Floats | None) -> Float32s | None:
         """The depth of the camera's px, NaN beyond the image; None, and counted, where it does not decode or has
-        another size than the image."""
-        detail, found = "", None
+        another size than the image, or than that which is registered."""
+        detail, found, registration = "", None, self.registration
+        fitting = image if registration is None else registration.rays
         with suppress(LogError):
             found = depth.depth_m(self.stamp_ns)
-        if found is not None and found.shape != image.shape:
+        if found is not None and found.shape != fitting.shape[:2]:
+            what = "the image has" if registration is None else "its calibration is of"
             detail = (
-                f"{depth.channel.topic} has {size_of(found)} px where the image has {size_of(image)}; depth must be "
+                f"{depth.channel.topic} has {size_of(found)} px where {what} {size_of(fitting)}; depth must be "
                 "registered to the image: choose another with --depth-topic."
             )
         if found is None or detail:
             return self._count_undecodable(depth.channel, detail)
+        if registration is not None:
+            return registration.register(found)
         if affine is None:
             return found
         size = self.camera.width, self.camera.height  # the nearest measurement to each px

@@ -134,7 +134,9 @@ class TopicCollector:
     def __init__(self, chosen: Selection) -> None:
         self.images = {part: Images(getattr(chosen, part)) for part in PARTS}
         self.by_channel = {one.channel: one for one in self.images.values() if one.channel}
-        self._calibrations = {one: Calibrations(one) for one in (chosen.camera_info, chosen.right_info) if one}
+        self._calibrations = {
+            one: Calibrations(one) for one in (chosen.camera_info, chosen.right_info, chosen.depth_info) if one
+        }
         self.poses = {
             source: PoseTrack(source.topic, chosen.geometry.get(source, (1.0, 1.0)))
             for source in chosen.sources
@@ -182,6 +184,7 @@ class TopicCollector:
             self._add_poses(channel)
         for message in self._paths.values():
             self._add_message(message, self._messages)
+        self.poses = {source: track.of_most() for source, track in self.poses.items()}
         if self.fixes:
             self.fixes.add_sentences()
 

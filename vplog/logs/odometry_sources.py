@@ -21,7 +21,7 @@ from vplog.logs.gather import TopicCollector
 from vplog.logs.messages.records import short_type
 from vplog.logs.stamps import NONE
 from vplog.logs.tf_odometry import FrameTree, frame_name
-from vplog.logs.topic_selection import SOURCES, Selection
+from vplog.logs.topic_selection import COMMAND, SOURCES, Selection
 from vplog.logs.tracks import PoseTrack
 
 TRUTH = Channel("truth", "ground truth", "")
@@ -54,16 +54,15 @@ _BODIES = ("base_link", "base_footprint", "base", "body", "robot", "chassis", "v
 """Frames that move: what is placed in them is a part of the robot."""
 _TRUTH = re.compile(r"ground_?truth|(^|[/_])gt([/_]|$)|vicon|optitrack|mocap|qualisys", re.IGNORECASE)
 """Names of ground truth and of the systems that measure it."""
-_COMMAND = re.compile(
-    "(?<![a-z])(goal|set_?point|target|desired|reference|command|cmd|ref|plan|way_?point|initial_?pose|clicked)s?(?![a-z])",
-    re.IGNORECASE,
-)
-"""Words for where a robot is to be, or is commanded to be."""
 _COMMANDED, _MAYBE_COMMANDED = "is a command by its name", "may be a command by its name"
 COVERED = 0.9
 """Share of the camera's time that odometry covers in a usual log: recorders start and stop within seconds."""
 _LEAST_HZ = 5.0
 """Poses a second, or one per image, beyond which more of them add nothing: 2 m apart at 10 m/s."""
+_HEADLESS = "moves every way without turning"
+_LEAST_PATH_M, _BENT, _TURNED = 10.0, 0.02, 1e-6
+"""m of a path from which that counts; the part of squared steps off their main direction, as of directions that spread
+evenly over 30 degrees; and the change of a rotation's elements that is more than rounding."""
 _SPARSE, _STILL, _PLACED = "poses a second that differ", "never moves", "is placed in"
 _LEAST_FACTOR = 0.01
 """Least factor: nothing measured makes a source impossible where it is the only one."""
@@ -92,11 +91,31 @@ def score_source(
         evidence[what] = max(math.sqrt(share), _LEAST_FACTOR)  # the root: a robot that mostly stands has odometry too
     if rate_hz is None:
         evidence["a single pose"] = _LEAST_FACTOR
+    if source_kind not in ("gps", "truth") and path_m > _LEAST_PATH_M and _is_headless(poses, source_kind == "twist"):
+        evidence[_HEADLESS] = _LEAST_FACTOR
     if jumps:
         evidence[f"jumps {plural(jumps, 'time')}"] = 1.0 / (1.0 + jumps)
     score, rate_hz = round(math.prod(evidence.values()), 6), None if rate_hz is None else round(rate_hz, 3)
     numbers = len(stamp_ns), rate_hz, round(coverage, 4), round(path_m, 3), jumps
     return OdometrySource(topic, kind, frames, *numbers, evidence, score, source_kind)
+
+
+def _is_headless(poses: Floats, integrated: bool) -> bool:
+    """Whether a path bends and the body does not turn with it, as of positions alone; or, of velocities integrated in
+    the body's axes, whether they were along the world's, as those of a satellite receiver: they turn as the body does,
+    and turned back they all point ahead."""
+    steps, back = np.diff(poses[:, :3, 3], axis=0), np.swapaxes(poses[:-1, :3, :3], 1, 2)
+    if float(np.ptp(poses[:, :3, :3], axis=0).max()) <= _TURNED:
+        return _bend(steps) > _BENT
+    velocities = (back @ steps[:, :, None])[:, :, 0]
+    ahead = (back @ velocities[:, :, None])[:, :, 0]
+    return integrated and _bend(velocities) > max(_BENT, 2 * _bend(ahead))
+
+
+def _bend(steps: Floats) -> float:
+    """Part of the squares of (K, 3) steps that is off their main direction, one way or back, at most 1."""
+    _, off, along = np.linalg.eigvalsh(steps.T @ steps)
+    return float(off / along) if along > 0 else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +156,8 @@ def _by_twists(
     moving, variances = twists[rows, :6], twists[rows, 6:]
     text = f"{track.topic}: the odometry is its velocities, integrated"
     gyro_ns, measured = read.imu.finish(notes)
-    placed = tree.between(track.child or "base_link", read.imu.frame) if len(gyro_ns) else None
+    mounts = (tree.between(body, read.imu.frame) for body in (track.child, "base_link") if body and len(gyro_ns))
+    placed = next((mount for mount in mounts if mount is not None), None)
     inside = np.asarray((gyro_ns >= stamp_ns[0]) & (gyro_ns <= stamp_ns[-1]))
     if inside.sum() < len(rows):
         notes.add(f"{text}.")
@@ -187,15 +207,23 @@ def choose_odometry(sources: list[tuple[OdometrySource, Channel]], chosen: Selec
     requested = chosen.odometry or (sources[0][1] if chosen.kind in SOURCES and sources else None)
     commands = [one for one, _ in sources if not requested and _COMMANDED in one.evidence]
     withheld = [one for one, _ in sources if one.kind == "truth" and not requested]
-    fit = [one for one in sources if one[0] not in commands + withheld]
+    headless = [one for one, _ in sources if not requested and _HEADLESS in one.evidence]
+    fit = [one for one in sources if one[0] not in commands + withheld + headless]
     if commands and (not fit or commands[0].score > fit[0][0].score):
         names = ", ".join(source.topic for source in commands)
         notes.add(
             f"{names}: a command by its name (where the robot should be), so not used as odometry; --odometry-topic "
             f"{commands[0].topic} takes it."
         )
+    if headless and not fit:
+        names = ", ".join(source.topic for source in headless)
+        notes.add(
+            f"{names} {_HEADLESS}, as positions or velocities of a satellite receiver do, which do not know where the "
+            f"body heads, so not used as odometry; --odometry-topic {headless[0].topic} takes it."
+        )
     if not fit:
-        return None if sources or chosen.kind in SOURCES else requested or next(iter(chosen.sources), None)
+        others = (source for source in chosen.sources if source not in chosen.tf)  # which have mounts and joints, too
+        return None if sources or chosen.kind in SOURCES else requested or next(others, None)
     best, source = fit[0]
     _note_doubts(best, requested is not None, chosen.image is not None, notes)
     return source
@@ -260,7 +288,7 @@ def _evidence_by_name(topic: str, kind: str, frames: list[str], source_kind: str
         found[f"moves {child}, not base_link"] = 0.9
     if is_truth(topic, *frames):
         found["is ground truth by its name"] = _LEAST_FACTOR
-    if _COMMAND.search(topic):  # a goal names the frame that it lies in, none that moves
+    if COMMAND.search(topic):  # a goal names the frame that it lies in, none that moves
         found |= {_MAYBE_COMMANDED: 0.1} if child else {_COMMANDED: _LEAST_FACTOR}
     return {what: factor for what, factor in found.items() if factor < 1.0}
 

@@ -10,16 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
-from vplog.data import Bytes, Camera, Gps, Imu, Ints, Lidar, LogInfo, Odometry, Scan, Topic, Trajectory
+from vplog.data import Bytes, Camera, Floats, Gps, Imu, Ints, Lidar, LogInfo, Odometry, Scan, Topic, Trajectory
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.calibration_file import SidecarFiles
-from vplog.logs.cameras import BODY, body_from_camera, camera_of
+from vplog.logs.cameras import BODY, body_from_camera, camera_of, optical_frame
 from vplog.logs.content import LogContent, read_content
+from vplog.logs.depth_registration import DepthRegistration, registration_of
 from vplog.logs.formats.container import Channel, Container, Contents, Notes
 from vplog.logs.formats.loss_account import TopicLoss
 from vplog.logs.formats.ros2_folder import messages_unpacked
-from vplog.logs.frames import ImageReader, RecordedFrame, size_of
+from vplog.logs.frames import ImageReader, RecordedFrame
 from vplog.logs.masks import masks_of
 from vplog.logs.messages.records import CalibrationMessage
 from vplog.logs.odometry_sources import PROPERTIES, is_truth
@@ -106,6 +107,7 @@ class RecordedLog:
     def frames(self, stamp_ns: Ints) -> Iterator[RecordedFrame]:
         """Raises LogError where a stamp is not one of `stamps()`."""
         content, images, pair, camera = self._content, self._images, self._pair, self.camera()
+        registration = self._depth[1] if self._depth else None
         for row in rows_of(content.stamp_ns, stamp_ns, self.name):
             at_ns, image = int(content.stamp_ns[row]), images.image(row)
             depth = images.companion("depth", row) if self._depth else None
@@ -113,7 +115,8 @@ class RecordedLog:
             mask, right_mask = images.companion("mask", row) or self._masks[0].of(at_ns), self._masks[1].of(at_ns)
             later = bisect_right(self._later_calibrations, at_ns, key=lambda calibration: calibration.stamp_ns)
             own = self._later_calibrations[later - 1] if later else None
-            yield RecordedFrame(at_ns, camera, image, depth, right, pair, self._notes, own, mask, right_mask)
+            beside = depth, right, pair, self._notes, own, mask, right_mask, registration
+            yield RecordedFrame(at_ns, camera, image, *beside)
 
     def file_names(self) -> list[str] | None:
         names = self._contents.names
@@ -161,19 +164,40 @@ class RecordedLog:
         return self._content.gps
 
     def imu(self) -> Imu | None:
-        """By the static transforms; noted where they do not place it."""
+        """By the static transforms, else the calibration file; noted where neither places it."""
         content = self._content
         if content.imu is None or content.chosen.imu is None or self.odometry() is not None:
             return None
         (camera, camera_frame), (frame, stamp_ns, values) = self._left, content.imu
         topic, placed = content.chosen.imu.topic, content.tree.between(camera_frame, frame)
-        finite = np.isfinite(values).all(axis=1)
+        known = self._sidecar.camera(self._image_channel().topic)
+        if placed is None and known is not None and known.body_from_camera is not None:
+            placed = se3.inverse(known.body_from_camera)
+            self._notes.add(f"{topic} is taken to be the IMU of the calibration.")
+        finite = np.isfinite(values).all(axis=1) & values[:, 3:].any(axis=1)  # zero of a gyroscope alone
         if placed is None or not finite.any():
-            why = "the static transforms do not place it beside the camera" if placed is None else "it has no numbers"
+            why = (
+                "the static transforms do not place it beside the camera"
+                if placed is None
+                else "it does not measure both turns and accelerations"
+            )
             self._notes.add(f"{topic}: {why}; visual odometry does without its measurements.")
             return None
         gyro, accel = values[finite, :3], values[finite, 3:]
         return Imu(topic, stamp_ns[finite], gyro, accel, camera.body_from_camera @ placed)
+
+    def _body_from_calibrated_imu(self) -> Floats:
+        """(4, 4) of the IMU that a calibration file has as the body, by the static transforms; else, noted where an
+        odometry moves another frame, the identity."""
+        if self.odometry() is None:
+            return np.eye(4)
+        body = self._body or BODY
+        imus = [c for c in self._candidates if c.role == "imu" and self._choice.imu in (None, c.channel.topic)]
+        for one in sorted(imus, key=lambda c: -c.count):
+            if one.frame and (placed := self._content.tree.between(body, one.frame)) is not None:
+                return placed
+        self._notes.add(f"No static transforms place an IMU on {body}; the calibration's IMU is taken to be {body}.")
+        return np.eye(4)
 
     def truth(self) -> Trajectory | Gps | None:
         """Ground truth of the data set, else the poses of a topic that is called ground truth."""
@@ -230,21 +254,20 @@ class RecordedLog:
         return sorted(self._content.calibrations[1:], key=lambda calibration: calibration.stamp_ns)
 
     @cached_property
-    def _depth(self) -> Channel | None:
-        """The depth topic, or None, with a note, where its first images do not decode or do not fit the camera's."""
+    def _depth(self) -> tuple[Channel, DepthRegistration | None] | None:
+        """The depth topic, and its registration where it is another camera's; None, with a note, where its first images
+        do not decode or do not fit the camera's."""
         depth, camera = self._selection.depth, self.camera()
         try:
             first = None if depth is None else self._images.first_depth(depth)
+            if first is None or depth is None:
+                return None
+            own = camera_of(depth.topic, self._content.depth_calibration, (first.shape[1], first.shape[0]), Notes())
+            frames = self._left[1], self._optical(known.frame) if (known := self._candidate(depth)) else ""
+            return depth, registration_of(own, camera, frames, self._content.tree, self._notes)
         except LogError as error:
             self._notes.add(f"Depth is not used: {error}")
             return None
-        if first is None or depth is None:
-            return None
-        if first.shape != (camera.height, camera.width):
-            size = f"{camera.width} x {camera.height}"
-            self._notes.add(f"Depth is not used: {depth.topic} has {size_of(first)} px, the images {size}.")
-            return None
-        return depth
 
     @cached_property
     def _images(self) -> ImageReader:
@@ -266,23 +289,30 @@ class RecordedLog:
         """The camera of the images as they come, and its frame."""
         image = self._image_channel()
         content, notes = self._content, self._notes
-        frame, size = self._images.first(image, [*content.places], self._path.name)
+        logged, size = self._images.first(image, [*content.places], self._path.name)
+        frame = self._optical(logged)
         known = self._sidecar.camera(image.topic)
         calibration = known.calibration if known else content.calibration
         camera = camera_of(image.topic, calibration, size, notes)
         for masks in self._masks:
             masks.check(content.stamp_ns.tolist(), size, notes)
         body = self._body
-        named = body and frame and content.tree.between(body, frame) is not None
+        named = body and frame and frame == logged and content.tree.between(body, frame) is not None
         visual = camera.matrix is not None or self._contents.names is None
         if known is not None and known.body_from_camera is not None and not named:
-            camera = replace(camera, body_from_camera=known.body_from_camera)
+            camera = replace(camera, body_from_camera=self._body_from_calibrated_imu() @ known.body_from_camera)
         elif self.odometry() is not None or content.chosen.lidar is not None or visual:
             ahead = self.odometry() is None  # it is computed then
             ahead |= any(source.used and source.kind in ("gps", "twist") for source in content.sources)
             placed = body_from_camera(content.tree, body, frame, notes, ahead)
             camera = replace(camera, body_from_camera=placed)
         return camera, frame
+
+    def _optical(self, frame: str) -> str:
+        """Frame of a camera, by the frame_id of its images; those of a data set are optical."""
+        if self._contents.body or not frame:
+            return frame
+        return optical_frame(self._content.tree, self._body or BODY, frame, self.odometry(), self._notes)
 
     @cached_property
     def _pair(self) -> Pair | None:
@@ -301,7 +331,7 @@ class RecordedLog:
             if own is None or theirs is None:
                 raise NoPairError(f"{right.topic} has no calibration")
             other, size = self._images.first(right, content.companions["right"], self._path.name)
-            camera = camera_of(right.topic, theirs, size, self._notes)
+            camera, other = camera_of(right.topic, theirs, size, self._notes), self._optical(other)
             if other and frame and self._choice.cameras is not None and self._are_apart(frame, other):
                 return None  # the other is a camera by itself
             right_from_left = content.tree.between(other, frame) if other and frame else None

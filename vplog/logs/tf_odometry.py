@@ -15,7 +15,7 @@ from vplog.logs.formats.container import Notes
 from vplog.logs.messages.records import PoseMessage
 from vplog.logs.stamps import NONE, Stamps
 
-_BODIES = ("base_link", "base_footprint")
+BODIES = ("base_link", "base_footprint")
 """Names of the body, ROS REP 105 and 120, in order of preference."""
 _ROOTS = ("odom", "map", "world")
 """Names of frames that stand still (ROS REP 105): odom first, whose poses do not jump."""
@@ -42,9 +42,11 @@ class FrameTree:
             if parent == child or not are_usable(pose[None]).all():
                 self.dropped += 1
                 continue
-            parent_from_child = se3.pose(se3.rotation(pose[3:]), pose[:3])
-            self.edges.append((parent, child))
-            self._from[parent][child], self._from[child][parent] = parent_from_child, se3.inverse(parent_from_child)
+            self.add(parent, child, se3.pose(se3.rotation(pose[3:]), pose[:3]))
+
+    def add(self, parent: str, child: str, parent_from_child: Floats) -> None:
+        self.edges.append((parent, child))
+        self._from[parent][child], self._from[child][parent] = parent_from_child, se3.inverse(parent_from_child)
 
     def __contains__(self, frame: str) -> bool:
         return frame_name(frame) in self._from
@@ -169,7 +171,7 @@ class DynamicTransforms:
         by_root = sorted(edges, key=lambda edge: -_ROOTS.index(_name(edge[0])) if _name(edge[0]) in _ROOTS else -9)
         parents = {child: parent for parent, child in by_root}  # of several parents the root that does not jump
         up = {frame: _ancestors(frame, parents) for edge in edges for frame in edge}
-        bodies = [body for name in _BODIES for body in sorted(up) if _name(body) == name]
+        bodies = [body for name in BODIES for body in sorted(up) if _name(body) == name]
         body = next((body for body in bodies if moving.intersection(up[body])), None)
         if body is None:
             body = "" if bodies else self._unnamed(moving, up)  # on a body that stands, only its parts move

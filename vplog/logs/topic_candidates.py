@@ -8,7 +8,7 @@ from dataclasses import replace
 from vplog.logs.formats.container import Channel, Container, Contents
 from vplog.logs.messages.decode import decode
 from vplog.logs.messages.pixels import is_depth, is_image, may_be_thermal
-from vplog.logs.messages.records import BadMessageError, CalibrationMessage, ImageMessage, kind_of
+from vplog.logs.messages.records import BadMessageError, CalibrationMessage, ImageMessage, ImuMessage, kind_of
 from vplog.logs.messages.video import codec_of
 from vplog.logs.tf_odometry import frame_name
 from vplog.logs.topic_selection import Candidate
@@ -16,13 +16,15 @@ from vplog.storage.image_file import image_size
 
 _THERMAL = re.compile(r"therm|infra|lwir|flir|boson|lepton|(?<![a-z])ir(?![a-z])")
 """Words for thermal cameras: their kind, their band, and the most common makes."""
+_First = ImageMessage | CalibrationMessage | ImuMessage
+"""The first message of a topic, where it says more than its type."""
 
 
 def read_candidates(container: Container, contents: Contents) -> list[Candidate]:
     """Every topic that could play a part; the first message of each tells depth from grey, its frame and its codec."""
     kinds = {channel: kind_of(channel) for channel in contents.counts}
-    wanted = {c for c, kind in kinds.items() if kind in ("image", "camera_info") and contents.counts[c]}
-    firsts: dict[Channel, ImageMessage | CalibrationMessage] = {}
+    wanted = {c for c, kind in kinds.items() if kind in ("image", "camera_info", "imu") and contents.counts[c]}
+    firsts: dict[Channel, _First] = {}
     left = set(wanted)
     for message in container.messages(wanted) if wanted else ():
         if message.channel not in left:
@@ -31,7 +33,7 @@ def read_candidates(container: Container, contents: Contents) -> list[Candidate]
             record = decode(message.channel, message.data)
         except BadMessageError:
             continue  # the next one may be sound
-        if isinstance(record, ImageMessage | CalibrationMessage):
+        if isinstance(record, _First):
             firsts[message.channel] = record
             left.discard(message.channel)
         if not left:
@@ -44,7 +46,7 @@ def read_candidates(container: Container, contents: Contents) -> list[Candidate]
     return [replace(c, role="image") if _is_thermal(c, firsts.get(c.channel), found) else c for c in found]
 
 
-def _candidate(channel: Channel, count: int, kind: str, first: ImageMessage | CalibrationMessage | None) -> Candidate:
+def _candidate(channel: Channel, count: int, kind: str, first: _First | None) -> Candidate:
     role, codec, encoding, size = kind, "", "", None
     if kind == "tf" and channel.topic.rstrip("/").endswith("static"):
         role = "tf_static"
@@ -59,6 +61,8 @@ def _candidate(channel: Channel, count: int, kind: str, first: ImageMessage | Ca
     calibrated = isinstance(first, CalibrationMessage) and bool(first.matrix[0, 0] > 0)
     frame = frame_name(first.frame) if first else ""
     supported = not isinstance(first, ImageMessage) or is_image(first)
+    if isinstance(first, ImuMessage):
+        supported = any(abs(rate) > 0 for rate in first.gyro)
     return Candidate(channel, count, role, frame, calibrated, codec, encoding, size or (0, 0), supported)
 
 

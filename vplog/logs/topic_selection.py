@@ -14,6 +14,7 @@ other parts the first by these rules does, unless TopicChoice names another:
 - odometry: the source with the highest score once the log is read (`odometry_sources.py`): pose topics, and tf, whose
   chain from its root to the body is taken;
 - gps: sentences of NMEA last, then most messages, then name;
+- imu: accelerometers alone last, then most messages, then name;
 - lidar: clouds that are another sensor's or were computed by their name last, then most messages, then name. It is read
   where it is requested as the odometry, or no topic of poses or velocities is there.
 """
@@ -39,6 +40,11 @@ EVERY_IMAGE = "*"
 SOURCES = ("twist", "gps", "truth", "visual", "lidar")
 """Odometry that no topic is chosen for: velocities added up, positions of fixes, the ground truth of a data set, and
 that of the images and of a lidar, which a run computes."""
+COMMAND = re.compile(
+    "(?<![a-z])(goal|set_?point|target|desired|reference|command|cmd|ref|plan|way_?point|initial_?pose|clicked)s?(?![a-z])",
+    re.IGNORECASE,
+)
+"""Words for where a robot is to be, or is commanded to be."""
 OPTIONS = {
     "image": "image-topic", "depth": "depth-topic", "right": "right-topic", "camera_info": "camera-info-topic",
     "odometry": "odometry-topic", "gps": "gps-topic", "odometry_file": "odometry-file",
@@ -128,10 +134,22 @@ class Candidate:
     size: tuple[int, int] = (0, 0)
     """Width and height in px of the first image, 0 where only decoding tells it."""
     supported: bool = True
-    """Whether images of its encoding can be decoded to grey."""
+    """Whether images of its encoding can be decoded to grey; of an IMU, whether it measures turns."""
 
 
-_PARTS = ("image", "depth", "camera_info", "odometry", "gps", "right", "right_info", "imu", "mask", "lidar")
+_PARTS = (
+    "image",
+    "depth",
+    "camera_info",
+    "odometry",
+    "gps",
+    "right",
+    "right_info",
+    "depth_info",
+    "imu",
+    "mask",
+    "lidar",
+)
 
 
 @dataclass(frozen=True)
@@ -146,6 +164,8 @@ class Selection:
     gps: Channel | None = None
     right: Channel | None = None
     right_info: Channel | None = None
+    depth_info: Channel | None = None
+    """The calibration of the depth, where it has one of its own."""
     imu: Channel | None = None
     """The IMU whose gyroscope turns velocities, where these are the odometry, or which visual odometry takes."""
     mask: Channel | None = None
@@ -159,7 +179,7 @@ class Selection:
     """Factors of the linear and angular velocities of sources that are wheel speeds."""
     tf_static: tuple[Channel, ...] = ()
     tf: tuple[Channel, ...] = ()
-    """Transforms over time: read where odometry may come from them, or where no topic is of static ones alone."""
+    """Transforms over time: odometry may come from them, and those that never change are static ones."""
 
     @property
     def parts(self) -> dict[Channel, str]:
@@ -177,10 +197,11 @@ class Selection:
     def channels(self) -> list[Channel]:
         return list(dict.fromkeys((*self.parts, *self.sources)))
 
-    def with_odometry(self, odometry: Channel | None) -> Selection:
-        """The selection once the source of odometry is known."""
-        tf = self.tf if odometry in self.tf or not self.tf_static else ()
-        return replace(self, odometry=odometry, sources=(), tf=tf)
+    def with_odometry(self, odometry: Channel | None, has_static: bool, turned: bool) -> Selection:
+        """The selection once the source of odometry is known, whether transforms over time never change, and whether
+        the odometry is velocities or still to be computed, which take an IMU."""
+        tf = self.tf if odometry in self.tf or has_static else ()
+        return replace(self, odometry=odometry, sources=(), tf=tf, imu=self.imu if turned else None)
 
 
 _NAMES = {
@@ -200,7 +221,7 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     """The topics to use by the rules above. Raises LogError where a topic named in `choice` cannot play its part."""
     _check_files(choice)
     _check_mask_topics(candidates, choice)
-    candidates = sorted(candidates, key=lambda c: (-c.count, c.channel))
+    candidates = sorted(candidates, key=lambda c: (c.role == "imu" and not c.supported, -c.count, c.channel))
     usable, pick = [c for c in candidates if c.count], partial(_pick, candidates, choice, log)
     image = pick("image", "depth", lambda c: _image_order(c, usable))
     for topic in choice.cameras or ():
@@ -214,15 +235,16 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     requested = pick("odometry", "tf") if kind == "topic" and choice.odometry_file is None and choice.odometry else None
     geometry = {c.channel: factors for c in candidates if (factors := _geometry(c, choice))}
     sources = _sources(usable, kind, requested, geometry)
-    turned = kind == "twist" or all(short_type(c.channel.type) in (*TWISTS, *GEOMETRY) for c in sources)
-    visual = image is not None and choice.odometry_file is None and (kind == "visual" or not (sources or kind))
-    found["odometry"], found["imu"] = requested, pick("imu") if (sources and turned) or visual else None
+    # whether tf has odometry, and a command is one, shows when they are read
+    posed = [c for c in sources if kind or (c.role != "tf" and not COMMAND.search(c.channel.topic))]
+    turned = kind == "twist" or all(short_type(c.channel.type) in (*TWISTS, *GEOMETRY) for c in posed)
+    visual = image is not None and choice.odometry_file is None and (kind == "visual" or not (posed or kind))
+    found["odometry"], found["imu"] = requested, pick("imu") if (posed and turned) or visual else None
     found["gps"] = pick("gps", key=lambda c: short_type(c.channel.type) == NMEA)
-    if kind == "lidar" or (not kind and all(c.role == "tf" for c in sources)):
+    if kind == "lidar" or not (kind or posed):
         found["lidar"] = _lidar(usable, choice)
     static = tuple(sorted(c.channel for c in candidates if c.role == "tf_static"))
-    moving = tuple(c.channel for c in usable if c.role == "tf")
-    tf = moving if not static or any(c.role == "tf" for c in sources) else ()
+    tf = tuple(c.channel for c in usable if c.role == "tf")
     channels = {part: c.channel for part, c in found.items() if c is not None}
     return Selection(
         **channels, sources=tuple(c.channel for c in sources), tf_static=static, tf=tf, kind=kind, geometry=geometry
@@ -252,11 +274,13 @@ def _of_image(
                 "not both. Leave out --depth-topic or --right-topic."
             )
         right = None
+    info, depth_info = _calibration(image, usable), None if depth is None else _calibration(depth, usable)
+    found = {"depth": depth, "right": right, "depth_info": None if depth_info is info else depth_info}
     if choice.calibration_file is not None:
-        return {"depth": depth, "right": right}
+        return found
     right_info = _calibration(right, usable) if right is not None else None
-    info = _calibration(image, usable) if choice.camera_info is None else pick("camera_info")
-    return {"depth": depth, "right": right, "right_info": right_info, "camera_info": info}
+    info = info if choice.camera_info is None else pick("camera_info")
+    return found | {"right_info": right_info, "camera_info": info}
 
 
 def _odometry_kind(candidates: list[Candidate], choice: TopicChoice) -> str:

@@ -18,7 +18,7 @@ from vplog.logs.formats.container import Channel, Notes
 from vplog.logs.messages.decode import Poses
 from vplog.logs.messages.nmea import SENTENCES
 from vplog.logs.messages.records import FixMessage, ImuMessage, PoseMessage
-from vplog.logs.stamps import Stamps
+from vplog.logs.stamps import NONE, Stamps
 from vplog.logs.tf_odometry import are_usable, frame_name
 
 _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
@@ -57,7 +57,9 @@ class PoseTrack:
         self._without_covariance = True
         """No pose has a covariance."""
         self._dropped = self._others = 0
-        """Poses that are unusable, and those of other bodies than the first."""
+        """Poses that are unusable, and those of other frames."""
+        self._tracks: dict[tuple[str, str], PoseTrack] = {}
+        """By their frames, tracks of the poses that name others than the first."""
         self.child = ""
         """The frame that moves, as the first message names it."""
         self.parent = ""
@@ -71,10 +73,10 @@ class PoseTrack:
 
     def add_all(self, poses: Poses, log_ns: list[int], positions: list[int] | None = None) -> None:
         """Add several messages that name the same frames."""
-        self.child = self.child or frame_name(poses.child)
-        self.parent = self.parent or frame_name(poses.frame)
-        if frame_name(poses.child) != self.child:
-            self._others += len(log_ns)
+        frames = frame_name(poses.frame), frame_name(poses.child)
+        self.parent, self.child = self.parent or frames[0], self.child or frames[1]
+        if frames != (self.parent, self.child):
+            self._tracks.setdefault(frames, PoseTrack(self.topic, self._geometry)).add_all(poses, log_ns, positions)
             return
         usable = are_usable(poses.poses)
         if poses.twists is not None:
@@ -89,16 +91,25 @@ class PoseTrack:
         self._without_covariance &= known is None or not usable.any()
         self._covariances.frombytes((np.full((len(usable), 36), np.nan) if known is None else known)[usable].tobytes())
 
+    def of_most(self) -> PoseTrack:
+        """The track of the frames that most poses name; of equal ones the first."""
+        counts = {track: len(track.stamps.log_ns) for track in (self, *self._tracks.values())}
+        most = max(counts, key=counts.__getitem__)
+        most._others = sum(counts.values()) - counts[most]
+        return most
+
     def finish(self, notes: Notes) -> Odometry | None:
         """The odometry, or None where no pose is usable."""
         given = self._given
         if dropped := self._dropped + int((~given).sum()):
             notes.add(f"{self.topic}: {plural(dropped, 'pose')} out of range or without a rotation dropped.")
         if self._others:
-            notes.add(f"{self.topic}: {plural(self._others, 'pose')} of other frames than {self.child} left out.")
+            frames = " in ".join(filter(None, (self.child, self.parent)))
+            notes.add(f"{self.topic}: {plural(self._others, 'pose')} of other frames than {frames} left out.")
         stamp_ns, rows = self.stamps.order(self.topic, notes)
         stamp_ns, rows = stamp_ns[given[rows]], rows[given[rows]]
         if not len(rows):
+            notes.add(f"{self.topic}: none of its messages gives a motion.")
             return None
         poses, covariance = np.empty((len(rows), 4, 4)), np.empty((len(rows), 6, 6))
         logged = np.frombuffer(self._poses).reshape(-1, 7), np.frombuffer(self._covariances).reshape(-1, 6, 6)
@@ -183,9 +194,11 @@ class ImuTrack:
             self._values.extend((*message.gyro, *message.accel))
 
     def finish(self, notes: Notes) -> tuple[Ints, Floats]:
-        """Increasing stamps (K,), and (K, 6) rates in rad/s about the axes of its frame, accelerations in m/s^2."""
+        """Increasing stamps (K,), and (K, 6) rates in rad/s about the axes of its frame, accelerations in m/s^2. Of an
+        accelerometer alone, whose rates are zero, nothing."""
         stamp_ns, rows = self.stamps.order(self.topic, notes)
-        return stamp_ns, np.frombuffer(self._values).reshape(-1, 6)[rows]
+        values = np.frombuffer(self._values).reshape(-1, 6)[rows]
+        return (stamp_ns, values) if values[:, :3].any() else (NONE, values[:0])
 
 
 class FixTrack:

@@ -70,6 +70,11 @@ class Landmarks:
     """Whether the scale is the depth sensor's; otherwise it is the odometry's."""
 
 
+_ENOUGH = 20
+"""Landmarks by depth that leave nothing to those by motion: a pose takes as many inliers. Sunlight blinds sensors, and
+much is beyond their range."""
+
+
 def landmarks_of(
     row: int,
     keyframes: Keyframes,
@@ -79,12 +84,15 @@ def landmarks_of(
     matches: PairMatches,
     settings: LandmarkSettings,
 ) -> Landmarks:
-    """The landmarks of the `count` strongest features of keyframe `row`: from depth where these have any, else from
-    motion, by their matches in the neighbouring keyframes."""
+    """The landmarks of the `count` strongest features of keyframe `row`: from depth where enough have one or none is
+    enough, else from motion, by their matches in the neighbouring keyframes."""
     own = features(row).rows(slice(count))
     rays = undistort.rays(camera, own.points)
+    measured = None
     if np.isfinite(own.depth_m).any():
-        return from_depth(rays, own.depth_m.astype(np.float64), camera, settings)
+        measured = from_depth(rays, own.depth_m.astype(np.float64), camera, settings)
+        if measured.known.sum() >= _ENOUGH:
+            return measured
     first, last = max(row - settings.neighbours, 0), min(row + settings.neighbours + 1, len(keyframes.stamp_ns))
     rows = [other for other in range(first, last) if other != row]
     observed = np.full((len(rows), len(rays), 2), np.nan)
@@ -93,7 +101,8 @@ def landmarks_of(
         observed[view, mine] = undistort.rays(camera, features(other).points[found])
     motion = se3.between(keyframes.odom_from_body[rows], keyframes.odom_from_body[row])
     views = se3.inverse(camera.body_from_camera) @ motion @ camera.body_from_camera
-    return from_motion(rays, observed, views, camera, settings)
+    moved = from_motion(rays, observed, views, camera, settings)
+    return moved if measured is None or moved.known.sum() >= _ENOUGH else measured
 
 
 def from_depth(rays: Floats, depth_m: Floats, camera: Camera, settings: LandmarkSettings) -> Landmarks:

@@ -21,14 +21,12 @@ from vplog.execution.execution import Execution
 from vplog.loops.verify import no_closures
 from vplog.maps.geo_bounds import earth_from_record, earth_record
 from vplog.maps.storage import layout, map_store
+from vplog.maps.storage.layout import PLACES_ONLY
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables
 from vplog.results.places_map import DrivePlaces, PlacesHeader, read_drives, read_places_header
 from vplog.storage.remote_path import original
-
-PLACES_ONLY = "places_of"
-"""Field in drive.json of such a drive: the file that it is from."""
 
 
 def drives_of_file(path: Path) -> dict[str, dict[str, Any]]:

@@ -12,12 +12,12 @@ from typing import Any
 from vplog.errors import LibraryError, ResultError, SettingsError, nearest_path
 from vplog.execution.execution import Execution
 from vplog.logs.image_folder import natural_order
-from vplog.maps.import_places import PLACES_ONLY, drives_of_file, import_places_of
+from vplog.maps.import_places import drives_of_file, import_places_of
 from vplog.maps.joining.drive_pairs import DRIVE_FILES
 from vplog.maps.storage import layout, map_store
 from vplog.maps.storage.contents import damage_warnings
 from vplog.maps.storage.damage import DamagedDriveError, damaged_files
-from vplog.maps.storage.layout import folder_name
+from vplog.maps.storage.layout import PLACES_ONLY, folder_name
 from vplog.maps.storage.map_store import Store
 from vplog.results import run_record
 from vplog.results.places_map import places_by_drive, read_places_header

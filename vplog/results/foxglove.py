@@ -28,8 +28,8 @@ PoseVector = list[float]
 """Position in m and quaternion x y z w of one pose."""
 Rgba = tuple[float, float, float, float]
 
-MAP, BODY, CAMERA = "map", "base_link", "camera"
-"""Frames: the root, the body, the camera fixed on it."""
+MAP, BODY, CAMERA, GPS = "map", "base_link", "camera", "gps"
+"""Frames: the root, the body, the camera and the antenna fixed on it."""
 REFERENCE, CLOSURE = "reference", "closure"
 """Frames of the two topics of pictures that are no view of the camera; they stand in the map's origin."""
 RERUN_ROOT = "tf#/"
@@ -71,11 +71,14 @@ def path(stamp_ns: int, poses: list[PoseVector]) -> PosesInFrame:
 def points(stamp_ns: int, poses: Floats, color: Rgba) -> PointCloud:
     """The positions of poses (R, 4, 4), all in one colour."""
     packed = np.zeros(len(poses), np.dtype([("position", "<f4", 3), ("color", "u1", 4)]))
-    packed["position"] = poses[:, :3, 3]
+    # float32 has steps of half a metre where UTM's northings are: far from the origin they begin at a whole kilometre
+    origin = np.round(poses[:1, :3, 3], -3).sum(0)
+    packed["position"] = poses[:, :3, 3] - origin
     packed["color"] = np.round(255 * np.array(color))
     data = packed.tobytes()
     message = PointCloud(timestamp=_time(stamp_ns), frame_id=MAP, point_stride=packed.itemsize, data=data)
     message.pose.position.SetInParent()  # rerun takes a position that is left out for one without a value
+    message.pose.position.x, message.pose.position.y, message.pose.position.z = origin.tolist()
     message.pose.orientation.w = 1.0
     for at, name in enumerate("xyz"):
         message.fields.add(name=name, offset=4 * at, type=PackedElementField.FLOAT32)
@@ -177,7 +180,7 @@ def fix(gps: Gps, row: int) -> LocationFix:
     """One satellite fix; its covariance is in m^2, east, north, up."""
     message = LocationFix(
         timestamp=_time(int(gps.stamp_ns[row])),
-        frame_id="gps",
+        frame_id=GPS,
         latitude=float(gps.latitude_deg[row]),
         longitude=float(gps.longitude_deg[row]),
         altitude=float(gps.altitude_m[row]),

@@ -123,9 +123,11 @@ def read_g2o(path: Path) -> GraphFile:
         _place(poses, given, a, b, measured, kind)
     information = _information(path, edges, values[:, layout.pose :], layout)
     held = 0
-    for line, name in fixed:
-        if name not in ids:
-            raise _at(path, line, f"FIX {name}, and there is no such vertex")
+    if unknown := [(line, name) for line, name in fixed if name not in ids]:
+        if not left_out:  # it may be one of these
+            raise _at(path, unknown[0][0], f"FIX {unknown[0][1]}, and there is no such vertex")
+        warnings.append(f"FIX {unknown[0][1]} is left out: it is no pose.")
+        fixed = [one for one in fixed if one not in unknown]
     if fixed:
         held = int(np.searchsorted(ids, fixed[0][1]))
         if len(fixed) > 1:
@@ -168,7 +170,7 @@ def _split(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counte
                     found.ids.extend(words[1 : 1 + named])
                     found.numbers.append(words[3] if named == 2 else line.split(None, 2)[2])
                 elif tag == "FIX":
-                    fixed += [(number, _id(path, number, word)) for word in line.split()[1:]]
+                    fixed += [(number, _id(path, number, word)) for word in line.partition("#")[0].split()[1:]]
                 elif tag[0] != "#":
                     if not _LEFT_OUT.match(tag):
                         raise _at(path, number, f"{tag[:30]!r} is not a g2o element")

@@ -70,7 +70,8 @@ def write_kml(path: Path, tree: dict[str, Any], name: str) -> None:
     document = ElementTree.SubElement(kml, "Document")
     for feature in tree["features"]:
         about, where = feature["properties"], feature["geometry"]["coordinates"]
-        points = [f"{x:.{_DEGREE_DIGITS}f},{y:.{_DEGREE_DIGITS}f}" for x, y, _ in where]
+        # KML has longitudes within 180 degrees
+        points = [f"{(x + 180.0) % 360.0 - 180.0:.{_DEGREE_DIGITS}f},{y:.{_DEGREE_DIGITS}f}" for x, y, _ in where]
         mark = ElementTree.SubElement(document, "Placemark")
         ElementTree.SubElement(mark, "name").text = f"closure {about['closure']}" if "closure" in about else name
         line = ElementTree.SubElement(mark, "LineString")

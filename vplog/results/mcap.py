@@ -197,6 +197,8 @@ def _solved(
                 for number, mount in enumerate([extras.camera.body_from_camera, *extras.further_cameras]):
                     fixed.append((foxglove.BODY, foxglove.camera_frame(number), se3.vectors(mount).tolist()))
                 fixed += [(foxglove.MAP, frame, foxglove.IDENTITY) for frame in (foxglove.REFERENCE, foxglove.CLOSURE)]
+            if extras.gps is not None and extras.gps.antenna_m is not None:
+                fixed.append((foxglove.BODY, foxglove.GPS, [*extras.gps.antenna_m.tolist(), *foxglove.IDENTITY[3:]]))
             yield stamp_ns, "/tf_static", foxglove.transforms(stamp_ns, fixed)
             if extras.earth is not None:
                 tree = geo.feature_collection(extras.earth, world_from_body, keyframes.stamp_ns, closures)
@@ -313,10 +315,10 @@ def _graph(stamp_ns: int, world_from_body: Floats, graph: PoseGraph, closures: C
 
 
 def _rejected(stamp_ns: int, world_from_body: Floats, closures: Closures) -> SceneUpdate:
-    """Candidates that geometry rejected, faint and on a topic of their own, since they are many."""
+    """Candidates that are not in the graph, faint and on a topic of their own, since they are many."""
     given = closures.of(*(one for verdicts, _ in _VERDICT_COLOURS.values() for one in verdicts))
     ends = closures.lines(world_from_body[:, :3, 3], ~given)
-    return foxglove.lines(stamp_ns, [("candidates rejected by geometry", ends, foxglove.FAINT_RED)])
+    return foxglove.lines(stamp_ns, [("candidates not in the graph", ends, foxglove.FAINT_RED)])
 
 
 def _loop_closure(

@@ -27,7 +27,7 @@ from mcap.writer import MCAP0_MAGIC
 from vplog.data import Floats, Gps
 from vplog.geometry import se3
 from vplog.results.closure_views import checked
-from vplog.results.foxglove import camera_frame
+from vplog.results.foxglove import GPS, camera_frame
 from vplog.results.mcap import FIXES, PICTURES, VIEWS, McapContent
 from vplog.results.tables import reading
 from vplog.storage.parquet_limits import crc_of
@@ -68,16 +68,16 @@ def read_pictures(path: Path) -> McapContent:
                 fixes.append(LocationFix.FromString(message.data))
                 continue
             pictures.append(CompressedImage.FromString(message.data).data)
-        named = list(zip(_picture_rows(reader), pictures, strict=True))
+        named, gps = list(zip(_picture_rows(reader), pictures, strict=True)), _gps(reader, fixes)
     by_row = {row: data for row, data in named if row is not None}
-    return McapContent(by_row, views, references, _gps(fixes) if fixes else None, thumbnails)
+    return McapContent(by_row, views, references, gps, thumbnails)
 
 
 def read_fixes(path: Path) -> Gps | None:
     """The satellite fixes alone, None without any. Raises ResultError as above."""
     with _reading(path) as reader:
         fixes = [LocationFix.FromString(message.data) for _, _, message in reader.iter_messages(topics=[FIXES])]
-    return _gps(fixes) if fixes else None
+        return _gps(reader, fixes)
 
 
 def read_images(path: Path) -> Iterator[CameraPicture]:
@@ -96,14 +96,19 @@ def read_images(path: Path) -> Iterator[CameraPicture]:
 
 def read_camera_poses(path: Path) -> list[Floats]:
     """body_from_camera (4, 4) of the cameras by number, as far as the file has them. Raises ResultError as above."""
-    found: dict[str, Floats] = {}
     with _reading(path) as reader:
-        for _, _, message in reader.iter_messages(topics=["/tf_static"]):
-            for one in FrameTransforms.FromString(message.data).transforms:
-                q, t = one.rotation, one.translation
-                found[one.child_frame_id] = se3.from_vectors(np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w]))
-    names = takewhile(found.__contains__, map(camera_frame, count()))
-    return [found[name] for name in names]
+        found = _mounts(reader)
+    return [found[name] for name in takewhile(found.__contains__, map(camera_frame, count()))]
+
+
+def _mounts(reader: McapReader) -> dict[str, Floats]:
+    """The static transforms (4, 4) by child frame."""
+    found: dict[str, Floats] = {}
+    for _, _, message in reader.iter_messages(topics=["/tf_static"]):
+        for one in FrameTransforms.FromString(message.data).transforms:
+            q, t = one.rotation, one.translation
+            found[one.child_frame_id] = se3.from_vectors(np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w]))
+    return found
 
 
 def read_topics(path: Path) -> list[str]:
@@ -148,7 +153,10 @@ def _check_crcs(stream: BinaryIO) -> None:
     stream.seek(0)
 
 
-def _gps(fixes: list[LocationFix]) -> Gps:
+def _gps(reader: McapReader, fixes: list[LocationFix]) -> Gps | None:
+    if not fixes:
+        return None
+    placed = _mounts(reader).get(GPS)
     covariance = np.full((len(fixes), 3, 3), np.nan)
     for row, fix in enumerate(fixes):
         if len(fix.position_covariance) == 9:
@@ -159,4 +167,5 @@ def _gps(fixes: list[LocationFix]) -> Gps:
         np.array([fix.longitude for fix in fixes]),
         np.array([fix.altitude for fix in fixes]),
         covariance,
+        None if placed is None else placed[:3, 3],
     )

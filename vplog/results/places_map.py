@@ -103,8 +103,9 @@ def drive_header(folder: Path) -> dict[str, Any]:
     records = [folder / name for name in ("drive.json", "run.json") if (folder / name).is_file()]
     account = run_record.read_run_json(records[0]) if records else {}
     topics = account.get("topics")
-    known = {"inputs": account.get("inputs"), "earth": account.get("earth")}
-    known["topics"] = {k: v for k, v in topics.items() if not k.endswith("_file")} if isinstance(topics, dict) else None
+    known: dict[str, Any] = {"inputs": account.get("inputs"), "topics": None, "earth": account.get("earth")}
+    if isinstance(topics, dict):  # files beside the log are among the inputs
+        known["topics"] = {name: topic for name, topic in topics.items() if not name.endswith(("_file", "masks"))}
     return {name: known[name] for name in ("inputs", "topics", "earth") if known[name] is not None}
 
 

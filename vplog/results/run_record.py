@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,14 @@ def read_single_run(folder: Path) -> dict[str, Any]:
 def has_metres(record: dict[str, Any]) -> bool:
     """Whether the lengths of a run are metres, by its run.json."""
     return record.get("scale") != "unknown"
+
+
+def command_of(record: dict[str, Any], out: str | Path, *more: str | Path) -> str:
+    """The command that runs a drive again into a folder, by its run.json; of older ones its log alone."""
+    known = record.get("arguments")
+    words = list(map(str, known if isinstance(known, list) else [record.get("log")]))
+    logs = sum(1 for _ in takewhile(lambda word: not word.startswith("--"), words))
+    return shlex.join(["vplog", "run", *words[:logs], "-o", str(out), *words[logs:], *map(str, more)])
 
 
 def recorded(record: Any, path: Path, kind: type, *names: str) -> Any:

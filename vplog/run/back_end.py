@@ -74,15 +74,15 @@ class BackEndResult:
 def solve(
     odometry: Odometry, keyframes: Keyframes, closures: Closures, gps: Gps | None, settings: BackEnd
 ) -> BackEndResult:
-    """The best trajectory of a drive; fixes are used with `gps.use`, and where they are the odometry. Raises GraphError
-    where there is none."""
+    """The best trajectory of a drive; fixes are used with `gps.use`, unless the odometry has found no metres, and where
+    they are the odometry. Raises GraphError where there is none."""
     covariance, noise_warnings, source = edge_covariance(odometry, keyframes.stamp_ns, settings.noise)
     graph, rows, build_warnings = build.build_graph(keyframes, covariance, closures)
     broken = broken_edges(odometry, keyframes.stamp_ns)
     graph = pieces_placed(graph, broken)
     of_odometry = by_odometry(graph, closures, rows)
     fixes, cost, scale, present = None, None, 1.0, graph
-    if settings.gps.use or not odometry.drifts:
+    if (settings.gps.use and odometry.metric) or not odometry.drifts:
         fixes = fixes_on(gps, odometry, keyframes, settings.gps)
         odometry_alone = Solution(graph.world_from_body, np.where(is_loop(graph), 0.0, 1.0), 0.0, 0.0, 0, True, "")
         # with the odometry's noise as claimed, or it would follow errors of satellites that closures then contradict

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import platform
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,13 +11,14 @@ from typing import Any
 
 from vplog import logs
 from vplog.errors import LogError, ResultError
+from vplog.logs.topic_selection import OPTIONS
 from vplog.results import run_record
 from vplog.run.cache.code_hash import version
 from vplog.settings import Settings
 from vplog.stages import Log
 from vplog.storage.input_hashes import bytes_of, files_of, stat_signature
 from vplog.storage.json_records import key_of
-from vplog.storage.remote_path import local_copy, located, original, reason
+from vplog.storage.remote_path import address, local_copy, located, original, reason
 from vplog.version import __version__
 
 OWN_LIBRARY = "the drive's own keyframes"
@@ -74,12 +76,12 @@ def logs_of(drives: Sequence[Path]) -> dict[str, Any]:
 @contextmanager
 def library_at(folder: Path, record: dict[str, Any]) -> Iterator[Path]:
     """The library of a run by its run.json: in its folder, or where it is from. Raises LogError, ResultError."""
-    library = folder / "library"
-    if not (library / "library.json").is_file():
-        about = record.get("library")
-        if not isinstance(about, dict) or not isinstance(about.get("from"), str):
-            raise ResultError(f"{folder}/run.json lacks library.from. Run `vplog run` again.")
-        library = located(about["from"])
+    library, about = folder / "library", record.get("library")
+    origin = about.get("from") if isinstance(about, dict) else None
+    if isinstance(origin, str) and origin != OWN_LIBRARY:  # one in the folder is that of a run before
+        library = located(origin)
+    elif not (library / "library.json").is_file():
+        raise ResultError(f"{folder} has no library. Run `vplog run` again.")
     with local_copy(library) as here:
         yield here
 
@@ -100,6 +102,34 @@ def head(
         "versions": versions(),
         **({} if topics is None else {"topics": topics.model_dump(mode="json")}),
     }
+
+
+def arguments(
+    paths: Sequence[Path], topics: logs.TopicChoice, pipeline: Settings | None = None, library: Path | None = None
+) -> list[str]:
+    """Arguments of `vplog run` for the parts of this log with these topics, settings and library; without the folder
+    for the results and what `--decisions` names."""
+    chosen: list[tuple[str, Any]] = [(OPTIONS[name], value) for name, value in topics if name in OPTIONS]
+    chosen += [("image-topic", topic) for topic in topics.cameras or ()]
+    chosen += [("mask", f"{name}={path}" if name else path) for name, path in topics.masks.items()]
+    chosen += [("mask-topic", f"{name}={masks}") for name, masks in topics.mask_topics.items()]
+    chosen += [("library", None if library is None else library_of(library))]
+    if pipeline is not None:
+        default, given = (_leaves(one.model_dump(mode="json")) for one in (type(pipeline)(), pipeline))
+        changed = {name: value for name, value in given.items() if value != default.get(name)}
+        chosen += [("set", f"{one}={json.dumps(value)}") for one, value in changed.items() if one != "decisions.file"]
+    # a URL with its query is shown nowhere
+    logs_ = ["LOG" if address(path) != str(path) else str(path) for path in paths]
+    options = [text for name, value in chosen if value is not None for text in (f"--{name}", str(value))]
+    return [*logs_, *(["--one-drive"] if len(paths) > 1 else []), *options]
+
+
+def _leaves(tree: dict[str, Any], above: str = "") -> dict[str, Any]:
+    """Values of settings by their dotted names."""
+    found: dict[str, Any] = {}
+    for name, value in tree.items():
+        found |= _leaves(value, f"{above}{name}.") if isinstance(value, dict) else {f"{above}{name}": value}
+    return found
 
 
 def versions() -> dict[str, str]:

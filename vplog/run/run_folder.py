@@ -19,7 +19,7 @@ from vplog.run import provenance
 from vplog.run.cache.stage_cache import CACHE_FILES, ENDING
 from vplog.storage.folders import check_no_picture, check_regular, check_replaceable
 from vplog.storage.input_hashes import bytes_of, hash_inputs
-from vplog.storage.remote_path import located, stands_for
+from vplog.storage.remote_path import located, original, stands_for
 
 _RUN_FILES = (
     "run.json", "report.html", "result.mcap", "graph.g2o", "trajectory.tum", "keyframes.parquet", "descriptors.parquet",
@@ -169,8 +169,8 @@ def _check_same_logs(out: Path, files: Sequence[Path]) -> None:
     for one in drives or [record]:
         if one and not _is_of(one, files, several=bool(drives)):
             raise SettingsError(
-                f"{out} is the run of {_named(one)}, and {given} is another log, or has changed since. Choose another "
-                "folder with -o, or replace that run with --force."
+                f"{original(out)} is the run of {_named(one)}, and {given} is another log, or has changed since. "
+                "Choose another folder with -o, or replace that run with --force."
             )
 
 

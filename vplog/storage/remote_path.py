@@ -333,11 +333,16 @@ def _download(path: RemotePath, target: Path) -> None:
             shutil.copyfileobj(source, sink, _BLOCK_BYTES)
 
 
+_RECORDS = ("run.json",), ("library.json", "features.parquet", "references.parquet")
+"""Files by which a run or a library is known."""
+
+
 @contextmanager
 def local_output(path: Path | RemotePath) -> Iterator[Path]:
     """Where to write what is to end at `path`: there, or for a remote one a local folder that is sent when all is done,
-    run.json last; nothing of what failed. Raises ResultError where the server does not take it, before any work where
-    there is none, SettingsError for one that takes nothing."""
+    run.json last; nothing of what failed. The record of a run or library that is there is in it, so that that of other
+    logs is refused as in a folder. Raises ResultError where the server does not take it, before any work where there is
+    none, SettingsError for one that takes nothing."""
     if not isinstance(path, RemotePath):
         yield path
         return
@@ -345,6 +350,9 @@ def local_output(path: Path | RemotePath) -> Iterator[Path]:
     _check_bucket(path)
     with scratch("url") as folder:
         target = folder / (path.name or "out")
+        names = next((names for names in _RECORDS if (path / names[0]).is_file()), ())
+        for name in names:
+            _download(path / name, target / name)
         with stands_for(target, path):
             yield target
         files = [target] if target.is_file() else sorted(file for file in target.rglob("*") if file.is_file())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -49,8 +48,7 @@ def ask(folder: Path, count: int = 10, output: Path | None = None) -> dict[str, 
         "decided": len(lines),
         "left": len(found) - len(chosen),
         "decisions": str(path),
-        "command": f"vplog run {shlex.quote(str(record.get('log')))} -o {shlex.quote(str(folder))} "
-        f"--decisions {shlex.quote(str(path))}",
+        "command": run_record.command_of(record, folder, "--decisions", path),
     }
 
 

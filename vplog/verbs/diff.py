@@ -93,12 +93,12 @@ def write_page(
     baseline, run = Path(found["baseline"]), Path(found["run"])
     record = run_record.read_single_run(run)
     known, poses, everything = _same_stamps((baseline, run))
-    run_from_baseline, _ = se3.umeyama(known[:, :3, 3], poses[:, :3, 3])
+    run_from_baseline, scale = se3.umeyama(known[:, :3, 3], poses[:, :3, 3], not _in_metres((baseline, run)))
     changes = {tuple(pair): kind for kind in ("gained", "lost") for pair in found["closures"][kind]}
     closures = tables.read_closures(run / "closures.parquet")
     stamps = tables.read_keyframes(run / "keyframes.parquet")[0].stamp_ns
     pairs = zip(stamps[closures.query].tolist(), stamps[closures.match].tolist(), strict=True)
-    at = se3.transform(run_from_baseline, everything[:, :3, 3])
+    at = se3.transform(run_from_baseline, scale * everything[:, :3, 3])
     judged = judge(run, record, truth, topics, options or TruthOptions()) if truth is not None else None
     write_report(run, record, path, judged, changes=Changes(found, at, [changes.get(pair) for pair in pairs]))
 
@@ -135,10 +135,15 @@ def _closures(folder: Path) -> dict[tuple[int, int], None]:
 
 
 def _moved(folders: Sequence[Path]) -> dict[str, Any]:
-    """Distance and angle between the trajectories of two runs where they have the same stamps."""
+    """Distance and angle between the trajectories of two runs where they have the same stamps; in the unit of the
+    first, by a similarity where one of them has no metres."""
     known, poses, _ = _same_stamps(folders)
-    aligned, _ = se3.umeyama(poses[:, :3, 3], known[:, :3, 3])
-    return motion_figures(se3.between(known, aligned @ poses))
+    aligned, scale = se3.umeyama(poses[:, :3, 3], known[:, :3, 3], not _in_metres(folders))
+    return motion_figures(se3.between(known, aligned @ se3.stretched(poses, scale)))
+
+
+def _in_metres(folders: Sequence[Path]) -> bool:
+    return all(run_record.has_metres(run_record.read_run_json(folder / "run.json")) for folder in folders)
 
 
 def _same_stamps(folders: Sequence[Path]) -> tuple[Floats, Floats, Floats]:

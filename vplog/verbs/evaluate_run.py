@@ -36,6 +36,7 @@ _FIGURES = {
 }
 FIGURES = tuple(_FIGURES)
 """Names of the figures of a run against the truth."""
+_BESIDE = {"odometry_file", "calibration_file", "masks"}
 _PUT_BACK = "Put it back there, or give a truth file: --truth FILE.tum."
 
 
@@ -104,9 +105,16 @@ def broken_limits(found: dict[str, Any], limits: Sequence[Limit]) -> list[str]:
     return sentences
 
 
+def recorded_topics(record: dict[str, Any], topics: logs.TopicChoice | None) -> logs.TopicChoice:
+    """The topics of a run, those given in their place; without files beside the log, which may be gone."""
+    known = logs.TopicChoice.read(record.get("topics") or {}, "run.json").model_dump(exclude=_BESIDE)
+    given = {} if topics is None else topics.model_dump(exclude_defaults=True)
+    return logs.TopicChoice.model_validate(known | given)
+
+
 def log_truth(record: dict[str, Any], topics: logs.TopicChoice | None, options: TruthOptions) -> Trajectory | Gps:
     """The ground truth that comes with the log of a run, else its fixes. Raises TruthError where it has neither."""
-    log = reopened(record, None, topics, _PUT_BACK)
+    log = reopened(record, None, recorded_topics(record, topics), _PUT_BACK)
     found = log.truth()
     found = log.gps() if found is None else _shifted(found, options) if isinstance(found, Trajectory) else found
     if found is None:
@@ -270,7 +278,7 @@ def _against_gps(
     if options.align == "origin":
         raise TruthError("--truth gps takes no --align origin: fixes have no orientation. Choose se3 or sim3.")
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
-    fixes = reopened(record, None, topics, _PUT_BACK).gps() if fixes is None else fixes
+    fixes = reopened(record, None, recorded_topics(record, topics), _PUT_BACK).gps() if fixes is None else fixes
     if fixes is None or not len(fixes.stamp_ns):
         raise TruthError(f"{record.get('log')} has no GPS fixes. Give a truth file: --truth FILE.tum")
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)

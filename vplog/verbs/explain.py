@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vplog import logs
-from vplog.data import Bytes, Camera, Closures, Features, Keyframes
+from vplog.data import USED, Bytes, Camera, Closures, Features, Keyframes
 from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
@@ -51,6 +51,9 @@ def explain(
     siblings = [closures.verdict[one].value for one in np.flatnonzero(closures.query == row["query"])]
     reason = str(run_record.recorded(record, folder / "run.json", dict, "solution").get("reason", ""))
     explanation = explain_text.describe(row, keyframes, world_from_body, siblings, pipeline, reason)
+    if not run_record.has_metres(record):
+        text = f"{explanation.solver} This run has no metres: lengths in m here are in its own unit."
+        explanation = replace(explanation, solver=text)
     shown = None
     if not words_only:
         topics = logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json")
@@ -72,9 +75,12 @@ def explain(
 def _chosen(closure: tuple[int, ...] | None, closures: Closures, keyframes: Keyframes) -> int:
     """Row of the ledger."""
     if closure is None:
-        if not np.isfinite(closures.residual_after).any():
-            raise ResultError("No closure of this run was given to the solver. Name one with --closure K.")
-        return int(np.nanargmax(closures.residual_after))
+        if not len(closures):
+            raise ResultError("No closure was proposed in this run: no keyframe has older ones to compare it with.")
+        for among in (closures.of(*USED), np.isfinite(closures.residual_after)):
+            if np.isfinite(residual := np.where(among, closures.residual_after, np.nan)).any():
+                return int(np.nanargmax(residual))
+        return int(np.argmax(closures.inliers))
     if len(closure) == 1:
         return closure[0]
     rows = [row_of(keyframes, one) for one in closure]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -21,16 +20,16 @@ from vplog.logs.clocks import GAP_NS, GAP_PERIODS
 from vplog.logs.image_folder import PERIOD_NS
 from vplog.logs.odometry_sources import PROPERTIES, evidence_text
 from vplog.logs.stamps import rate_hz
-from vplog.logs.topic_selection import OPTIONS
 from vplog.results.html import render
 from vplog.results.previews import jpeg
+from vplog.results.run_record import command_of
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.run.lidar_odometry import new_registration
 from vplog.run.odometry import UNIT, about_assumed, gives_visual, is_metric, source_of
+from vplog.run.provenance import arguments
 from vplog.run.visual_odometry.visual import visual_odometry
 from vplog.stages import Log
 from vplog.storage.json_records import plain
-from vplog.storage.remote_path import address
 from vplog.storage.scratch import replacing
 
 _SAMPLES = 8
@@ -50,6 +49,7 @@ _PART_WORDS = {
     "depth": "depth",
     "camera_info": "calibration",
     "right_info": "calibration of the right camera",
+    "depth_info": "calibration of the depth",
     "odometry": "odometry",
     "gps": "satellite fixes",
     "imu": "IMU of the odometry",
@@ -166,12 +166,7 @@ def _use(used: bool, possible: bool) -> str:
 
 def command(path: Path, topics: TopicChoice) -> str:
     """The command that runs on this log with these topics."""
-    chosen = {name: value for name, value in topics if name in OPTIONS and value is not None}
-    options = [f"--{OPTIONS[name]} {shlex.quote(str(value))}" for name, value in chosen.items()]
-    options += [f"--mask {shlex.quote(f'{name}={path}' if name else str(path))}" for name, path in topics.masks.items()]
-    options += [f"--mask-topic {shlex.quote(f'{name}={masks}')}" for name, masks in topics.mask_topics.items()]
-    log = "LOG" if address(path) != str(path) else shlex.quote(str(path))  # a URL with its query is shown nowhere
-    return " ".join(["vplog run", log, "-o OUT", *options])
+    return command_of({"arguments": arguments([path], topics)}, "OUT")
 
 
 @contextmanager

@@ -46,6 +46,8 @@ def report(
     Raises VplogError with one line.
     """
     record = run_record.read_single_run(folder)
+    if path is None and (folder / "drive.json").is_file():
+        raise ResultError(f"{folder} is a drive of a map, whose files stay as they are. Name another page with -o.")
     options = options or TruthOptions()
     if truth is None and options != TruthOptions():
         raise TruthError("--distance-m, --heading-deg, --align and --truth-offset-s need a truth: give --truth.")
@@ -87,7 +89,7 @@ def judge(
         judged.curves,
         judged.at_place,
         error_m,
-        np.where(at.known[closures.match] & at.known[closures.query], apart_m, np.nan),
+        np.where(at.known[closures.match] & at.known[closures.query] & found.truth.oriented, apart_m, np.nan),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -67,6 +68,14 @@ def test_images_of_ros(version: int, sec: int, nanos: int, frame: str, encoding:
     same(decode(channel, memoryview(message)), expected)
     assert stamp_of(channel, memoryview(message)) == sec * 10**9 + nanos
     refused(channel, message[:-1] if pixels else message[:-4], message + b"\0\0\0\0", message[:9])
+
+
+@given(SECONDS, NANOS, st.binary(max_size=40))
+def test_video_of_foxglove_as_ros1_has_no_sequence_number(sec: int, nanos: int, packet: bytes) -> None:
+    texts = b"".join(struct.pack("<I", len(text)) + text for text in (b"camera", packet, b"h264"))
+    channel, message = Channel("/t", "foxglove_msgs/CompressedVideo", "ros1"), struct.pack("<II", sec, nanos) + texts
+    same(decode(channel, message), ImageMessage(sec * 10**9 + nanos, "camera", "h264", packet, True))
+    assert stamp_of(channel, message) == sec * 10**9 + nanos
 
 
 @settings(deadline=None)

@@ -462,6 +462,15 @@ def test_luma_is_that_of_pictures() -> None:
     assert abs(int(np.median(image[:, 1:5])) - 230) <= 2
 
 
+@pytest.mark.parametrize(
+    ("set_range", "expected"), [(0, [0, 16, 235, 255]), (1, [0, 0, 255, 255]), (2, [0, 16, 235, 255])]
+)
+def test_a_grey_plane_has_the_full_range_unless_it_is_said(set_range: int, expected: list[int]) -> None:
+    frame = av.VideoFrame.from_ndarray(np.tile(np.array([[0, 16, 235, 255]], np.uint8), (4, 1)), "gray")
+    frame.color_range = set_range
+    np.testing.assert_array_equal(video_module.grey(frame), [expected] * 4)
+
+
 FILES = {"h264": "a.mp4", "vp9": "a.webm", "av1": "a.mkv"}
 
 

@@ -26,6 +26,7 @@ from vplog.maps.joining import drive_pairs
 from vplog.maps.joining import join as map_join
 from vplog.maps.joining.inter_session import Candidates, candidates_among, likely_drives, proposed_in, with_proposals
 from vplog.maps.joining.join import read_drives
+from vplog.maps.joining.join_states import read_states
 from vplog.maps.joining.joint_record import components_in
 from vplog.maps.merge import merge_maps
 from vplog.maps.storage import map_store
@@ -378,3 +379,14 @@ def test_drives_that_satellites_tell_apart_are_not_compared(copy: Path) -> None:
     far = PIPELINE.model_copy(update={"join": JoinSettings(apart_m=1.0)})
     with map_store.reading(copy) as store:
         assert candidates.drives_to_search(store, records, later, state, far)[3] == [1, 2]
+
+
+def test_a_drive_that_comes_back_is_a_new_one(halves: Path, tmp_path: Path) -> None:
+    """Others may have come meanwhile, which its old place in the order would leave it uncompared with."""
+    root = tmp_path / "map"
+    shutil.copytree(halves, root)
+    with map_store.writing(root) as store:
+        map_store.remove(store, ["before"])
+        assert set(read_states(store)) == {"before", "after"}
+        read_drives(store, {})
+        assert set(read_states(store)) == {"after"}

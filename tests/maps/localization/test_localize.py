@@ -17,6 +17,8 @@ from vplog.errors import LogError, ResultError, SettingsError, TruthError
 from vplog.geometry import se3
 from vplog.geometry.geodesy import geodetic
 from vplog.geometry.tum import read_tum
+from vplog.maps.joining.joint_record import joint_components, read_joint, write_joint
+from vplog.maps.storage import map_store
 from vplog.results import run_record, tables
 
 if TYPE_CHECKING:
@@ -160,6 +162,18 @@ def test_a_map_localises_in_the_frame_of_its_joined_drives(halves: Path, picture
     (most, count), (_, others) = Counter(one["frame"] for one in alone["answers"]).most_common(2)
     assert len(read_tum(out, TruthError, "-o")[0]) == count
     assert any(f"in the frame of {most}, and lacks {others} picture" in text for text in alone["warnings"])
+    less, replaced = tmp_path / "less", tmp_path / "replaced"
+    for copy in (less, replaced):
+        shutil.copytree(root, copy)
+    with map_store.writing(less) as store:
+        map_store.remove(store, ["before"])  # whose frame it was
+        assert joint_components(store)["after"].drives == ["after"]
+    left = api.localize(less, pictures / "pictures", topics=calibration)
+    assert {one["drive"] for one in left["answers"] if one["localized"]} == {"after"}
+    joint = read_joint(replaced)
+    write_joint(replaced, {**joint, "keys": {**joint["keys"], "after": "of another state"}})
+    with map_store.reading(replaced) as store:
+        assert "after" not in joint_components(store), "its joint poses are of other keyframes"
     image = next((pictures / "pictures").iterdir())
     assert vplog.open_map(root).localize(image, pictures / "camera.yaml").localized
     assert vplog.open_map(root).info(check=True)["damaged_files"] == []

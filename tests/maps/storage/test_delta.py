@@ -125,6 +125,7 @@ def test_others_read_a_map_at_a_version(root: Any, verb: Callable[..., Said], mo
     with map_store.writing(root) as store:
         assert delta.vacuum(store, time.time() - 3600) == {"objects": 0, "bytes": 0}
         assert delta.vacuum(store, time.time() + 3600)["objects"] >= 3 * len(map_store.TABLES)
+        assert delta.vacuum(store, time.time() - 3600) == {"objects": 0, "bytes": 0}, "by fewer hours than before"
     assert seen(root) == states[2]
     with pytest.raises(Exception, match="No files"):
         opened(root, "keyframes", 1)

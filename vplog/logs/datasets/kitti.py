@@ -37,8 +37,8 @@ def read(path: Path) -> DataSet:
     cameras = {one.name: one for one in read_calibrations(calibration)} if calibration.is_file() else {}
     streams = []
     for name in _CAMERAS:
-        files = image_files(path / name)
-        if rows := [int(file.stem) for file in files if file.stem.isdecimal()]:
+        files = [file for file in image_files(path / name) if file.stem.isdecimal()]
+        if rows := [int(file.stem) for file in files]:
             if max(rows) >= len(stamp_ns):
                 raise LogError(
                     f"{path / name} has an image {max(rows)}, and times.txt {len(stamp_ns)} rows only. Copy it again."

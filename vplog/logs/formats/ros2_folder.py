@@ -158,10 +158,12 @@ def _nanoseconds(tree: Any) -> int:
 
 
 def split_parts(files: list[Path]) -> list[Path] | None:
-    """The files in order where they are NAME_0, NAME_1, ... of one bag; else None."""
-    matches = [re.fullmatch(r"(.*)_(\d+)", file.stem) for file in files]
+    """The files in order where they are NAME_0, NAME_1, ... of one bag; else None. One that ROS 1 did not finish is
+    NAME_2.bag.active."""
+    names = [Path(file.name.removesuffix(".active")) for file in files]
+    matches = [re.fullmatch(r"(.*)_(\d+)", name.stem) for name in names]
     numbers = sorted((int(m[2]), file) for m, file in zip(matches, files, strict=True) if m)
-    one_name = len({m[1] for m in matches if m}) == 1 and len({file.suffix for file in files}) == 1
+    one_name = len({m[1] for m in matches if m}) == 1 and len({name.suffix for name in names}) == 1
     if not one_name or [number for number, _ in numbers] != list(range(len(files))):
         return None
     return [file for _, file in numbers]

@@ -46,7 +46,8 @@ def stamp_of(channel: Channel, data: RawData | Record) -> int:
         if len(data) < FRAME_ID_AT:
             raise BadMessageError(f"{len(data)} bytes are too few for a header")
         cdr, order = channel.encoding == "cdr", "<" if channel.encoding == "ros1" or data[1] == 1 else ">"
-        return nanoseconds(*struct.unpack_from(f"{order}{'i' if cdr else 'I'}I", data, 4))
+        at = 4 if cdr or short_type(channel.type) != "foxglove_msgs/CompressedVideo" else 0  # it has no std_msgs/Header
+        return nanoseconds(*struct.unpack_from(f"{order}{'i' if cdr else 'I'}I", data, at))
     record = decode(channel, data)
     return 0 if isinstance(record, list) else record.stamp_ns
 

@@ -36,8 +36,13 @@ _UNKNOWN_COVARIANCE = 0
 _RADIUS_95, _NORMAL_95 = 2.448, 1.960
 """Sigmas that 95 % of errors are below, in the plane and along an axis."""
 _UNKNOWN_VARIANCES = (math.nan,) * 6
-_SIDE = re.compile(r"(left|right|(?<![a-z])[lr](?![a-z]))", re.IGNORECASE)
-"""The side of a wheel in the name of its joint."""
+_SIDE = re.compile(r"(left|right)|(?<![a-z])[bfmr]?([lr])(?![a-z])", re.IGNORECASE)
+"""The side of a wheel in the name of its joint, there alone or behind back, front, middle or rear: `fl_wheel_joint`."""
+_NOT_DRIVEN = re.compile(
+    r"steer|cast[eo]r|^(?!.*wheel).*(gripper|finger|hand|arm|shoulder|elbow|wrist|hip|knee|ankle|leg|eye)",
+    re.IGNORECASE,
+)
+"""Names of joints with a side that drive no wheel: those that turn or trail one, and limbs."""
 _NED = 1
 """VehicleOdometry.POSE_FRAME_NED; 2 is a frame of its own, forward, right and down."""
 _ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -193,16 +198,18 @@ def _ackermann(fields: _Fields) -> Record:
 
 
 def _wheels(fields: _Fields) -> Record:
-    """Velocities of wheels in rad/s by their names: the mean of left and right, and their difference."""
+    """Velocities of wheels in rad/s by their names: the mean of left and right, and their difference. Where some joints
+    are wheels by name the others are none. Empty without both sides: an arm may share the topic."""
     stamp_ns, frame = fields.header()
     names = [fields.text() for _ in range(fields.numbers("I")[0])]
     _, speeds, _ = fields.doubles(), fields.doubles(), fields.doubles()
     sides: dict[str, list[float]] = {"l": [], "r": []}
-    for name, speed in zip(names, speeds.tolist(), strict=False):
+    driven = [one for one in zip(names, speeds.tolist(), strict=False) if not _NOT_DRIVEN.search(one[0])]
+    for name, speed in [one for one in driven if "wheel" in one[0].lower()] or driven:
         if side := _SIDE.search(name):
-            sides[side[1][0].lower()].append(speed)
+            sides[(side[1] or side[2])[0].lower()].append(speed)
     if not (sides["l"] and sides["r"]):
-        raise BadMessageError("it has no velocities of left and right wheels")
+        return []
     left, right = (sum(one) / len(one) for one in (sides["l"], sides["r"]))
     return _moving(stamp_ns, frame, ((left + right) / 2, 0.0, 0.0, 0.0, 0.0, right - left, *_UNKNOWN_VARIANCES))
 

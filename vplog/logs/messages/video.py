@@ -245,6 +245,7 @@ def grey(frame: Any) -> Bytes:
     plane = frame.planes[0]
     rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
     full = int(frame.color_range) == _FULL_RANGE or frame.format.name.startswith("yuvj")
+    full |= frame.format.name == "gray" and not int(frame.color_range)  # unset: as FFmpeg converts it
     return rows.copy() if full else _STRETCH[rows]
 
 

@@ -115,14 +115,17 @@ class Growth:
     def add(self, drives: Iterable[str]) -> None:
         """Place drives one after the other; what was alone is tried again when one that it has closures with is joined.
         Raises ResultError and DamagedDriveError."""
-        waiting = dict.fromkeys(drives)
+        waiting, parted = dict.fromkeys(drives), set[str]()
         while waiting:
             drive = next(iter(waiting))
             del waiting[drive]
             self._part[drive] = Part({drive: ""})
+            joined = {drive, *(one for one, part in self._part.items() if len(part.folders) > 1)}
             if self._placed(drive):
-                others = {one for pair in self._met[drive] for one in pair if one in self._part}
-                waiting |= dict.fromkeys(sorted(one for one in others if len(self._part[one].folders) == 1))
+                alone = {one for one, part in self._part.items() if len(part.folders) == 1}
+                parted |= joined & alone  # by the whole, which would part them again
+                others = {one for pair in self._met[drive] for one in pair} & alone - parted
+                waiting |= dict.fromkeys(sorted(others))
 
     def _placed(self, drive: str) -> bool:
         """Place a drive by its closures with those that are there, and put together what it joins."""

@@ -31,7 +31,7 @@ from vplog.maps.joining.join_states import JoinState, read_states, write_states
 from vplog.maps.joining.members import CameraTrust, Member, member_of
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import damaged_table
-from vplog.maps.storage.layout import PICTURES, folder_name
+from vplog.maps.storage.layout import PICTURES, PLACES_ONLY, folder_name
 from vplog.maps.storage.map_store import Store, reading, writing
 from vplog.maps.storage.snapshot import LostRaceError
 from vplog.pipeline import Pipeline
@@ -159,7 +159,7 @@ def read_drives(store: Store, urls: Mapping[str, str]) -> Drives:
     """Give new drives their place in the order, which stays: a killed join goes on as it began."""
     library = store.head().library or ""
     reasons, known = dict[str, str](), store.drives()
-    stored, states = read_states(store, known), dict[str, JoinState]()
+    stored, states = read_states(store), dict[str, JoinState]()
 
     def read(drive: str) -> Member:
         return member_of(store, {**known[drive], "log": urls.get(drive, known[drive]["log"])})
@@ -168,6 +168,9 @@ def read_drives(store: Store, urls: Mapping[str, str]) -> Drives:
         state = stored.get(drive)
         if about.get(PICTURES):
             reasons[drive] = f"{drive} has no odometry: it can be found, and is joined with no other drive."
+            continue
+        if PLACES_ONLY in about:
+            reasons[drive] = f"{drive} has places alone: it can be found, and is joined with no other drive."
             continue
         if state is None or state.key != about["key"]:
             try:
@@ -184,8 +187,10 @@ def read_drives(store: Store, urls: Mapping[str, str]) -> Drives:
     last = max((one.position for one in states.values()), default=-1)
     for number, drive in enumerate([drive for drive, one in states.items() if one.position < 0], start=last + 1):
         states[drive] = replace(states[drive], position=number)
-    if changed := {drive for drive, one in states.items() if one is not stored.get(drive)}:
-        write_states(store, states.values(), changed)
+    changed = {drive for drive, one in states.items() if one is not stored.get(drive)}
+    gone = [one for drive, one in stored.items() if drive not in states]
+    if changed or gone:
+        write_states(store, states.values(), changed, gone)
     order = sorted(states.keys() - reasons.keys(), key=lambda drive: (states[drive].position, drive))
     others = [one for drive, one in states.items() if drive in reasons]
     return Drives([states[one] for one in order], known, reasons, library, cache(lambda at: read(order[at])), others)

@@ -79,24 +79,28 @@ class JoinState:
 _STATES = TypeAdapter(list[JoinState])
 
 
-def read_states(store: Store, drives: Collection[str]) -> dict[str, JoinState]:
-    """The states that are known of these drives; of a damaged file none."""
+def read_states(store: Store) -> dict[str, JoinState]:
+    """The states that are known of drives, also of some that are gone; of a damaged file none."""
     files = sorted(f"joins/{name}" for name in store.names_beside("joins") if name.startswith(STATES))
     store.fetch_beside(files)
     found = dict[str, JoinState]()
     for name in files:
         with suppress(ResultError, ValueError):
             states = _STATES.validate_python(read_compressed(store.root / name))
-            found |= {state.drive: state for state in states if state.drive in drives}
+            found |= {state.drive: state for state in states}
     return found
 
 
-def write_states(store: Store, states: Iterable[JoinState], changed: Collection[str]) -> None:
-    """Write the files in which the states of these drives are. Raises ResultError."""
-    files: dict[int, list[JoinState]] = {}
+def write_states(
+    store: Store, states: Iterable[JoinState], changed: Collection[str], gone: Iterable[JoinState] = ()
+) -> None:
+    """Write the files in which the states of these drives are, and without those of drives that are `gone`: one that
+    comes back is a new one. Raises ResultError."""
+    without = {one.position // _OF_EACH for one in gone}
+    files: dict[int, list[JoinState]] = {number: [] for number in sorted(without)}
     for one in states:
         files.setdefault(one.position // _OF_EACH, []).append(one)
     for number, inside in files.items():
-        if any(one.drive in changed for one in inside):
+        if number in without or any(one.drive in changed for one in inside):
             rows = [asdict(one) for one in sorted(inside, key=lambda one: (one.position, one.drive))]
             write_compressed(store.root / "joins" / f"{STATES}{number:05d}.json.gz", rows)

@@ -91,11 +91,14 @@ def components_in(store: Store) -> list[dict[str, Any]] | None:
 
 
 def joint_components(store: Store) -> dict[str, Component]:
-    """The component of each drive that is in one. Raises ResultError where their record is damaged."""
+    """The component of each drive that is in one; drives that were removed or replaced since are in none, as a join may
+    be still to come. Raises ResultError where their record is damaged."""
     joint, found = store.root / "joint", dict[str, Component]()
-    for one in components_in(store) or []:
-        grown = one.get("grown", {})
-        found |= {drive: Component(joint / grown.get(drive, one["folder"]), one["drives"]) for drive in one["drives"]}
+    components, known = components_in(store) or [], store.drives()
+    replaced = replaced_since(store.root, known) if components else []
+    for one in components:
+        grown, there = one.get("grown", {}), [name for name in one["drives"] if name in known and name not in replaced]
+        found |= {drive: Component(joint / grown.get(drive, one["folder"]), there) for drive in there}
     return found
 
 

@@ -168,7 +168,8 @@ def select_views(log: Log, settings: KeyframeSettings) -> tuple[Ints, Keyframes 
     """Stamps (Q,) of the keyframes of a log, or of all its frames without odometry, and warnings."""
     odometry, stamps = log.odometry(), log.stamps()
     if odometry is None or len(odometry.stamp_ns) < 2:
-        return stamps, None, []
+        without = [] if log.file_names() else [f"{log.name} has no odometry, so every frame is a query."]
+        return stamps, None, without  # pictures never have any
     keyframes, warnings = select_keyframes(log.name, stamps, odometry, settings)
     return keyframes.stamp_ns, keyframes, warnings
 
@@ -181,9 +182,7 @@ def describe_log(
     `query` is False for a log that becomes a drive of the map. A descriptor takes some hundred bytes, and no image or
     feature is kept.
     """
-    stamps, keyframes, warnings = select_views(log, pipeline.keyframes)
-    if keyframes is None and log.file_names() is None:  # pictures never have odometry
-        warnings.append(f"{log.name} has no odometry, so every frame is a query.")
+    stamps, _, warnings = select_views(log, pipeline.keyframes)
     described, descriptors, lost = [], [], []
     found = _descriptors(log, stamps, pipeline, state, execution, query)
     for stamp_ns, descriptor, why in execution.counted("describe", found, len(stamps)):

@@ -141,7 +141,7 @@ def vacuum(store: Store, before: float) -> dict[str, int]:
         old = {name for name, meta in there.items() if meta["last_modified"].timestamp() < before}
         versions = [_version(name) for name in old if name.startswith("commits/")]
         commits = _commits(place, store, max(versions, default=0))
-        of_then = sum(one["version"] <= max(versions, default=0) for one in commits)
+        of_then = max(1, sum(one["version"] <= max(versions, default=0) for one in commits))
         needed = {*_files(commits[:of_then]), *(name for one in commits[of_then:] for name in one["added"])}
         first = commits[0]["version"] if commits else 0
         gone = [
@@ -171,6 +171,10 @@ def _commits(place: RemotePath, store: Store, at: int | None = None) -> list[del
     versions = [_version(name) for name in remote_path.objects_below(place / "commits")]
     newest = max(versions, default=-1)
     first = (newest if at is None else min(at, newest)) // _ALL_EVERY * _ALL_EVERY
+    gap = max({*range(first, newest)}.difference(versions), default=-1)
+    whole = (gap // _ALL_EVERY + 1) * _ALL_EVERY
+    if gap >= 0 and whole <= newest:  # an earlier `vacuum` removed what was before
+        first = whole
     with ThreadPoolExecutor(objects.AT_ONCE) as pool:
         names = [f"commits/{version:020}.json" for version in range(first, newest + 1)]
         found = list(pool.map(lambda name: objects.get(place / name), names if newest >= 0 else []))

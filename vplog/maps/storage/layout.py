@@ -32,6 +32,8 @@ ADD_AGAIN = "compute the drive again: vplog batch LOG -o MAP"
 """Remedy for a damaged drive in messages."""
 PICTURES = "pictures"
 """Field in drive.json of a folder of images without odometry: its places have no poses."""
+PLACES_ONLY = "places_of"
+"""Field in drive.json of a drive of which the map has the places alone: the file that they are from."""
 DESCRIBED_WITH = "described_with"
 """Field in drive.json of a drive whose places were made with a larger library than the map has since it was condensed:
 the hash of that one, by which its key and its joins are known."""

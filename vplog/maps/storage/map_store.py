@@ -129,7 +129,8 @@ def publish(store: Store, drive: str, made: Path, sent: upload.SentRun | None = 
     else:
         sent = sent or upload.send_run(store.mirror.remote, made, time.time())
         drive = upload.publish(store.mirror, drive, sent, made)
-    follow_with_delta(store, delta.PATIENCE_S)
+    with suppress(ResultError):  # the drive is in the map; the tables follow at the writer's end
+        follow_with_delta(store, delta.PATIENCE_S)
     return drive
 
 

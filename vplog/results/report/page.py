@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -15,6 +14,7 @@ from vplog.errors import plural
 from vplog.geometry import geodesy, se3
 from vplog.results.html import figure, mapping, render
 from vplog.results.report import charts
+from vplog.results.run_record import command_of, has_metres
 
 if TYPE_CHECKING:
     from vplog.results.geo import Earth
@@ -175,6 +175,11 @@ def page(content: ReportContent) -> str:
     )
 
 
+def _unit(content: ReportContent) -> str:
+    """Unit of length of the run."""
+    return "m" if has_metres(content.record) else "units of the run"
+
+
 def _tiles(content: ReportContent) -> list[tuple[str, str]]:
     """The drive in seven numbers, each with its label."""
     path_m = float(np.linalg.norm(np.diff(content.tracks.after.world_from_body[:, :3, 3], axis=0), axis=1).sum())
@@ -182,7 +187,7 @@ def _tiles(content: ReportContent) -> list[tuple[str, str]]:
     totals = mapping(content.record.get("totals"))
     return [
         (figure(len(content.tracks.keyframes.stamp_ns)), "keyframes"),
-        (f"{figure(path_m)} m", "path"),
+        (f"{figure(path_m)} {_unit(content)}", "path"),
         (f"{figure((int(stamps[-1]) - int(stamps[0])) / 1e9 if len(stamps) else 0.0)} s", "of drive"),
         (figure(len(content.closures)), "candidates"),
         (figure(int(content.closures.accepted.sum())), "accepted closures"),
@@ -214,7 +219,7 @@ def _questions(content: ReportContent) -> list[list[Any]]:
             (row := one.rows[0]),
             *(str(int(end[row])) for end in (closures.query, closures.match)),
             closures.verdict[row].value,
-            figure(closures.p_false[row], 3),
+            "-" if np.isnan(closures.p_false[row]) else f"{closures.p_false[row]:.3g}",
             figure(one.p_wrong, 3),
             figure(one.moved_m, 3),
             str(len(one.rows)),
@@ -226,12 +231,12 @@ def _questions(content: ReportContent) -> list[list[Any]]:
 def _certainty(content: ReportContent) -> list[str]:
     """The certificate of global optimality, and the uncertainty of the keyframes' positions."""
     found = [str(reason)] if (reason := mapping(content.record.get("certificate")).get("reason")) else []
-    sigma_m = _sigma_m(content.covariance)
+    sigma_m, unit = _sigma_m(content.covariance), _unit(content)
     if len(sigma_m := sigma_m[np.isfinite(sigma_m)]):
         to = "where GPS measures them" if content.record.get("gps") else "the first keyframe"
         found.append(
             f"Positions of keyframes relative to {to}, one sigma along the worst axis: median "
-            f"{figure(float(np.median(sigma_m)), 3)} m, largest {figure(float(sigma_m.max()), 3)} m."
+            f"{figure(float(np.median(sigma_m)), 3)} {unit}, largest {figure(float(sigma_m.max()), 3)} {unit}."
         )
     return found
 
@@ -253,15 +258,16 @@ def _over_time(content: ReportContent) -> list[charts.Chart]:
     poses = [(kind, name, track.world_from_body) for kind, name, track in both]
     yaw = [(kind, name, np.degrees(np.unwrap(np.arctan2(one[:, 1, 0], one[:, 0, 0])))) for kind, name, one in poses]
     speed_s, speed = _speed(sample_s, tracks.after.world_from_body[:, :3, 3])
+    unit = _unit(content)
     used, residual = closures.of(*USED), np.minimum(closures.residual_after, _MOST_SIGMA)
     dots = [("dot yes", "in the solution", used), ("dot no", "other closures", ~used)]
     solved, error_m = np.isfinite(residual), None if judged is None else judged.error_m
     residuals = [(kind, name, np.where(rows, residual, np.nan)[solved]) for kind, name, rows in dots]
     drawn: list[tuple[str, Floats, list[tuple[str, str, Floats]]]] = [
-        ("height, z in m", sample_s, [(kind, name, one[:, 2, 3]) for kind, name, one in poses]),
+        (f"height, z in {unit}", sample_s, [(kind, name, one[:, 2, 3]) for kind, name, one in poses]),
         ("heading, yaw in degrees", sample_s, yaw),
-        ("speed in m/s", speed_s, [("after", "optimised", speed)]),
-        ("position, one sigma in m", keyframe_s, [("after", "one sigma", _sigma_m(content.covariance))]),
+        (f"speed in {unit}/s", speed_s, [("after", "optimised", speed)]),
+        (f"position, one sigma in {unit}", keyframe_s, [("after", "one sigma", _sigma_m(content.covariance))]),
         (
             f"residual of closures in sigma, cut at {_MOST_SIGMA:.0f}",
             keyframe_s[closures.query[solved]],
@@ -308,7 +314,7 @@ def _map(content: ReportContent) -> tuple[list[tuple[str, str]], dict[str, Any]]
     false = false_closures(content)
     groups = [
         ("yes", "closures in the solution", closures.of(*USED) & ~false),
-        ("no", "closures the solver or a decision rejected", closures.of(*_AFTER_GEOMETRY)),
+        ("no", "closures the solver, the false rate or a decision rejected", closures.of(*_AFTER_GEOMETRY)),
         ("false", "closures in the solution that are false", false),
         ("before", "candidates that geometry rejected", ~closures.of(*USED, *_AFTER_GEOMETRY)),
     ]
@@ -375,14 +381,15 @@ def _views(content: ReportContent) -> tuple[dict[str, Any], dict[str, str]]:
 def _audit(content: ReportContent, drawn: dict[str, Any]) -> dict[str, Any]:
     """Data of the page's script."""
     views, references = _views(content)
-    closures, log = content.closures, content.record.get("log")
+    closures = content.closures
     order = np.lexsort((-closures.score.astype(np.float64), ~closures.of(*USED)))
     columns = _columns(content, sorted(order[:_MOST_ROWS].tolist()))
     start_ns = int(content.tracks.after.stamp_ns[0])
-    command = f"vplog run {shlex.quote(str(log))} -o RUN --decisions decisions.csv"
+    command = command_of(content.record, "RUN", "--decisions", "decisions.csv")
     return {
         "columns": columns,
         "scales": _scales(columns, drawn["error_m"]),
+        "unit": _unit(content),
         "used": [verdict.value for verdict in USED],
         "sentences": {verdict.value: verdict.sentence for verdict in Verdict},
         "stamps": list(map(str, content.tracks.keyframes.stamp_ns.tolist())),  # beyond 2^53, where JavaScript rounds
@@ -427,9 +434,10 @@ def _columns(content: ReportContent, rows: list[int]) -> dict[str, list[Any]]:
         columns["change"] = [content.changes.change[row] for row in rows]
     whole = ("query", "match", "rank", "matches", "inliers", "reverse_inliers", "support")
     whole += () if closures.of_first_camera.all() else ("query_camera", "match_camera")
-    shares = {"residual_before": 2, "residual_after": 2, "p_false": 4, "weight": 3, "score": 4, "spread": 3}
+    shares = {"residual_before": 2, "residual_after": 2, "weight": 3, "score": 4, "spread": 3}
     columns |= {name: getattr(closures, name)[rows].tolist() for name in whole}
     columns |= {name: _rounded(getattr(closures, name)[rows], digits) for name, digits in shares.items()}
+    columns["p_false"] = [float(f"{one:.3g}") if np.isfinite(one) else None for one in closures.p_false[rows].tolist()]
     columns["metres"] = _rounded(np.linalg.norm(closures.match_from_query[rows, :3, 3], axis=1), 2)
     if judged is not None and judged.closure_error_m is not None:
         columns["error_m"] = _rounded(judged.closure_error_m[rows], 2)

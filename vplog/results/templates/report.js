@@ -3,10 +3,11 @@
   const $ = (id) => document.getElementById(id), data = JSON.parse($("audit").textContent);
   const { columns, used, stamps, thumbnails, sentences } = data;
   const count = columns.row.length, names = Object.keys(columns);
+  const afterGeometry = new Set(["rejected_by_solver", "not_significant", "rejected_by_decision"]);
   const isUsed = (row) => used.includes(columns.verdict[row]);
   const isFalse = (row) => isUsed(row) && columns.true?.[row] === "no";
   const kindOf = (row) => isFalse(row) ? "false" : isUsed(row) ? "yes"
-    : columns.residual_after[row] !== null || columns.verdict[row] === "rejected_by_decision" ? "no" : "before";
+    : columns.residual_after[row] !== null || afterGeometry.has(columns.verdict[row]) ? "no" : "before";
 
   // Decisions: by "query,match"; those that the run followed are there from the start
   const decisions = new Map(), pairOf = (row) => columns.query[row] + "," + columns.match[row];
@@ -34,7 +35,7 @@
   const aliases = { keyframe: ["query", "match"], residual: ["residual_after"] };
   const compare = { "<": (a, b) => a < b, ">": (a, b) => a > b, "=": (a, b) => a === b, "<=": (a, b) => a <= b, ">=": (a, b) => a >= b };
   const test = (term) => {
-    const [, name, operator, number] = /^([a-z_]+)(<=|>=|<|>|=)(-?[\d.]+)$/.exec(term) ?? [];
+    const [, name, operator, number] = /^([a-z_]+)(<=|>=|<|>|=)(-?[\d.]+(?:e[-+]?\d+)?)$/.exec(term) ?? [];
     const of = (aliases[name] ?? [name]).filter((one) => columns[one]);
     if (of.length) return (row) => of.some((one) => columns[one][row] !== null && compare[operator](columns[one][row], +number));
     return (row) => (columns.verdict[row] + " " + (decisions.get(pairOf(row))?.decision ?? "") + " true:" + columns.true?.[row] + " " + columns.change?.[row]).includes(term);
@@ -165,7 +166,7 @@
     }
     const metres = round(120 / view.scale);
     pen.fillStyle = colour("ink"); pen.fillRect(16, height - 16, metres * view.scale, 2);
-    word(+metres.toPrecision(1) + " m", 16, height - 22);
+    word(+metres.toPrecision(1) + " " + data.unit, 16, height - 22);
     const origin = place(view.middle), foot = [width - 60, height - 60];
     for (const [name, axis] of Object.entries(data.map.axes)) {
       const long = name === "N" ? 38 : 26, tip = place(axis.map((value, at) => view.middle[at] + value));

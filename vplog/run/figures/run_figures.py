@@ -267,6 +267,9 @@ def earth_of(
     if inside.sum() < _LEAST_FIXES:
         return None
     poses = se3.interpolate_at(trajectory.stamp_ns, trajectory.world_from_body, fixes.stamp_ns[inside])
-    enu_from_world, scale = se3.umeyama(poses[:, :3, 3], fixes.enu_m[inside], with_scale=not metric)
+    antenna_m = np.zeros(3) if gps.antenna_m is None or not metric else gps.antenna_m
+    enu_from_world, scale = se3.umeyama(
+        se3.transform(poses, antenna_m[None])[:, 0], fixes.enu_m[inside], with_scale=not metric
+    )
     enu_from_world[:3, :3] *= scale
     return Earth(fixes.origin, enu_from_world) if scale > 0.0 else None

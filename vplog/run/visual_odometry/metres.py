@@ -80,7 +80,7 @@ def random_walk(sigma: Floats) -> sparse.csr_array:
 
 
 def _sigma_m(gps: Gps) -> float:
-    variance = np.trace(gps.covariance, axis1=1, axis2=2) / 3.0
+    variance = np.trace(gps.covariance[:, :2, :2], axis1=1, axis2=2) / 2.0  # the altitude may not be known
     known = variance[np.isfinite(variance) & (variance > 0)]
     return float(np.sqrt(np.median(known))) if len(known) else RECEIVER_SIGMA_M
 
