@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vplog import logs
-from vplog.errors import LogError, ResultError
+from vplog.errors import LibraryError, LogError, ResultError
 from vplog.logs.topic_selection import OPTIONS
 from vplog.results import run_record
 from vplog.run.cache.code_hash import version
@@ -75,13 +75,13 @@ def logs_of(drives: Sequence[Path]) -> dict[str, Any]:
 
 @contextmanager
 def library_at(folder: Path, record: dict[str, Any]) -> Iterator[Path]:
-    """The library of a run by its run.json: in its folder, or where it is from. Raises LogError, ResultError."""
+    """The library of a run by its run.json: in its folder, or where it is from. Raises LogError, LibraryError."""
     library, about = folder / "library", record.get("library")
     origin = about.get("from") if isinstance(about, dict) else None
     if isinstance(origin, str) and origin != OWN_LIBRARY:  # one in the folder is that of a run before
         library = located(origin)
     elif not (library / "library.json").is_file():
-        raise ResultError(f"{folder} has no library. Run `vplog run` again.")
+        raise LibraryError(f"{folder} has lost its library. Run `vplog run` again.")
     with local_copy(library) as here:
         yield here
 
