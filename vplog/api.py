@@ -389,7 +389,7 @@ def batch(
     from vplog.batch.drive_inputs import drive_inputs
     from vplog.storage.remote_path import local_copy, located
 
-    inputs, parts, threads = drive_inputs(_paths(list(logs))), _topics(topics), threads or available()
+    inputs, parts, threads = drive_inputs(_paths(logs)), _topics(topics), threads or available()
     if parts is not None and parts.odometry_file is not None and len(inputs) > 1:
         raise SettingsError(
             f"--odometry-file {parts.odometry_file} is of one drive, and {len(inputs)} logs are given. "
@@ -557,8 +557,8 @@ def _topics(topics: Topics | None) -> TopicChoice | None:
     """The choice of topics, with absolute paths of files, so that run.json is understood from any folder."""
     from vplog.logs import TopicChoice
 
-    if topics is None or isinstance(topics, TopicChoice):
-        return topics
-    choice = TopicChoice.read(dict(topics), "topics")
+    if topics is None:
+        return None
+    choice = topics if isinstance(topics, TopicChoice) else TopicChoice.read(dict(topics), "topics")
     files = {name: path.resolve() for name in ("odometry_file", "calibration_file") if (path := getattr(choice, name))}
     return choice.model_copy(update={**files, "masks": {one: path.resolve() for one, path in choice.masks.items()}})

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from tests.maps.bucket import serving
-from vplog.batch.drive_inputs import drive_inputs
+from vplog.batch.drive_inputs import _beside, drive_inputs
 from vplog.batch.plan import with_topics
 from vplog.errors import LogError, ResultError, SettingsError
 from vplog.logs import TopicChoice
@@ -111,3 +112,11 @@ def test_one_line_says_what_is_wrong_in_a_manifest(text: str, wrong: str, tmp_pa
     (tmp_path / "drives.parquet").write_bytes(b"PAR1 no")
     with pytest.raises(ResultError, match=r"drives.parquet cannot be read"):
         drive_inputs([tmp_path / "drives.parquet"])
+
+
+def test_a_list_of_a_server_names_no_file_of_this_machine(tmp_path: Path) -> None:
+    remote: Any = RemotePath("https://example.org/fleet/drives.csv")
+    assert str(_beside(remote, "a.mcap")) == "https://example.org/fleet/a.mcap"
+    with pytest.raises(SettingsError, match="a file of this machine"):
+        _beside(remote, str(tmp_path / "private.mcap"))
+    assert _beside(tmp_path / "drives.csv", "/logs/a.mcap") == Path("/logs/a.mcap")

@@ -12,7 +12,7 @@ import pytest
 
 from vplog.batch.worker import DriveState
 from vplog.cli import progress
-from vplog.cli.progress import Events, Progress
+from vplog.cli.progress import Events, Progress, _Stage
 from vplog.pipeline import STAGES
 from vplog.results.run_record import read_run_json, write_run_json
 
@@ -137,3 +137,9 @@ def test_off_a_terminal_a_stage_that_is_silent_has_its_line(tmp_path: Path, monk
         shown("solve", 0, 1)
         time.sleep(0.2)
     assert not lines
+
+
+def test_what_was_there_before_makes_no_stage_look_fast() -> None:
+    stage = _Stage("extract", 6000, time.monotonic() - 10.0, done=5410, known=5400)
+    assert stage.eta_s() == pytest.approx(590.0, rel=0.1)
+    assert _Stage("extract", 6000, time.monotonic(), done=5400, known=5400).eta_s() is None

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from vplog.execution.cores import limited
 from vplog.execution.execution import Execution, logged_warnings
 
 if TYPE_CHECKING:
@@ -109,3 +110,14 @@ def test_warnings_are_recorded_where_the_caller_silences_them(level: int, caplog
         logger.setLevel(before)
     assert warnings == ["poor"]
     assert caplog.messages == (["poor"] if level == logging.NOTSET else [])
+
+
+def test_opencv_has_as_many_threads_afterwards_as_before() -> None:
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(3)
+    try:
+        with limited(2):
+            assert list(Execution(2).map(lambda _: cv2.getNumThreads(), range(4))) == [1] * 4
+        assert cv2.getNumThreads() == 3
+    finally:
+        cv2.setNumThreads(before)

@@ -8,6 +8,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -258,3 +259,15 @@ def test_a_library_of_thumbnails_describes_as_the_whole_one(references: list[Ref
     small.save_small(tmp_path)
     again = BobbSettings().load(tmp_path, Execution())
     assert again.to_arrow([again.describe(seen)]) == state.to_arrow([state.describe(seen)])
+
+
+def test_images_that_claim_more_px_than_their_bytes_hold_are_refused_before_they_are_decoded(saved: Path) -> None:
+    """One PNG of 60 kB and 67 Mpx may stand in a thousand rows."""
+    table = pq.read_table(saved / "references.parquet")
+    black = cv2.imencode(".png", np.zeros((1024, 1024), np.uint8))[1].tobytes()
+    rows = [{**table.to_pylist()[0], "image": black, "width": 32_000, "height": 32_000}] * 2
+    pq.write_table(pa.Table.from_pylist(rows, table.schema), saved / "references.parquet")
+    features = pq.read_table(saved / "features.parquet").slice(0, 0)
+    pq.write_table(features, saved / "features.parquet")
+    with pytest.raises(LibraryError, match="more px than their bytes hold"):
+        library_files.load_references(saved)

@@ -231,3 +231,11 @@ def test_stderr_of_a_command_has_vplogs_lines_alone(tmp_path: Path, verb: Callab
     assert "Lost: " in said.err
     for line in said.err.splitlines():
         assert not any(word in line for word in ("libpng", "JPEG data", "[ERROR", "[ WARN", "imdecode_")), line
+
+
+def test_a_jpeg_of_thousands_of_scans_is_refused() -> None:
+    """Each is a pass over all blocks: 16 MB of them take half an hour."""
+    data = cv2.imencode(".jpg", np.zeros((64, 64), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    scan = data.rindex(b"\xff\xda")
+    with pytest.raises(BadImageError, match="more than 500 scans"):
+        decode_image(data[:scan] + data[scan:-2] * 1000 + data[-2:])

@@ -120,7 +120,9 @@ def _lines(file: Path) -> Iterator[str]:
 
 
 def _beside(file: Path, text: str) -> Path:
-    """The place that a list or a manifest names."""
+    """The place that a list or a manifest names. Raises SettingsError where one of a server names a file here."""
+    if isinstance(file, RemotePath) and text.startswith("/"):
+        raise SettingsError(f"{file} names {text[:80]!r}, a file of this machine. Name what lies beside it, or URLs.")
     if "://" in text or text.startswith("/"):
         return located(text)
     return located(f"{file.url.rpartition('/')[0]}/{text}") if isinstance(file, RemotePath) else file.parent / text

@@ -41,6 +41,7 @@ from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record
 from vplog.results.staging import check_contents, staged
 from vplog.stages import Log
+from vplog.storage.remote_path import located
 from vplog.storage.scratch import replacing
 from vplog.version import __version__
 
@@ -323,7 +324,7 @@ def _comparison_in(out: Path, query: Path, other: Path) -> list[str]:
     if path.exists():
         earlier = run_record.read_run_json(path)
         drives = [str(earlier.get(name)) for name in ("query", "map")]
-        if not all(map(same_drive, map(Path, drives), (query, other))):
+        if not all(map(same_drive, map(located, drives), (query, other))):
             raise SettingsError(f"{out} holds a comparison of {' in '.join(drives)}. Choose another folder with -o.")
     return ["compare.json", "answers.csv", "scores-[0-9][0-9]-*.npz", *FIGURES]
 

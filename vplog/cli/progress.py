@@ -83,13 +83,15 @@ class _Stage:
     seconds: float | None = None
     """s that it took, None until it is finished."""
     reported_s: float = 0.0
+    known: int = 0
+    """Items that were there when it began, as far as its first report tells."""
 
     def rate(self) -> float:
         """Items a second, 0 where unknown."""
-        return self.done / max(time.monotonic() - self.began_s, 1e-9)
+        return (self.done - self.known) / max(time.monotonic() - self.began_s, 1e-9)
 
     def eta_s(self) -> float | None:
-        return (self.total - self.done) / self.rate() if self.done and self.total > 1 else None
+        return (self.total - self.done) / self.rate() if self.done > self.known and self.total > 1 else None
 
 
 class Progress:
@@ -143,7 +145,7 @@ class Progress:
         if stage is None or (stage.seconds is not None and done < total):
             if step:
                 self._finish_steps()
-            stage = self._stages[name] = _Stage(name, total, time.monotonic())
+            stage = self._stages[name] = _Stage(name, total, time.monotonic(), known=done if done > 1 else 0)
             self._write("stage_started", stage, total=total)
         if stage.seconds is not None:
             return

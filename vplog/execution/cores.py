@@ -7,6 +7,7 @@ of `graph/` lie between who knows the limit and the linear algebra that starts t
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -26,9 +27,13 @@ def allowed() -> int:
 
 @contextmanager
 def limited(threads: int | None) -> Iterator[None]:
-    """No more threads than so many for what is done inside; None changes nothing."""
-    before = _limit.set(threads or _limit.get())
+    """No more threads than so many for what is done inside; None changes nothing. OpenCV, which is told to start none
+    inside, has as many as before afterwards."""
+    before, cv2 = _limit.set(threads or _limit.get()), sys.modules.get("cv2")
+    started = -1 if cv2 is None else cv2.getNumThreads()  # -1 is its default
     try:
         yield
     finally:
         _limit.reset(before)
+        if (cv2 := sys.modules.get("cv2")) is not None:
+            cv2.setNumThreads(started)

@@ -34,11 +34,11 @@ class PaperBobbSettings(lib.WordSettings, RelearnedSettings):
     kind: Literal["bobb_paper"] = "bobb_paper"
     """Name of the recogniser."""
     l1_range: Literal[1, 2] = 1
-    references: int = Field(default=4, ge=1)
+    references: int = Field(default=4, ge=1, le=1000)
     """J: reference images that explain an image."""
-    boxes: int = Field(default=4, ge=1)
+    boxes: int = Field(default=4, ge=1, le=1000)
     """I: boxes mined on each of them."""
-    partitions: int = Field(default=200, ge=1)
+    partitions: int = Field(default=200, ge=1, le=10_000)
     """K: random partitions of a reference."""
     columns: int = Field(default=32, ge=1, le=256)
     """M: patches of a partition along the image's width."""

@@ -61,7 +61,7 @@ class FabmapSettings(RelearnedSettings):
     100, that by which a hundred references are best told apart."""
     new_place: Literal["mean_field", "sampled"] = "mean_field"
     """A place never seen is like the average place, or like a reference; those must be from elsewhere then."""
-    samples: int = Field(default=100, ge=2)
+    samples: int = Field(default=100, ge=2, le=100_000)
     """References drawn for a sampled new place; all of them where they are fewer."""
     new_place_prior: float = Field(default=0.9, ge=0, lt=1)
     """Prior of a new place, as in the papers; the places share the rest alike. 0: all queries are in the map."""

@@ -26,7 +26,7 @@ class WordSettings(Settings):
 
     features: int = Field(default=800, ge=1)
     """Strongest features of an image that are used."""
-    neighbours: int = Field(default=10, ge=1)
+    neighbours: int = Field(default=10, ge=1, le=1024)
     """Nearest library features looked at for each feature."""
     max_l1: float = Field(default=0.4, ge=0)
     """Normalised L1 distance below which two descriptors are the same word: the paper's check."""
@@ -34,11 +34,11 @@ class WordSettings(Settings):
     """The largest distance that two descriptors can have: the paper does not say how its distance is normalised. 2: the
     descriptors have unit L1 length. 1: their distance is a share of the largest as well, so that twice as far is still
     the same word. The paper's measure, ANR, comes nearer to what it claims with 1 (docs/guides/compare.md)."""
-    hnsw_links: int = Field(default=16, ge=2)
+    hnsw_links: int = Field(default=16, ge=2, le=256)
     """Links of a node in the HNSW graph (Malkov & Yashunin 2018); recall of the first neighbour .94 at ef 16."""
-    hnsw_ef_construction: int = Field(default=40, ge=1)
+    hnsw_ef_construction: int = Field(default=40, ge=1, le=4096)
     """Breadth of the search while the graph is built."""
-    hnsw_ef_search: int = Field(default=16, ge=1)
+    hnsw_ef_search: int = Field(default=16, ge=1, le=4096)
     """Breadth of the search for a feature's neighbours; raised to `neighbours` where it is less."""
 
 

@@ -21,7 +21,7 @@ from vplog.errors import LibraryError, nearest_path
 from vplog.execution.execution import Execution
 from vplog.settings import Settings
 from vplog.storage.folders import check_regular
-from vplog.storage.image_file import BadImageError, decode_image
+from vplog.storage.image_file import BadImageError, decode_image, image_size
 from vplog.storage.json_records import has_checksum, with_checksum
 from vplog.storage.parquet_limits import check_columns, check_file, check_version, open_table, read_table, write_table
 from vplog.storage.scratch import put_in_place, sync_all
@@ -33,6 +33,9 @@ _MAX_FEATURES = 50_000_000
 """Features a library file may claim: 6.4 GB of descriptors, far above any library that one machine can search."""
 
 
+_MOST_PX, _PX_PER_BYTE = 2**30, 100
+"""Px of all images of a library that any may have, and px a byte that a larger one may: one image may stand in many
+rows, and take a byte for a thousand px."""
 _MAX_DESCRIPTOR = 4096
 """Bytes: above those of any local features in use."""
 
@@ -216,6 +219,9 @@ def load_references(folder: Path, execution: Execution = Execution()) -> list[Re
         if any(column.null_count for table in (features, references) for column in table.columns):
             raise LibraryError(f"{folder}: the tables have empty cells; build it again with `vplog library`.")
         entries = references.to_pylist()
+        claimed = sum(max(one["width"], 0) * max(one["height"], 0) for one in entries)
+        if claimed > max(_MOST_PX, _PX_PER_BYTE * (folder / "references.parquet").stat().st_size):
+            raise LibraryError(f"{folder}: the images of its references claim more px than their bytes hold.")
     owners = features["reference"].to_numpy()
     start = np.searchsorted(owners, np.arange(len(references) + 1)).tolist()
     if len(owners) and (owners[0] < 0 or owners[-1] >= len(references) or np.any(np.diff(owners) < 0)):
@@ -233,11 +239,11 @@ def load_references(folder: Path, execution: Execution = Execution()) -> list[Re
         inside = (points[part] > -1) & (points[part] < [width, height])
         if not (0 < width < 2**15 and 0 < height < 2**15 and np.all(inside)):
             raise LibraryError(f"{folder}: reference {row} has features outside its {width} x {height} image.")
+        side, stated = (THUMBNAIL_SIDE, THUMBNAIL_SIDE), image_size(entry["image"])
         try:
-            image = decode_image(entry["image"])
+            image = decode_image(entry["image"]) if stated in ((width, height), side) else None
         except BadImageError:
             image = None
-        side = (THUMBNAIL_SIDE, THUMBNAIL_SIDE)
         if image is None or image.shape not in ((height, width), side):
             raise LibraryError(
                 f"{folder}: the image of reference {row} is damaged; build it again with `vplog library`."

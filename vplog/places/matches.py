@@ -62,13 +62,13 @@ class WeighedMatchSettings(Settings):
     """A patch's match weighs this many times a keypoint's; 0 uses keypoints alone. A number for each reference, or one
     for all. None takes 2, and 0 on references where storeys or aisles of one layout mislead patches, as the library's
     own images show (see vplog/places/self_recognition.py)."""
-    neighbours: int = Field(default=24, ge=2)
+    neighbours: int = Field(default=24, ge=2, le=1024)
     """Nearest library features looked at for each feature; the last one sets the scale of the others' distances."""
     reach: float = Field(default=0.8, gt=0)
     """A match weighs 1 - d2 / (reach x d2 of the last neighbour), squared distances, and nothing below zero."""
-    hnsw_links: int = Field(default=16, ge=2)
+    hnsw_links: int = Field(default=16, ge=2, le=256)
     """Links of a node in the HNSW graph (Malkov & Yashunin 2018)."""
-    hnsw_ef_construction: int = Field(default=40, ge=1)
+    hnsw_ef_construction: int = Field(default=40, ge=1, le=4096)
     """Breadth of the search while the graph is built."""
 
 

@@ -52,7 +52,7 @@ class VectorsSettings(RelearnedSettings):
 
     def learn(self, references: Iterable[Reference], execution: Execution) -> VectorsState:
         """Nothing to learn. Raises LibraryError where there is no reference, or no file of vectors."""
-        paths = _files(self.file)
+        paths = vectors_files(self.file)
         tables = [_opened(path) for path in paths]
         lengths = {table.dimensions for table in tables}
         if len(lengths) > 1:
@@ -193,7 +193,7 @@ class _Stamped:
 def check_drives(places: object, drives: int) -> None:
     """Raises LibraryError where places are vectors of a file that does not say which of so many drives they are of."""
     if isinstance(places, VectorsSettings) and places.file and drives > 1:
-        path = _files(places.file)[-1]
+        path = vectors_files(places.file)[-1]
         if not _opened(path).names_drives:
             raise LibraryError(
                 f"{path} does not say which of {drives} drives its vectors are of. Give a Parquet file with "
@@ -205,7 +205,7 @@ def _opened(path: Path) -> _Rows | _Stamped:
     return _Rows(path) if path.suffix == ".npy" else _Stamped(path)
 
 
-def _files(name: str) -> list[Path]:
+def vectors_files(name: str) -> list[Path]:
     """The file, or the pair that it is one of. Raises LibraryError where there is none."""
     path = Path(name)
     if not name or not path.exists():

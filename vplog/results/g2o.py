@@ -123,11 +123,12 @@ def read_g2o(path: Path) -> GraphFile:
         _place(poses, given, a, b, measured, kind)
     information = _information(path, edges, values[:, layout.pose :], layout)
     held = 0
-    if unknown := [(line, name) for line, name in fixed if name not in ids]:
+    present = set(ids.tolist()) if fixed else set()
+    if unknown := [(line, name) for line, name in fixed if name not in present]:
         if not left_out:  # it may be one of these
             raise _at(path, unknown[0][0], f"FIX {unknown[0][1]}, and there is no such vertex")
         warnings.append(f"FIX {unknown[0][1]} is left out: it is no pose.")
-        fixed = [one for one in fixed if one not in unknown]
+        fixed = [(line, name) for line, name in fixed if name in present]
     if fixed:
         held = int(np.searchsorted(ids, fixed[0][1]))
         if len(fixed) > 1:

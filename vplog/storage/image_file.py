@@ -41,6 +41,8 @@ _JPEG_MARKER = struct.Struct(">BBHxHH")
 _TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
 _TIFF_SIDES, _TIFF_SHORT = (256, 257), 3
 """Tags of width and height, and the type of 16 bits: TIFF 6.0, section 2 and 3."""
+_SCAN_START, _MOST_SCANS = b"\xff\xda", 500
+"""Start of a scan, which is nowhere within one; a progressive JPEG has ten, and each takes a pass over all blocks."""
 _SIMPLEJPEG_ERRORS = (ValueError, KeyError)
 """Exceptions of simplejpeg; a KeyError where the header names a sampling of colours that it does not know."""
 _PNM_HEAD = 4096
@@ -107,6 +109,8 @@ def image_size(data: bytes | memoryview) -> tuple[int, int] | None:
 
 def _decode_jpeg(data: bytes | memoryview, unchanged: bool) -> Any:
     bits, has_end = _jpeg_bits_and_end(data)
+    if bytes(data).count(_SCAN_START) > _MOST_SCANS:
+        raise BadImageError(f"its JPEG has more than {_MOST_SCANS} scans")
     if bits != 8:
         raise BadImageError(f"its JPEG has {bits} bits a sample; write 8, or 16 as PNG")
     data = data if has_end else bytes(data) + _JPEG_END

@@ -5,6 +5,7 @@ Endpoints and credentials are those of object_store.py.
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import re
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 SCHEMES = (*STORES, "http", "https")
 _NO_HEAD = re.compile("answers (403|405|501)")
+_LEFT_FREE = 1 << 28
+"""Bytes of a disk that copies leave free."""
 _BLOCK_BYTES = 1 << 20
 """Read ahead of small reads: a chunk of a log; a request costs as much as some hundred kB."""
 _PART_BYTES = 1 << 24
@@ -327,6 +330,9 @@ def local_copy(path: Path | RemotePath) -> Iterator[Path]:
 
 def _download(path: RemotePath, target: Path) -> None:
     files = {path: target} if path.is_file() else {file: target / file.relative_to(path) for file in path.rglob()}
+    length = sum(file.stat().st_size for file in files)
+    if length > shutil.disk_usage(target.parent).free - _LEFT_FREE:
+        raise OSError(errno.ENOSPC, f"{path} has {length / 1e9:.1f} GB, and {target.parent} no room for them")
     for file, place in files.items():
         place.parent.mkdir(parents=True, exist_ok=True)
         with file.open() as source, place.open("wb") as sink:

@@ -33,7 +33,7 @@ def cache_folder(folder: Path | None, name: str, max_gb: float | None = None) ->
     None where the cache may hold nothing, or the user's cannot be made. Raises SettingsError where `folder` cannot be
     used.
     """
-    place = folder or _user_cache()
+    place = _user_cache() if folder is None else Path(folder)
     if max_bytes(max_gb) <= 0 or place is None:
         return None
     found, problem = place.absolute() / name, "it belongs to another user"

@@ -30,6 +30,7 @@ from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, open_truth
 from vplog.execution.execution import Execution, logged_warnings
 from vplog.pipeline import Pipeline
 from vplog.places.plugin import PluginSettings
+from vplog.places.vectors import VectorsSettings, vectors_files
 from vplog.results.run_record import is_ours, read_run_json, write_run_json
 from vplog.results.staging import check_contents, staged
 from vplog.run.cache.code_hash import code_of
@@ -91,6 +92,11 @@ def study(
             "images": [None if topics is None else image_topics(topics, log.camera().name) for log in opened],
             "min_gap": min_gap,
             "truth_hash": _truth_hash(truth),
+            "vectors": [
+                [hash_inputs(file) for file in vectors_files(one.file)]
+                for one in recognisers.values()
+                if isinstance(one, VectorsSettings)
+            ],
         }
         cached = stack.enter_context(options.cache.opened(scratch))
         folders = [
@@ -132,7 +138,8 @@ def study(
                 _write(work, account, inputs, done, [])
         for file, path in files.items():
             shutil.copy2(path, made / file)
-        notes = [warning for log in opened for warning in log.warnings] + warnings + bench.warnings
+        notes = [warning for log in opened for warning in log.warnings] + warnings
+        notes += [warning for one in done.values() for warning in one.get("warnings", ())]
         result = _write(made, account, inputs, done, list(dict.fromkeys(notes)))
     shutil.rmtree(out / _WORK, ignore_errors=True)
     return result
@@ -154,7 +161,8 @@ def _do(name: str, bench: Bench, options: StudyOptions, out: Path) -> dict[str, 
     else:
         found, figures = PICTURES[name](bench, options, out)
     files = [f"{figure}.{kind}" for figure in figures for kind in ("png", "svg")]
-    return {"figures": files, **found, "seconds": round(time.perf_counter() - began, 3)}
+    warnings = list(bench.warnings)
+    return {"figures": files, **found, "warnings": warnings, "seconds": round(time.perf_counter() - began, 3)}
 
 
 def _write(

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from stat import S_ISREG
 
 import numpy as np
 
@@ -27,6 +28,8 @@ from vplog.logs.messages.records import (
     Record,
 )
 
+_MOST_BYTES = 2**29
+"""Length of an image, four times that of the largest uncompressed ones."""
 _LATEST_NS = 2**32 * 10**9
 """ns; stamps of ROS 1 end in 2106."""
 
@@ -174,8 +177,10 @@ def raw_image(stamp_ns: int, frame: str, encoding: str, pixels: Bytes | Float32s
 
 
 def _bytes_of(file: Path) -> bytes:
+    """Empty of what cannot be read, is no file, as a pipe, or longer than an image is."""
     try:
-        return file.read_bytes()
+        about = file.stat()
+        return file.read_bytes() if S_ISREG(about.st_mode) and about.st_size <= _MOST_BYTES else b""
     except OSError:
         return b""
 

@@ -13,9 +13,10 @@ import json
 import struct
 import zlib
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Any, BinaryIO, Self, TypeVar
 
 import numpy as np
@@ -194,11 +195,13 @@ class StageCache:
     def __enter__(self) -> Self:
         """Begin to read the drive's files for their hashes, beside the stages."""
         self.inputs = inputs_of(self.drive, self.folder)
-        self._aside = ThreadPoolExecutor(1)
+        self._aside, self._stop = ThreadPoolExecutor(1), Event()
         self._hashes = self._aside.submit(self._hash_inputs)
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None:  # a log of hundreds of GB is not read to its end for a run that has failed
+            self._stop.set()
         self._aside.shutdown()
         if not self.keep or not any(self.folder.glob(f"*{ENDING}")):  # nothing came of the run: no log, no odometry
             self.drop()
@@ -257,8 +260,13 @@ class StageCache:
 
         Not if they change meanwhile: what is made from them may be of what they were before.
         """
+
+        def check(_: int) -> None:
+            if self._stop.is_set():
+                raise CancelledError
+
         inputs = self.inputs
-        hashes = hash_inputs(self.drive) if inputs.hashes is None else inputs.hashes
+        hashes = hash_inputs(self.drive, check) if inputs.hashes is None else inputs.hashes
         if self.keep and stat_signature(self.drive) == inputs.signature:
             known = _read_inputs(self.folder)
             known = known if known.get("token") == inputs.token else {}
