@@ -347,7 +347,7 @@ def compare(
 
 
 def batch(
-    logs: Iterable[Place],
+    logs: Place | Iterable[Place],
     map: Place,
     pipeline: str | Path | Pipeline | None = None,
     *,
@@ -523,7 +523,7 @@ class Answers:
         return pa.Table.from_pylist(self.record["answers"], schema=PLACED)
 
 
-def _paths(log: Place | Sequence[Place]) -> list[Path]:
+def _paths(log: Place | Iterable[Place]) -> list[Path]:
     from pathlib import Path
 
     from vplog.storage.remote_path import RemotePath, located

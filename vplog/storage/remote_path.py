@@ -330,6 +330,7 @@ def local_copy(path: Path | RemotePath) -> Iterator[Path]:
 
 def _download(path: RemotePath, target: Path) -> None:
     files = {path: target} if path.is_file() else {file: target / file.relative_to(path) for file in path.rglob()}
+    target.parent.mkdir(parents=True, exist_ok=True)
     length = sum(file.stat().st_size for file in files)
     if length > shutil.disk_usage(target.parent).free - _LEFT_FREE:
         raise OSError(errno.ENOSPC, f"{path} has {length / 1e9:.1f} GB, and {target.parent} no room for them")
