@@ -14,7 +14,6 @@ needs an `if __name__ == "__main__"` guard.
 
 from __future__ import annotations
 
-import os
 import sys
 from importlib import import_module
 from types import ModuleType
@@ -53,20 +52,6 @@ __all__ = [
     "SettingsError", "TruthError", "VplogError", "batch", "compare", "evaluate", "localize", "open_log", "open_map",
     "open_run", "run",
 ]  # fmt: skip
-
-
-def _let_numba_cache() -> None:
-    """Where neither the installation nor the user's home can be written to, as in a container with another user, numba
-    refuses to compile: kernels are then stored in this user's temporary folder."""
-    home = os.path.expanduser("~")  # noqa: PTH111 (pathlib takes most of the time of this import)
-    writable = any(os.access(place, os.W_OK) for place in (__path__[0], f"{home}/.cache", home))
-    if not writable and "NUMBA_CACHE_DIR" not in os.environ:
-        from vplog.storage.scratch import own_folder
-
-        os.environ["NUMBA_CACHE_DIR"] = str(own_folder() / "numba")
-
-
-_let_numba_cache()
 
 
 def __getattr__(name: str) -> Any:

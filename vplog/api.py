@@ -39,6 +39,20 @@ if TYPE_CHECKING:
 logging.getLogger("vplog").addHandler(logging.NullHandler())  # warnings are in the records
 
 
+def _let_numba_cache() -> None:
+    """Where neither the installation nor the user's home can be written to, as in a container with another user, numba
+    refuses to compile: kernels are then stored in this user's temporary folder."""
+    home = os.path.expanduser("~")  # noqa: PTH111 (there may be none)
+    writable = any(os.access(place, os.W_OK) for place in (Path(__file__).parent, f"{home}/.cache", home))
+    if not writable and "NUMBA_CACHE_DIR" not in os.environ:
+        from vplog.storage.scratch import own_folder
+
+        os.environ["NUMBA_CACHE_DIR"] = str(own_folder() / "numba")
+
+
+_let_numba_cache()
+
+
 def run(
     log: Place | Sequence[Place],
     out: Place,
