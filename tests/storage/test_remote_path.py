@@ -111,23 +111,23 @@ def test_a_run_goes_from_s3_to_s3_and_is_evaluated_there(
     tiny: Demo, drive: Demo, bucket: str, verb: Callable[..., Said]
 ) -> None:
     put(tiny.log, f"{bucket}/two")
-    found = verb("run", f"{bucket}/two/drive.mcap", "-o", f"{bucket}/runs/a", "--threads", 2, "--json", *QUICK).json
-    assert found["run"] == f"{bucket}/runs/a"
+    found = verb("run", f"{bucket}/two/drive.mcap", "-o", f"{bucket}/runs/own", "--threads", 2, "--json", *QUICK).json
+    assert found["run"] == f"{bucket}/runs/own"
     assert found["log"] == f"{bucket}/two/drive.mcap"
     assert list(found["inputs"]) == ["drive.mcap"]
-    names = {path.name for path in located(f"{bucket}/runs/a").iterdir()}
+    names = {path.name for path in located(f"{bucket}/runs/own").iterdir()}
     assert {"run.json", "result.mcap", "closures.parquet", "trajectory.tum"} <= names
-    assert json.loads((located(f"{bucket}/runs/a") / "run.json").read_text())["finished"] is True
+    assert json.loads((located(f"{bucket}/runs/own") / "run.json").read_text())["finished"] is True
     put(tiny.truth, f"{bucket}/two")
     truth = f"{bucket}/two/{tiny.truth.name}"
-    assert verb("evaluate", f"{bucket}/runs/a", "--truth", truth, "--json").json["closures"]["keyframes"] > 20
-    assert "Cannot read s3://" in verb("evaluate", f"{bucket}/runs/a", "--truth", f"{truth}.not").error
-    assert verb("evaluate", f"{bucket}/runs/a", "--truth", "gps", "--json").json["ate_after"]["rmse_m"] > 0
-    other = verb("run", drive.log, "-o", f"{bucket}/runs/a", "--threads", 2, *QUICK).error
-    assert f"{bucket}/runs/a is the run of" in other
-    assert json.loads((located(f"{bucket}/runs/a") / "run.json").read_text())["log"] == found["log"]
+    assert verb("evaluate", f"{bucket}/runs/own", "--truth", truth, "--json").json["closures"]["keyframes"] > 20
+    assert "Cannot read s3://" in verb("evaluate", f"{bucket}/runs/own", "--truth", f"{truth}.not").error
+    assert verb("evaluate", f"{bucket}/runs/own", "--truth", "gps", "--json").json["ate_after"]["rmse_m"] > 0
+    other = verb("run", drive.log, "-o", f"{bucket}/runs/own", "--threads", 2, *QUICK).error
+    assert f"{bucket}/runs/own is the run of" in other
+    assert json.loads((located(f"{bucket}/runs/own") / "run.json").read_text())["log"] == found["log"]
     for words in (("ask",), ("report",), ("explain", "--closure", 0)):
-        assert "nothing is written beside it" in verb(words[0], f"{bucket}/runs/a", *words[1:]).error
+        assert "nothing is written beside it" in verb(words[0], f"{bucket}/runs/own", *words[1:]).error
 
 
 def test_a_web_server_is_asked_for_parts(drive: Demo, monkeypatch: pytest.MonkeyPatch) -> None:
