@@ -108,11 +108,12 @@ def image_size(data: bytes | memoryview) -> tuple[int, int] | None:
 
 
 def _decode_jpeg(data: bytes | memoryview, unchanged: bool) -> Any:
-    bits, has_end = _jpeg_bits_and_end(data)
-    if bytes(data).count(_SCAN_START) > _MOST_SCANS:
+    marker, at = next((one for one in _jpeg_segments(data) if one[0] in _JPEG_FRAMES), (0, len(data) - 5))
+    if marker not in _JPEG_SEQUENTIAL and bytes(data).count(_SCAN_START) > _MOST_SCANS:
         raise BadImageError(f"its JPEG has more than {_MOST_SCANS} scans")
-    if bits != 8:
+    if (bits := data[at + 4]) != 8:
         raise BadImageError(f"its JPEG has {bits} bits a sample; write 8, or 16 as PNG")
+    has_end = _has_end(data, at)
     data = data if has_end else bytes(data) + _JPEG_END
     strict = not has_end  # a warning then means that samples are missing
     try:
@@ -241,10 +242,9 @@ def _jpeg_segments(data: bytes | memoryview) -> Iterator[tuple[int, int]]:
         position += 2 + length
 
 
-def _jpeg_bits_and_end(data: bytes | memoryview) -> tuple[int, bool]:
-    """Bits of a sample, and whether an end marker lies behind the frame's header (thumbnails lie before it)."""
-    at = next((at for marker, at in _jpeg_segments(data) if marker in _JPEG_FRAMES), len(data) - 5)
-    return data[at + 4], data[-2:] == _JPEG_END or bytes(data).rfind(_JPEG_END) > at
+def _has_end(data: bytes | memoryview, at: int) -> bool:
+    """Whether an end marker lies behind the frame's header `at` (thumbnails lie before it)."""
+    return data[-2:] == _JPEG_END or bytes(data).rfind(_JPEG_END) > at
 
 
 def _jpeg_size(data: bytes | memoryview) -> tuple[int, int] | None:
@@ -254,7 +254,7 @@ def _jpeg_size(data: bytes | memoryview) -> tuple[int, int] | None:
         if marker in _JPEG_FRAMES and size is None:
             *_, height, width = _JPEG_MARKER.unpack_from(data, at)
             size, components, can_lack_end = (width, height), data[at + 9 : at + 10], marker in _JPEG_SEQUENTIAL
-            if _jpeg_bits_and_end(data)[1]:
+            if _has_end(data, at):
                 return size
         elif marker == _JPEG_SCAN:
             return size if can_lack_end and data[at + 4 : at + 5] == components else None
