@@ -32,7 +32,7 @@ from vplog.maps.joining.components import Drives, PairLedger
 from vplog.maps.joining.growth import Growth, Part
 from vplog.maps.joining.join_states import JoinState
 from vplog.maps.joining.joint_graph import verified, with_solve
-from vplog.maps.joining.joint_record import joint_components, keyframe_poses
+from vplog.maps.joining.joint_record import keyframe_poses, recorded_components
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import load_pipeline
 from vplog.results import tables
@@ -218,7 +218,7 @@ def errors(city: City, count: int, last: int) -> tuple[float, float, int]:
     """Root mean square of the positions' error, m, of all drives of the largest component in its frame and of the last
     ones of them, infinite where it has none of these; and how many of these it has."""
     store = Store(city.root)
-    joints = joint_components(store)
+    joints = recorded_components(store)
     largest = max({id(one.drives): one.drives for one in joints.values()}.values(), key=len)
     number = {one.name: at for at, one in enumerate(city.drives[:count])}
     inside = [drive for drive in largest if drive in number]

@@ -12,7 +12,7 @@ import pytest
 
 from tests.benchmarks.city import City, Cost, errors, undecided, with_join
 from vplog.maps.joining import components
-from vplog.maps.joining.joint_record import joint_components, keyframe_poses, read_joint, write_joint
+from vplog.maps.joining.joint_record import keyframe_poses, read_joint, recorded_components, write_joint
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import load_pipeline
 from vplog.results import tables
@@ -72,7 +72,7 @@ def component(root: Path) -> dict:
 def test_a_drive_more_touches_no_other(city: City) -> None:
     before = digests(city.root)
     poses = {
-        drive: keyframe_poses(Store(city.root), joint_components(Store(city.root)), drive)
+        drive: keyframe_poses(Store(city.root), recorded_components(Store(city.root)), drive)
         for drive in component(city.root)["drives"]
     }
     cost = Cost()
@@ -86,7 +86,7 @@ def test_a_drive_more_touches_no_other(city: City) -> None:
     assert len(found["drives"]) == COUNT
     assert {f"d{COUNT - 2:06d}", f"d{COUNT - 1:06d}"} <= set(found["grown"])
     store = Store(city.root)
-    joint = joint_components(store)
+    joint = recorded_components(store)
     for drive, known in poses.items():
         np.testing.assert_array_equal(keyframe_poses(store, joint, drive), known)
     assert errors(city, COUNT, 2)[1] < 3.0
@@ -158,7 +158,7 @@ def test_damaged_poses_are_made_again(city: City) -> None:
     path.write_bytes(path.read_bytes()[:100])
     Cost().solve(city, COUNT, PIPELINE)
     store = Store(city.root)
-    joint = joint_components(store)
+    joint = recorded_components(store)
     assert len(component(city.root)["drives"]) == COUNT
     assert len(keyframe_poses(store, joint, met[0])) == 200
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, NotRequired
 
@@ -90,16 +90,23 @@ def components_in(store: Store) -> list[dict[str, Any]] | None:
     return groups and [component for group in groups for component in group["components"]]
 
 
-def joint_components(store: Store) -> dict[str, Component]:
-    """The component of each drive that is in one; drives that were removed or replaced since are in none, as a join may
-    be still to come. Raises ResultError where their record is damaged."""
+def recorded_components(store: Store, without: Callable[[str], bool] = lambda _: False) -> dict[str, Component]:
+    """The component of each drive as joint.json has them, `without` some drives. Raises ResultError where it is
+    damaged."""
     joint, found = store.root / "joint", dict[str, Component]()
-    components, known = components_in(store) or [], store.drives()
-    replaced = replaced_since(store.root, known) if components else []
-    for one in components:
-        grown, there = one.get("grown", {}), [name for name in one["drives"] if name in known and name not in replaced]
+    for one in components_in(store) or []:
+        grown, there = one.get("grown", {}), [drive for drive in one["drives"] if not without(drive)]
         found |= {drive: Component(joint / grown.get(drive, one["folder"]), there) for drive in there}
     return found
+
+
+def joint_components(store: Store) -> dict[str, Component]:
+    """The component of each drive that is in one; drives that were removed or replaced since are in none, as a join may
+    be still to come. Raises ResultError as `recorded_components`."""
+    store.fetch_beside(["joint.json"])
+    known = store.drives()
+    replaced = set(replaced_since(store.root, known))
+    return recorded_components(store, lambda drive: drive not in known or drive in replaced)
 
 
 def keyframe_poses(store: Store, joint: Mapping[str, Component], drive: str) -> Floats:
