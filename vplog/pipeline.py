@@ -210,8 +210,9 @@ def run(
         closures = name_shared(closures, state, views)
         solved = do(solve, odometry, keyframes, closures, log.gps(), pipeline)
         result = Run(
-            log, odometry, camera, keyframes, features, library, references, state, coverage, descriptors, solved, views
-        )
+            log, odometry, camera, keyframes, features, library, references, state, coverage, descriptors, solved,
+            views, pipeline.features.identity(),
+        )  # fmt: skip
         header = tables.TableMetadata(pipeline.model_dump(mode="json"), state.hash)
-        written = do(write, folder, result, pipeline.verify, pipeline.pictures, pipeline.features.identity(), header)
+        written = do(write, folder, result, pipeline.verify, pipeline.pictures, header)
         return finish(folder, result, do(report, folder, result, written, head), do)

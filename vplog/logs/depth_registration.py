@@ -23,8 +23,8 @@ OpenCV's five steps leave px of error in wide lenses."""
 
 @dataclass(frozen=True, eq=False)
 class DepthRegistration:
-    """What leads from the px of a depth image to those of the camera: register of depth_image_proc, with the lenses of
-    both cameras, and without holes where the images have the finer px."""
+    """Mapping of the px of a depth image to those of the camera: register of depth_image_proc, with the lenses of both
+    cameras, and without holes where the images have the finer px."""
 
     rays: Float32s
     """(H, W, 3) of the depth's px in the axes of the images' camera, of length 1 along the z of the depth's."""

@@ -78,6 +78,8 @@ class Run:
     solved: BackEndResult
     views: Sequence[View]
     """The pictures of every camera, the first one's first."""
+    extractor: dict[str, Any]
+    """Identity of the local features, which a library names."""
     record: dict[str, Any] = field(default_factory=dict)
     """Content of run.json."""
 
@@ -114,7 +116,6 @@ def write(
     run: Run,
     verify: VerifySettings,
     pictures: PictureSettings,
-    extractor: dict[str, Any],
     header: tables.TableMetadata,
     *,
     steps: Steps,
@@ -147,7 +148,7 @@ def write(
     mcap.write_mcap(folder / "result.mcap", keyframes, poses, run.graph, run.closures, header, extras)
     if run.library is None:
         run.state.save(folder / "library")
-        name_extractor(folder / "library", extractor)
+        name_extractor(folder / "library", run.extractor)
     steps.cache.finish([view.pictures.features.files for view in run.views])
     first = len(run.views[0].places)  # the report shows those of the first camera
     return Written(extras, covariance, descriptors[:first], graph_sha256)

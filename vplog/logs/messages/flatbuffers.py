@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message as Proto
 
 _MOST_BYTES = 2**28
-"""Of the entries of a vector together: they may share their bytes, so that a short message becomes a long one."""
+"""Bytes of the entries of a vector together: they may share their bytes, so that a short message becomes a long one."""
 _FIELDS = {
     "foxglove.CompressedImage": "timestamp frame_id data format",
     "foxglove.CompressedVideo": "timestamp frame_id data format",
