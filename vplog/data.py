@@ -89,6 +89,8 @@ class Odometry:
     """Not where lengths are in a unit of its own, as those of one camera without depth."""
     of_images: bool = False
     """Where it is that of the images that closures are found in, so that they share its errors of calibration."""
+    increments: bool = False
+    """Where `covariance` is known to be that of the motion since the row before; in a log its values tell."""
 
 
 RECEIVER_SIGMA_M = 3.0

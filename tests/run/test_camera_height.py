@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -70,3 +72,21 @@ def test_a_rendered_street_has_metres() -> None:
     truth = scene.world_from_body[np.searchsorted(scene.stamp_ns, found.stamp_ns)]
     own, known = (np.linalg.norm(np.diff(one[:, :3, 3], axis=0), axis=1).sum() for one in (found.odom_from_body, truth))
     assert own == pytest.approx(known, rel=0.05)
+
+
+def test_a_piece_without_a_ground_does_not_take_the_unit_of_its_neighbours_for_its_own(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Each piece has its own unit: what was not measured may be any length."""
+    log_scale = np.repeat([0.0, 1.0, 0.0], VIEWS // 3)
+    odometry = replace(drive(log_scale), breaks=np.array([VIEWS // 3, 2 * VIEWS // 3]))
+    shown = [view for view in views(log_scale, 1.6, 0.1, 2) if log_scale[view.row] == 0.0]
+    found = by_height(odometry, shown, 1.6, CAMERA)
+    assert found is not None and found.covariance is not None
+    assert "view of the ground" in caplog.text
+    sigma_m = np.sqrt(found.covariance[:, 3, 3])
+    piece = np.arange(VIEWS // 3 + 1, 2 * VIEWS // 3)
+    steps = np.linalg.norm(np.diff(found.odom_from_body[:, :3, 3], axis=0), axis=1)
+    assert np.sqrt((sigma_m[piece] ** 2).sum()) > 0.9 * steps[piece - 1].sum()
+    assert sigma_m[5] < 2 * sigma_m[: VIEWS // 3].min()
+    assert steps[[*range(38), *range(81, 118)]] == pytest.approx(1.0, abs=0.1)

@@ -223,3 +223,13 @@ def test_it_is_named_by_source_or_topic_and_what_it_needs_is_said(
     ]
     with pytest.raises(LogError, match="pip install"):
         odometry_of(scans())
+
+
+@needs_kiss_icp
+def test_a_lidar_at_less_than_a_hertz_is_registered() -> None:
+    """As a log that was thinned has it."""
+    slow = [replace(scan, stamp_ns=START_NS + 20 * (scan.stamp_ns - START_NS), seconds=None) for scan in scans()]
+    stamps = np.array([scan.stamp_ns for scan in slow])
+    found = lidar_odometry(slow, range_of(scans()[::5]), Lidar("/points", stamps, BODY_FROM_LIDAR))
+    assert found is not None and not len(found.breaks)
+    assert len(found.stamp_ns) > 0.9 * SCANS

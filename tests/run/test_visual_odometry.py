@@ -10,6 +10,7 @@ import pytest
 
 from vplog.data import EdgeKind, Frame, Odometry, PoseGraph, Solution, Trajectory
 from vplog.geometry import se3
+from vplog.graph.noise import NoiseSettings, edge_covariance
 from vplog.graph.refine import Refined
 from vplog.graph.variance_components import Sigmas, claimed_times
 from vplog.run.back_end import BackEndResult, keyframe_covariances
@@ -27,6 +28,12 @@ SETTINGS = DemoSettings(laps=0.5, frame_rate_hz=6, width=384, height=216, seed=3
 def scene(stereo: bool) -> Scene:
     made = make_scene(SETTINGS)
     return replace(made, camera=replace(made.camera, baseline_m=BASELINE_M)) if stereo else made
+
+
+@cache
+def slow() -> Scene:
+    """A few centimetres from frame to frame."""
+    return make_scene(DemoSettings(laps=0.5, frame_rate_hz=40, width=384, height=216, seed=3))
 
 
 @cache
@@ -135,3 +142,31 @@ def test_closures_do_not_make_odometry_of_the_same_images_surer_than_it_claims()
     assert own is not None and shared is not None
     ratio = np.sqrt(np.trace(shared[5, 3:, 3:]) / np.trace(own[5, 3:, 3:]))
     assert ratio > 3.0
+
+
+@pytest.mark.parametrize("without", [slice(0, None, 2), slice(1, None, 2), slice(3, 7)])
+def test_frames_without_depth_are_followed_by_the_others(without: slice) -> None:
+    """Depth at another rate, and none for a moment, as before a wall too near."""
+    street, drive = slow(), list[Frame]()
+    for row in range(FRAMES):
+        image, depth = take_picture(street, row)
+        if row in range(FRAMES)[without]:
+            depth = None if without.step else np.full(image.shape, np.nan, np.float32)
+        drive.append(Frame(int(street.stamp_ns[row]), street.camera, image, depth))
+    odometry = odometry_of(drive)
+    assert len(odometry.stamp_ns) >= FRAMES - 1
+    assert not len(odometry.breaks)
+    truth = street.world_from_body[np.searchsorted(street.stamp_ns, odometry.stamp_ns)]
+    off = se3.between(se3.between(truth[0], truth[-1]), se3.between(*odometry.odom_from_body[[0, -1]]))
+    assert np.linalg.norm(off[:3, 3]) < 0.05 * np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()
+
+
+def test_a_drive_that_stands_still_first_has_the_covariance_of_its_steps() -> None:
+    """Variances that happen to grow are no reason to take them for those of the pose since the start."""
+    odometry = odometry_of(frames(stereo=False)[:8])
+    assert odometry.increments
+    growing = np.eye(6) * np.linspace(1e-6, 1e-4, 8)[:, None, None]
+    _, _, source = edge_covariance(replace(odometry, covariance=growing), odometry.stamp_ns, NoiseSettings())
+    assert source == "increments"
+    logged = replace(odometry, covariance=growing, increments=False)
+    assert edge_covariance(logged, odometry.stamp_ns, NoiseSettings())[2] == "accumulated"

@@ -125,7 +125,8 @@ def covariance_without_breaks(
     # an unknown axis must not leak into known ones through the adjoint: the model fills it in at the end
     logged = np.where((known[:, None] & known) & usable[:, None, None], logged, 0.0)
     logged = (logged + np.swapaxes(logged, 1, 2)) / 2
-    source = "accumulated" if _is_accumulated(variance, known) else "increments"
+    accumulated = not odometry.increments and _is_accumulated(variance, known)
+    source = "accumulated" if accumulated else "increments"
     difference = _accumulated_growth if source == "accumulated" else _summed_increments
     covariance = difference(odometry, keys, logged)
     for axis in np.flatnonzero(~known):

@@ -11,6 +11,7 @@ from vplog.data import Floats, Ints, Odometry
 from vplog.errors import plural
 from vplog.geometry import se3
 from vplog.logs.formats.container import Notes
+from vplog.logs.stamps import longest_gap_ns
 
 _ACCELERATION_M_S2 = 10.0
 """m/s^2; tyres hold 1 g, and little has more for longer than a moment:"""
@@ -30,6 +31,10 @@ _WINDOW = 3
 """Steps on either side whose median velocity a step is held against: one of them may be a jump itself."""
 _LEAST = 4 * _WINDOW
 """Poses; fewer are too few for a quantile."""
+_SAME = 1e-3
+"""m and rad; a pose that is as near the first one is that of an estimator that was started again,"""
+_AWAY_M = 0.5
+"""m; unless it was no further from there just before."""
 _NAMED = 4
 """Jumps that are named."""
 
@@ -61,6 +66,15 @@ def without_jumps(odometry: Odometry, what: str, notes: Notes) -> Odometry:
     """The odometry with its motion continued over each jump, and without outliers; both are noted. What follows a
     jump is moved as one piece, and the covariance of the pose behind it becomes unknown."""
     stamp_ns, poses, covariance = odometry.stamp_ns, odometry.odom_from_body, odometry.covariance
+    restarts = _restarts(stamp_ns, poses)
+    if len(restarts):
+        seconds = ", ".join(f"{(stamp_ns[row + 1] - stamp_ns[0]) / 1e9:.1f} s" for row in restarts[:_NAMED].tolist())
+        notes.add(
+            f"{what}: it starts again from its first pose after a gap, at {seconds} (a node that was restarted?): only "
+            "closures and fixes relate what is before to what is behind."
+        )
+        poses = _extrapolated(stamp_ns, poses, restarts, held=True)
+    starts_ns = np.union1d(stamp_ns[odometry.breaks], stamp_ns[restarts + 1])
     rows = find_jumps(stamp_ns, poses)
     outlier = _outlier(stamp_ns, poses, rows)
     if outlier.any():
@@ -74,7 +88,17 @@ def without_jumps(odometry: Odometry, what: str, notes: Notes) -> Odometry:
         covariance = None if covariance is None else covariance.copy()
         if covariance is not None:
             covariance[rows + 1] = np.nan
-    return replace(odometry, stamp_ns=stamp_ns, odom_from_body=poses, covariance=covariance)
+    breaks = np.unique(np.searchsorted(stamp_ns, starts_ns))
+    return replace(odometry, stamp_ns=stamp_ns, odom_from_body=poses, covariance=covariance, breaks=breaks)
+
+
+def _restarts(stamp_ns: Ints, poses: Floats) -> Ints:
+    """Rows behind which, after a gap, the poses begin again at the first one: in so long any jump might be a motion."""
+    rows = np.flatnonzero(np.diff(stamp_ns) > longest_gap_ns(stamp_ns))
+    away = se3.between(poses[:1], poses)
+    far_m, far_rad = np.linalg.norm(away[:, :3, 3], axis=1), se3.angle(away)
+    same = (far_m < _SAME) & (far_rad < _SAME)
+    return rows[same[rows + 1] & (far_m[rows] > _AWAY_M)]
 
 
 def _deviation(steps: Floats, seconds: Floats) -> Floats:
@@ -109,12 +133,12 @@ def _outlier(stamp_ns: Ints, poses: Floats, rows: Ints) -> np.ndarray:
     return outlier
 
 
-def _extrapolated(stamp_ns: Ints, poses: Floats, rows: Ints) -> Floats:
-    """The poses, those behind each jump moved to where the motion before it leads."""
+def _extrapolated(stamp_ns: Ints, poses: Floats, rows: Ints, held: bool = False) -> Floats:
+    """The poses, those behind each jump moved to where the motion before it leads, or to where it was (`held`)."""
     result = poses.copy()
     for row, stop in zip(rows.tolist(), [*(rows[1:] + 1).tolist(), len(poses)], strict=True):
         onward = np.eye(4)
-        if row and row - 1 not in rows:
+        if row and row - 1 not in rows and not held:
             share = (stamp_ns[row + 1] - stamp_ns[row]) / (stamp_ns[row] - stamp_ns[row - 1])
             before = se3.log(se3.between(poses[row - 1], poses[row])[None])
             onward = se3.exp(before * min(share, _TIMES))[0]

@@ -10,9 +10,14 @@ import scipy
 from vplog.data import RECEIVER_SIGMA_M, Floats, Gps, Ints, Odometry
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
+from vplog.logs.stamps import longest_gap_ns
 
-_LONGEST_S = 1.0
-"""s; over a longer gap the last velocity is not held, as of a recorder that was paused."""
+_GYRO_GAP_NS = 100_000_000
+"""ns between samples of a gyroscope within which a turn can begin and end."""
+_AGREES = 0.5
+"""Share of the variance of the turns that a gyroscope must explain."""
+_SCALES = 0.2, 5.0
+"""Its turns by those of the wheels: skid steering turns half as far as wheels tell; degrees are 57 times radians."""
 _STANDING_M_S, _STANDING_RAD_S = 0.01, 0.02
 """m/s and rad/s; below both a vehicle stands: wheels resolve some mm/s, and a gyroscope's bias is below a degree/s."""
 _LEAST_STANDING_S = 1.0
@@ -36,44 +41,79 @@ _LEVEL_RAD = 0.1
 
 
 def dead_reckoned(stamp_ns: Ints, twists: Floats, variances: Floats) -> Odometry:
-    """Velocities (T, 6), linear (m/s) then angular (rad/s) in the body's axes, added up by trapezoids.
+    """Velocities (T, 6), linear (m/s) then angular (rad/s) in the body's axes, added up by trapezoids; it breaks where
+    there are none for long, as of a recorder that was paused.
 
     `variances` (T, 6) of these, NaN or zero where unknown, become those of the increments.
     """
-    seconds = np.diff(stamp_ns) / 1e9
-    held = np.where(seconds <= _LONGEST_S, seconds, 0.0)[:, None]
-    moved = (twists[1:] + twists[:-1]) / 2 * held
+    seconds = (np.diff(stamp_ns) / 1e9)[:, None]
+    gap = np.diff(stamp_ns) > longest_gap_ns(stamp_ns)
+    moved = (twists[1:] + twists[:-1]) / 2 * np.where(gap[:, None], 0.0, seconds)
     step = se3.exp(moved[:, [3, 4, 5, 0, 1, 2]])
     poses = np.tile(np.eye(4), (len(stamp_ns), 1, 1))
     for row, one in enumerate(step, 1):
         np.matmul(poses[row - 1], one, out=poses[row])
     poses[:, :3, :3] = se3.rotation(se3.quaternion(poses[:, :3, :3]))  # rounding adds up over a long drive
+    breaks = np.flatnonzero(gap) + 1
     known = np.isfinite(variances).all(1) & (variances >= 0).all(1) & (variances > 0).any(1)
     if not known.all():
-        return Odometry(stamp_ns, poses, None)
+        return Odometry(stamp_ns, poses, None, breaks=breaks)
     covariance = np.zeros((len(stamp_ns), 6, 6))
-    covariance[1:, range(6), range(6)] = variances[1:, [3, 4, 5, 0, 1, 2]] * held**2
+    covariance[1:, range(6), range(6)] = variances[1:, [3, 4, 5, 0, 1, 2]] * seconds**2
     covariance[0] = covariance[1] if len(covariance) > 1 else 0.0
-    return Odometry(stamp_ns, poses, covariance)
+    return Odometry(stamp_ns, poses, covariance, breaks=breaks, increments=True)
 
 
-def turned_by_gyro(
-    stamp_ns: Ints, twists: Floats, gyro_ns: Ints, gyro: Floats, body_from_imu: Floats
-) -> tuple[Ints, Floats, float | None]:
-    """Velocities (T, 6) at the samples of a gyroscope, whose rates (K, 3) rad/s replace the angular ones: a wheel's
-    scale and slip no longer turn the drive. Stamps (K,), velocities (K, 6), and the rad/s that the gyroscope is off at
-    rest; None where the body never stands for long, and it is left in."""
-    inside = (gyro_ns >= stamp_ns[0]) & (gyro_ns <= stamp_ns[-1])
-    at_ns, rates = gyro_ns[inside], gyro[inside] @ body_from_imu[:3, :3].T
+def gyro_agrees(stamp_ns: Ints, turning: Floats, gyro_ns: Ints, gyro: Floats) -> bool:
+    """Whether rates (K, 3) of a gyroscope are those of the body's turns (T, 3), rad/s in its axes, but for a scale of
+    wheels that slip; where the body does not turn, nothing contradicts them."""
     since = stamp_ns[0]
-    moving = np.stack([np.interp(at_ns - since, stamp_ns - since, column) for column in twists.T], axis=1)
+    angle = scipy.integrate.cumulative_trapezoid(gyro, (gyro_ns - since) / 1e9, axis=0, initial=0.0)
+    inside = (stamp_ns >= gyro_ns[0]) & (stamp_ns <= gyro_ns[-1])
+    if inside.sum() < 2:
+        return True
+    at_ns, turning = stamp_ns[inside], turning[inside]
+    seconds = np.diff(at_ns)[:, None] / 1e9
+    turned = np.stack([np.interp(at_ns - since, gyro_ns - since, column) for column in angle.T], axis=1)
+    measured, turning = np.diff(turned, axis=0) / seconds, (turning[1:] + turning[:-1]) / 2
+    measured, turning = measured - np.median(measured, axis=0), turning - np.median(turning, axis=0)
+    axes = np.sqrt((turning**2).mean(0)) > _STANDING_RAD_S
+    if not axes.any():
+        return True
+    measured, turning = measured[:, axes], turning[:, axes]
+    common, own = float((measured * turning).sum()), float((turning**2).sum())
+    return _SCALES[0] < common / own < _SCALES[1] and common**2 > _AGREES * own * float((measured**2).sum())
+
+
+def turned_by_gyro(stamp_ns: Ints, twists: Floats, gyro_ns: Ints, gyro: Floats) -> tuple[Ints, Floats, float | None]:
+    """Velocities (S, 6) at the samples of both, whose angular ones are those (K, 3) of a gyroscope, rad/s in the axes
+    of the body, as long as it measures: a wheel's scale and slip no longer turn the drive. Nothing is made up within
+    gaps of the velocities (T, 6). Stamps (S,), velocities, and the rad/s that the gyroscope is off at rest; None where
+    the body never stands for long, and it is left in."""
+    gaps = np.diff(stamp_ns) > longest_gap_ns(stamp_ns)
+    behind = np.searchsorted(stamp_ns, gyro_ns).clip(1, len(stamp_ns) - 1)
+    within = (gyro_ns >= stamp_ns[0]) & (gyro_ns <= stamp_ns[-1]) & ~gaps[behind - 1]
+    at_ns = np.union1d(stamp_ns, gyro_ns[within])
+    moving = _interpolated(at_ns, stamp_ns, twists)
     linear, turning = moving[:, :3], moving[:, 3:]
+    next_one = np.searchsorted(gyro_ns, at_ns).clip(1, len(gyro_ns) - 1)
+    measured = np.isin(at_ns, gyro_ns) | (
+        (gyro_ns[0] <= at_ns) & (at_ns <= gyro_ns[-1])
+        & (gyro_ns[next_one] - gyro_ns[next_one - 1] <= max(_GYRO_GAP_NS, 3 * np.median(np.diff(gyro_ns))))
+    )  # fmt: skip
+    rates = _interpolated(at_ns, gyro_ns, gyro)
     standing = (np.linalg.norm(linear, axis=1) < _STANDING_M_S) & (np.linalg.norm(turning, axis=1) < _STANDING_RAD_S)
-    seconds = float(np.diff(at_ns)[standing[1:]].sum()) / 1e9 if len(at_ns) > 1 else 0.0
-    if seconds < _LEAST_STANDING_S:
-        return at_ns, np.concatenate([linear, rates], axis=1), None
-    bias = np.median(rates[standing], axis=0)
-    return at_ns, np.concatenate([linear, rates - bias], axis=1), float(np.linalg.norm(bias))
+    standing &= measured
+    seconds = float(np.diff(at_ns)[standing[1:] & standing[:-1]].sum()) / 1e9
+    bias = np.median(rates[standing], axis=0) if seconds >= _LEAST_STANDING_S else None
+    turning = np.where(measured[:, None], rates - (0.0 if bias is None else bias), turning)
+    return at_ns, np.concatenate([linear, turning], axis=1), None if bias is None else float(np.linalg.norm(bias))
+
+
+def _interpolated(at_ns: Ints, stamp_ns: Ints, values: Floats) -> Floats:
+    """(S, D) of (T, D) values."""
+    since = stamp_ns[0]
+    return np.stack([np.interp(at_ns - since, stamp_ns - since, column) for column in values.T], axis=1)
 
 
 def odometry_of_fixes(gps: Gps) -> Odometry | None:

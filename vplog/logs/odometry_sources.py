@@ -15,11 +15,11 @@ import numpy as np
 from vplog.data import Floats, Gps, Ints, Odometry, OdometrySource, Trajectory
 from vplog.errors import plural
 from vplog.logs.continuity import find_jumps
-from vplog.logs.dead_reckoning import dead_reckoned, odometry_of_fixes, turned_by_gyro
+from vplog.logs.dead_reckoning import dead_reckoned, gyro_agrees, odometry_of_fixes, turned_by_gyro
 from vplog.logs.formats.container import Channel, Contents, Notes
 from vplog.logs.gather import TopicCollector
 from vplog.logs.messages.records import short_type
-from vplog.logs.stamps import NONE
+from vplog.logs.stamps import NONE, longest_gap_ns
 from vplog.logs.tf_odometry import FrameTree, frame_name
 from vplog.logs.topic_selection import COMMAND, SOURCES, Selection
 from vplog.logs.tracks import PoseTrack
@@ -161,15 +161,33 @@ def _by_twists(
     inside = np.asarray((gyro_ns >= stamp_ns[0]) & (gyro_ns <= stamp_ns[-1]))
     if inside.sum() < len(rows):
         notes.add(f"{text}.")
-        return dead_reckoned(stamp_ns, moving, variances)
+        return _dead_reckoned(stamp_ns, moving, variances, track.topic, notes)
     if placed is None and frame_name(read.imu.frame) not in ("", track.child, "base_link"):
         notes.add(f"{read.imu.topic}: its frame has no static transform; it is taken to be mounted as the body is.")
     body_from_imu = np.eye(4) if placed is None else placed
-    stamp_ns, turned, off = turned_by_gyro(stamp_ns, moving, gyro_ns, measured[:, :3], body_from_imu)
+    gyro = measured[:, :3] @ body_from_imu[:3, :3].T
+    if not gyro_agrees(stamp_ns, moving[:, 3:], gyro_ns, gyro):
+        notes.add(
+            f"{text}; the gyroscope of {read.imu.topic} is not used, as its turns are not those of the velocities: "
+            "its mount (static transform), its unit or its clock is another's."
+        )
+        return _dead_reckoned(stamp_ns, moving, variances, track.topic, notes)
+    stamp_ns, turned, off = turned_by_gyro(stamp_ns, moving, gyro_ns, gyro)
     bias = "its bias unknown, as the body never stands still for a second"
     bias = bias if off is None else f"less a bias of {np.degrees(off):.3f} deg/s at rest"
     notes.add(f"{text}; it turns by the gyroscope of {read.imu.topic}, {bias}.")
-    return dead_reckoned(stamp_ns, turned, np.full_like(turned, np.nan))
+    return _dead_reckoned(stamp_ns, turned, np.full_like(turned, np.nan), track.topic, notes)
+
+
+def _dead_reckoned(stamp_ns: Ints, twists: Floats, variances: Floats, topic: str, notes: Notes) -> Odometry:
+    odometry = dead_reckoned(stamp_ns, twists, variances)
+    if len(odometry.breaks):
+        longest_s = np.diff(odometry.stamp_ns)[odometry.breaks - 1].max() / 1e9
+        notes.add(
+            f"{topic}: {plural(len(odometry.breaks), 'gap')} between its velocities, of up to {longest_s:.1f} s, in "
+            "which the motion is not known: only closures and fixes relate what is before to what is behind."
+        )
+    return odometry
 
 
 def other_sources(gps: Gps | None, contents: Contents, chosen: Selection) -> dict[Channel, SourceOdometry]:
@@ -300,7 +318,7 @@ def _coverage(stamp_ns: Ints, camera_ns: Ints, span_ns: Ints) -> float:
         return int(stamp_ns[-1] - stamp_ns[0]) / whole if whole > 0 else 1.0
     if len(stamp_ns) < 2:
         return float(np.isin(camera_ns, stamp_ns).mean())
-    gap_ns = max(10**9, 3 * int(np.median(np.diff(stamp_ns))))  # as KeyframeSettings.max_odometry_gap_s
+    gap_ns = longest_gap_ns(stamp_ns)  # as KeyframeSettings.max_odometry_gap_s
     right = np.searchsorted(stamp_ns, camera_ns).clip(1, len(stamp_ns) - 1)
     before, behind = stamp_ns[right - 1], stamp_ns[right]
     inside = (before <= camera_ns) & (camera_ns <= behind) & (behind - before <= gap_ns)

@@ -41,6 +41,11 @@ _NAMED = 4
 """Jumps of a clock that are named."""
 
 
+def longest_gap_ns(stamp_ns: Ints) -> int:
+    """The time between two samples up to which they follow each other: a second, or three of their median periods."""
+    return max(_SECOND_NS, 3 * int(np.median(np.diff(stamp_ns)))) if len(stamp_ns) > 1 else _SECOND_NS
+
+
 @dataclass
 class Stamps:
     """Header stamps of one topic in file order, with the log times they fall back to."""

@@ -81,23 +81,29 @@ def are_usable(poses: Floats) -> np.ndarray:
     return placed & (largest > _SMALLEST) & (largest < 1 / _SMALLEST)
 
 
+_STANDING_NS = 500_000_000
+"""ns between the samples that are stored of a link which does not move."""
+
+
 @dataclass
 class _Link:
     """One edge of the frame tree over time."""
 
     first: PoseMessage
     times_ns: list[tuple[int, int, int]] = field(default_factory=list)
-    """Stamp, log time and position in the file of the first and the last sample before it moved."""
+    """Stamp, log time and position in the file of samples before it moved, `_STANDING_NS` apart: no gap."""
     moves: bool = False
     travels: bool = False
     """Its position changes, not its rotation alone."""
     stamps: Stamps = field(default_factory=Stamps)
     values: array[float] = field(default_factory=lambda: array("d"))
-    """x y z, x y z w of every sample; of a link that stands still at first, of the ends of that time alone."""
+    """x y z, x y z w of every sample; of a link that stands still at first, of some of that time."""
 
     def add(self, transform: PoseMessage, time_ns: tuple[int, int, int]) -> None:
         if not self.moves:
-            self.times_ns[1:] = [time_ns]  # the first stays
+            if len(self.times_ns) > 1 and time_ns[1] - self.times_ns[-2][1] < _STANDING_NS:
+                self.times_ns.pop()
+            self.times_ns.append(time_ns)
             return
         for before_ns in self.times_ns:
             self._append(self.first, before_ns)

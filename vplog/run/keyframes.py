@@ -10,6 +10,7 @@ from pydantic import Field
 from vplog.data import Floats, Ints, Keyframes, Odometry
 from vplog.errors import LogError, plural
 from vplog.geometry import se3
+from vplog.logs.stamps import longest_gap_ns
 from vplog.settings import Settings
 
 _PAPER_SPACING_M = 1.0
@@ -44,8 +45,8 @@ def select_keyframes(
             f"{drive} has {plural(len(stamp_ns), 'frame')}, and a graph needs two. Give a longer part of it."
         )
     warnings = []
-    gap_ns = 3 * int(np.median(np.diff(odometry.stamp_ns))) if len(odometry.stamp_ns) > 1 else 0
-    gap_ns = max(gap_ns, 10**9) if settings.max_odometry_gap_s is None else int(settings.max_odometry_gap_s * 1e9)
+    longest_s = settings.max_odometry_gap_s
+    gap_ns = longest_gap_ns(odometry.stamp_ns) if longest_s is None else int(longest_s * 1e9)
     covered = _has_odometry(stamp_ns, odometry.stamp_ns, gap_ns)
     if missing := int((~covered).sum()):
         warnings.append(f"{missing} of {plural(len(stamp_ns), 'frame')} without odometry at its stamp left out.")

@@ -16,6 +16,7 @@ import numpy as np
 from vplog.data import Floats, Lidar, Odometry, Scan
 from vplog.errors import LogError
 from vplog.geometry import se3
+from vplog.logs.stamps import longest_gap_ns
 
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
@@ -32,8 +33,6 @@ _LEAST = 50
 _LEAST_SHARE = 0.3
 """Share of the points that must have a neighbour in the scan before, within a voxel: between scans of a turning sensor
 with gaps it is above a half, between different places below a fifth."""
-_PATIENCE_NS = 10**9
-"""ns for which scans that match nothing are passed over; then, as after a gap as long, the next piece begins."""
 _MOST_PERIODS = 10
 """Periods of scans that were lost, for which the motion of the last one is continued at most."""
 _NEIGHBOURS = 10
@@ -71,6 +70,8 @@ class _Tracker:
     """State of the registration from scan to scan."""
 
     range_m: float
+    patience_ns: int
+    """Scans that match nothing are passed over for so long; then, as after a gap as long, the next piece begins."""
     stamp_ns: list[int] = field(default_factory=list)
     pose: list[Floats] = field(default_factory=list)
     covariance: list[Floats] = field(default_factory=list)
@@ -93,7 +94,7 @@ class _Tracker:
         since_ns = end_ns - self.stamp_ns[-1] if self.stamp_ns else 0
         if len(scan.points) < _LEAST or (self.stamp_ns and since_ns <= 0):
             return
-        if self.icp is None or since_ns > _PATIENCE_NS:
+        if self.icp is None or since_ns > self.patience_ns:
             self._start(scan.points, end_ns)
             return
         turn = self._voxels(scan.points, seconds)
@@ -149,14 +150,15 @@ class _Tracker:
         moved = se3.adjoint(body_from_lidar)
         covariance = moved @ (np.stack(self.covariance) + _mean_square(np.stack(self.off))) @ moved.T
         poses = body_from_lidar @ np.stack(self.pose) @ se3.inverse(body_from_lidar)
-        return Odometry(np.array(self.stamp_ns), poses, covariance, breaks=np.array(self.breaks, np.int64))
+        breaks = np.array(self.breaks, np.int64)
+        return Odometry(np.array(self.stamp_ns), poses, covariance, breaks=breaks, increments=True)
 
 
 def lidar_odometry(scans: Iterable[Scan], range_m: float, lidar: Lidar) -> Odometry | None:
     """The motion of the body by the scans of a lidar up to a range; None where fewer than two have a pose. Scans that
     match nothing have none. The covariance is that of each scan's motion since the one before it. Stamps are those of
     the last points. Raises LogError where kiss-icp is not installed."""
-    tracker = _Tracker(range_m)
+    tracker = _Tracker(range_m, longest_gap_ns(lidar.stamp_ns))
     for scan in scans:
         tracker.add(scan)
     return tracker.odometry(lidar.body_from_lidar)

@@ -300,12 +300,12 @@ def _log_breaks(what: str, odometry: Odometry, stamp_ns: np.ndarray, of: str) ->
 
 _ARRAYS = {"stamp_ns": np.int64, "odom_from_body": np.float64, "covariance": np.float64, "breaks": np.int64}
 """Fields of computed odometry, and their types."""
+_FLAGS = ("metric", "of_images", "increments")
 
 
 def _plain(odometry: Odometry) -> dict[str, Any]:
     return {name: getattr(odometry, name).tolist() for name in _ARRAYS} | {
-        "metric": odometry.metric,
-        "of_images": odometry.of_images,
+        name: getattr(odometry, name) for name in _FLAGS
     }
 
 
@@ -314,4 +314,5 @@ def _from_plain(tree: dict[str, Any]) -> Odometry:
     count = len(arrays["stamp_ns"])
     if arrays["odom_from_body"].shape != (count, 4, 4) or arrays["covariance"].shape != (count, 6, 6):
         raise ValueError("poses and covariances do not fit the stamps")
-    return Odometry(**arrays, metric=bool(tree["metric"]), of_images=bool(tree["of_images"]))
+    metric, of_images, increments = (bool(tree[name]) for name in _FLAGS)
+    return Odometry(**arrays, metric=metric, of_images=of_images, increments=increments)

@@ -8,13 +8,14 @@ say how such heights hold a monocular scale).
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
 from vplog.data import SCALE_WANDER, Camera, Floats, Ints, Odometry
-from vplog.run.visual_odometry.metres import random_walk, scaled
+from vplog.run.visual_odometry.metres import random_walk, scaled, without_scale
 
 _DEPRESSION = np.sin(np.radians(4.0))
 """Sine of the angle below the horizon: what is farther is low by a small error of the pitch alone."""
@@ -66,8 +67,18 @@ def by_height(odometry: Odometry, views: list[Below], height_m: float, camera: C
     log_scale, left = _smoothed(odometry, rows, np.log(height_m / heights), spread)
     if left > _SPREAD:
         return None
-    since = odometry.stamp_ns - odometry.stamp_ns[0]
-    return replace(scaled(odometry, np.exp(np.interp(since, since[rows], log_scale)), camera), metric=True)
+    since, count = odometry.stamp_ns - odometry.stamp_ns[0], len(odometry.stamp_ns)
+    bounds = np.concatenate([[0], odometry.breaks, [count]])
+    piece_of = np.searchsorted(bounds, rows, "right") - 1
+    scale, unmeasured = np.full(count, float(np.median(log_scale))), list[tuple[int, int]]()
+    for piece, (a, b) in enumerate(pairwise(bounds.tolist())):
+        inside = piece_of == piece
+        if inside.any():
+            scale[a:b] = np.interp(since[a:b], since[rows[inside]], log_scale[inside])
+        else:
+            unmeasured.append((a, b))
+    metric = replace(scaled(odometry, np.exp(scale), camera), metric=True)
+    return without_scale(metric, unmeasured, "view of the ground")
 
 
 def _heights(views: list[Below]) -> tuple[Floats, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from vplog.data import RECEIVER_SIGMA_M, SCALE_WANDER, Camera, Floats, Gps, Ints
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
 
+_log = logging.getLogger(__name__)
 _APART = 10.0
 """Sigmas of a fix between two that are compared: their distance then is known to a seventh."""
 _REACH = (1, 2, 4, 8)
@@ -21,6 +23,10 @@ _TUNING = 2.0
 """Sigmas beyond which a distance counts less (Huber)."""
 _ROUNDS = 15
 """Gauss-Newton steps; from the median ratio some five converge."""
+_ANY_SCALE = 1.0
+"""Sigma of the log of a scale that was not measured: each piece has a unit of its own."""
+_NAMED = 3
+"""Pieces that are named."""
 _LEAST = 3
 """Fixes at such distances from each other that give metres."""
 
@@ -38,7 +44,7 @@ class _Way(NamedTuple):
 
 def in_metres(odometry: Odometry, gps: Gps, camera: Camera) -> Odometry | None:
     """Odometry with its steps multiplied by the scale that the fixes imply; None where the body does not move far
-    enough for one. Pieces without such fixes take the scale of the others."""
+    enough for one. Pieces without such fixes take the scale of the others, see `without_scale`."""
     lever = camera.body_from_camera
     poses = se3.inverse(lever) @ odometry.odom_from_body @ lever
     bounds = np.concatenate([[0], odometry.breaks, [len(poses)]]).tolist()
@@ -54,7 +60,30 @@ def in_metres(odometry: Odometry, gps: Gps, camera: Camera) -> Odometry | None:
         if one is not None:
             middle = (way.stamp_ns[1:] - odometry.stamp_ns[0] + way.stamp_ns[:-1] - odometry.stamp_ns[0]) / 2.0
             log_scale[a:b] = np.interp(odometry.stamp_ns[a:b] - odometry.stamp_ns[0], middle, one)
-    return replace(scaled(odometry, np.exp(log_scale), camera), metric=True)
+    metric = replace(scaled(odometry, np.exp(log_scale), camera), metric=True)
+    unmeasured = [piece for piece, one in zip(pairwise(bounds), found, strict=True) if one is None]
+    return without_scale(metric, unmeasured, "satellite fixes")
+
+
+def without_scale(odometry: Odometry, pieces: list[tuple[int, int]], what: str) -> Odometry:
+    """Odometry whose steps are as unsure as they are long in these pieces (from row, to row), where no scale was
+    measured and that of the others stands in; they are noted."""
+    pieces = [(a, b) for a, b in pieces if b - a > 1]
+    if not pieces or odometry.covariance is None:
+        return odometry
+    covariance = odometry.covariance.copy()
+    for a, b in pieces:
+        step = se3.between(odometry.odom_from_body[a : b - 1], odometry.odom_from_body[a + 1 : b])[:, :3, 3]
+        # an error of scale adds up over the piece, while those of its steps are summed as independent
+        covariance[a + 1 : b, 3:, 3:] += (b - a) * _ANY_SCALE**2 * step[:, :, None] * step[:, None, :]
+    since_s = (odometry.stamp_ns - odometry.stamp_ns[0]) / 1e9
+    named = ", ".join(f"{since_s[a]:.1f} to {since_s[b - 1]:.1f} s" for a, b in pieces[:_NAMED])
+    _log.warning(
+        "Visual odometry has no %s by which to tell its scale in %d of its pieces (%s%s): that of the others is "
+        "assumed, and may be wrong there.",
+        what, len(pieces), named, ", ..." if len(pieces) > _NAMED else "",
+    )  # fmt: skip
+    return replace(odometry, covariance=covariance)
 
 
 def scaled(odometry: Odometry, scale: Floats, camera: Camera) -> Odometry:

@@ -62,6 +62,10 @@ class Sensor:
     def pixel_sigma(self) -> float:
         return self._noise.pixel_sigma
 
+    def rho_variance(self, rho: Floats) -> Floats:
+        """(K,) of inverse depths (K,) as if measured."""
+        return self._noise.depth_sigma**2 + (self._noise.depth_share * rho) ** 2
+
     def measure(self, frame: Frame, px: Float32s) -> Points:
         """The points at (K, 2) px of a frame; those that the lens gives no ray have none, NaN."""
         rays = undistort.rays(self.camera, px)

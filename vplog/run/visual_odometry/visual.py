@@ -313,8 +313,9 @@ class _Tracker:
             return ReferenceFrame(frame, ids, estimated, self._free())
         shown = np.concatenate([other for _, other, _ in self.window])
         times = (np.sort(shown).searchsorted(ids, "right") - np.sort(shown).searchsorted(ids, "left")).clip(1)
-        own = np.where(np.isfinite(points.variance), points.variance, np.nanmedian(points.variance))
         rho = 1.0 / at[:, 2]
+        # a point without depth in this view, or every one, is as sure as one that is measured there
+        own = np.where(np.isfinite(points.variance), points.variance, self.sensor.rho_variance(rho))
         estimated = type(points)(points.px, at[:, :2] * rho[:, None], points.noise, rho, own / times)
         return ReferenceFrame(frame, ids, estimated, self._free())
 
@@ -365,6 +366,7 @@ class _Tracker:
             breaks=np.array(self.breaks, np.int64),
             metric=self.sensor.metric,
             of_images=True,
+            increments=True,
         )
         metres = None if self.height_m is None else by_height(found, self.below, self.height_m, camera)
         return metres or found

@@ -1,0 +1,123 @@
+"""Velocities added up, where they are slow, where they pause, and beside a gyroscope that pauses or disagrees."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vplog.data import Odometry
+from vplog.graph.noise import NoiseSettings, edge_covariance
+from vplog.logs.continuity import without_jumps
+from vplog.logs.dead_reckoning import dead_reckoned, gyro_agrees, turned_by_gyro
+from vplog.logs.formats.container import Notes
+
+START_NS = 1_600_000_000_000_000_000
+UNKNOWN = np.nan
+
+
+def stamps(seconds: np.ndarray) -> np.ndarray:
+    return START_NS + np.rint(seconds * 1e9).astype(np.int64)
+
+
+def ahead(count: int, speed: float, turn: float | np.ndarray = 0.0) -> np.ndarray:
+    """(T, 6)."""
+    found = np.zeros((count, 6))
+    found[:, 0], found[:, 5] = speed, turn
+    return found
+
+
+def way_m(odometry: Odometry) -> float:
+    return float(np.linalg.norm(np.diff(odometry.odom_from_body[:, :3, 3], axis=0), axis=1).sum())
+
+
+@pytest.mark.parametrize("period_s", [0.02, 1.0, 1.5, 5.0])
+def test_slow_velocities_lose_no_path(period_s: float) -> None:
+    """As the speed of an OBD or CAN logger, whose stamps jitter."""
+    at_s = np.arange(0, 300, period_s)
+    at_s += np.random.default_rng(1).uniform(-0.005, 0.005, len(at_s)) * min(period_s, 1.0)
+    found = dead_reckoned(stamps(at_s), ahead(len(at_s), 10.0), np.full((len(at_s), 6), UNKNOWN))
+    assert way_m(found) == pytest.approx(10.0 * (at_s[-1] - at_s[0]))
+    assert not len(found.breaks)
+
+
+@pytest.mark.parametrize("variance", [UNKNOWN, 0.01])
+def test_what_happened_in_a_pause_is_not_known(variance: float) -> None:
+    at_s = np.concatenate([np.arange(0, 30, 0.1), np.arange(90, 120, 0.1)])
+    found = dead_reckoned(stamps(at_s), ahead(len(at_s), 10.0), np.full((len(at_s), 6), variance))
+    assert found.breaks.tolist() == [300]
+    keys = stamps(np.array([0.0, 15.0, 29.0, 91.0, 110.0]))
+    edges, _, _ = edge_covariance(found, keys, NoiseSettings())
+    sigma_m = np.sqrt(edges[:, 3, 3])
+    assert sigma_m[2] > 500
+    assert sigma_m[[0, 1, 3]].max() < 10
+
+
+def pausing(wheels_s: np.ndarray, gyro_s: np.ndarray) -> Odometry:
+    """The odometry of a circle by wheels that turn too far, and by a gyroscope that does not."""
+    gyro = np.zeros((len(gyro_s), 3))
+    gyro[:, 2] = 0.1
+    found = turned_by_gyro(stamps(wheels_s), ahead(len(wheels_s), 10.0, 0.12), stamps(gyro_s), gyro)
+    return dead_reckoned(found[0], found[1], np.full_like(found[1], UNKNOWN))
+
+
+def test_a_gyroscope_that_pauses_or_starts_late_leaves_the_wheels() -> None:
+    wheels_s, gyro_s = np.arange(0, 120, 0.05), np.arange(0, 120, 0.01)
+    paused = pausing(wheels_s, gyro_s[(gyro_s < 50) | (gyro_s > 60)])
+    late = pausing(wheels_s, gyro_s[gyro_s > 20])
+    for found, turn in ((paused, 110 * 0.1 + 10 * 0.12), (late, 100 * 0.1 + 20 * 0.12)):
+        assert way_m(found) == pytest.approx(1199.5, rel=0.001)
+        assert not len(found.breaks)
+        heading = np.unwrap(np.arctan2(found.odom_from_body[:, 1, 0], found.odom_from_body[:, 0, 0]))
+        assert heading[-1] - heading[0] == pytest.approx(turn, abs=0.03)
+
+
+def test_nothing_is_made_up_where_the_wheels_pause() -> None:
+    wheels_s, gyro_s = np.arange(0, 120, 0.05), np.arange(0, 120, 0.01)
+    found = pausing(wheels_s[(wheels_s < 30) | (wheels_s > 90)], gyro_s)
+    assert way_m(found) == pytest.approx(600, abs=2)
+    assert len(found.breaks) == 1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_gyroscope_agrees_with_the_turns_it_measures(seed: int) -> None:
+    """Not in the axes of a camera, in degrees, by another clock, or of something else; wheels may slip."""
+    rng = np.random.default_rng(seed)
+    gyro_s, wheels_s = np.arange(0, 60, 0.01), np.arange(0, 60, 0.05)
+    phase = rng.uniform(0, 6, 4)
+
+    def rate(at_s: np.ndarray) -> np.ndarray:
+        return 0.2 * np.sin(np.outer(0.3 + 0.2 * np.arange(4), at_s) + phase[:, None]).sum(0)
+
+    gyro = rng.normal([0, 0, 0.02], 0.1, (len(gyro_s), 3))
+    gyro[:, 2] += rate(gyro_s)
+    turning = ahead(len(wheels_s), 1.0, rate(wheels_s) + rng.normal(0, 0.02, len(wheels_s)))[:, 3:]
+    both = stamps(wheels_s), turning, stamps(gyro_s)
+    assert gyro_agrees(*both, gyro)
+    assert gyro_agrees(*both[:1], 2 * turning, both[2], gyro)
+    assert gyro_agrees(*both[:1], 0 * turning, both[2], gyro)
+    assert not gyro_agrees(*both, gyro[:, [1, 2, 0]])
+    assert not gyro_agrees(*both, np.degrees(gyro))
+    assert not gyro_agrees(*both, -gyro)
+    assert not gyro_agrees(*both, np.roll(gyro, 1000, axis=0))
+
+
+@pytest.mark.parametrize("gap_s", [3.0, 5.0, 20.0])
+def test_an_estimator_that_starts_again_is_a_break(gap_s: float) -> None:
+    """However long the gap is, in which any jump might be a motion."""
+    at_s = np.concatenate([np.arange(0, 60, 0.05), np.arange(60 + gap_s, 120, 0.05)])
+    poses = np.tile(np.eye(4), (len(at_s), 1, 1))
+    poses[:1200, 0, 3], poses[1200:, 0, 3] = at_s[:1200], at_s[1200:] - at_s[1200]
+    found = without_jumps(Odometry(stamps(at_s), poses, None), "/odom", notes := Notes())
+    assert found.breaks.tolist() == [1200]
+    assert "starts again" in notes.lines[0]
+    assert found.odom_from_body[1200, 0, 3] == pytest.approx(found.odom_from_body[1199, 0, 3])
+    assert way_m(found) == pytest.approx(60 + 60 - gap_s, abs=0.2)
+
+
+def test_a_robot_that_comes_back_to_its_dock_does_not_start_again() -> None:
+    at_s = np.concatenate([np.arange(0, 60, 0.05), np.arange(70, 120, 0.05)])
+    poses = np.tile(np.eye(4), (len(at_s), 1, 1))
+    poses[:1200, 0, 3] = 20 * np.sin(np.linspace(0, np.pi, 1200))
+    found = without_jumps(Odometry(stamps(at_s), poses, None), "/odom", notes := Notes())
+    assert not len(found.breaks)
+    assert notes.lines == []
