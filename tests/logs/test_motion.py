@@ -307,3 +307,18 @@ def test_one_drive_recorded_in_ros1_and_ros2_moves_alike(shared_data: Path) -> N
     np.testing.assert_array_equal(one.stamp_ns, other.stamp_ns)
     np.testing.assert_allclose(one.odom_from_body, other.odom_from_body, atol=1e-12)
     assert len(one.stamp_ns) > 500
+
+
+def test_standing_first_is_no_gap(tmp_path: Path) -> None:
+    """As robots do before they drive: the transforms of that time count, though they are all alike."""
+    stands = [*[POSES[0]] * 400, *POSES]
+    found = []
+    for row, pose in enumerate(stands):
+        stamp = int(START_NS + PERIOD_NS * row)
+        found += [tf(2, "/tf", stamp, ("odom", "base_link", pose)), image(2, stamp)]
+    log = logs.open(write_ros2(tmp_path / "drive", found))
+    (source,) = [one for one in log.info().odometry_sources if one.kind == "tf"]
+    assert source.coverage == 1.0
+    odometry = log.odometry()
+    assert odometry is not None and np.diff(odometry.stamp_ns).max() <= 10**9
+    assert not any("standing" in line or "covers" in line for line in log.warnings)

@@ -10,6 +10,7 @@ import pytest
 from vplog.data import Camera, Closures, Features, Floats, Keyframes, Verdict
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
+from vplog.loops.candidate import lenient
 from vplog.loops.propose import Proposals
 from vplog.loops.undistort import project
 from vplog.loops.verify import VerifySettings, drive_of, verify_between
@@ -126,3 +127,25 @@ def test_a_camera_whose_mount_is_wrong_leaves_the_pose_of_the_other(yaw_deg: flo
 def test_a_ledger_without_candidates_stays_so() -> None:
     rig = rig_of(np.random.default_rng(4), np.eye(4), (30, 30))
     assert verify_together(by_one(rig).rows(np.zeros(0, np.int64)), rig, Execution()) == []
+
+
+def test_a_camera_without_a_matrix_leaves_the_others() -> None:
+    rig = rig_of(np.random.default_rng(5), np.eye(4), (40, 40))
+    ledger = replace(by_one(rig, 1), verdict=[Verdict.TOO_FEW_INLIERS])
+    rig.drives = [rig.drives[0], replace(rig.drives[1], camera=replace(CAMERAS[1], matrix=None))]
+    (together,) = verify_together(ledger, rig, Execution())
+    assert together.verdict == [Verdict.TOO_FEW_INLIERS]
+
+
+def test_what_chance_does_not_explain_has_a_pose_whatever_the_share_of_its_inliers() -> None:
+    """As a person decided, and in reverse: 40 of 200 matches on a facade whose windows are alike."""
+    rng = np.random.default_rng(6)
+    rig = rig_of(rng, motion_of(rng), (200, 0))
+    own = rig.drives[0]
+    first, second = own.features(0), own.features(1)
+    order = np.concatenate([np.arange(40), rng.permutation(np.arange(40, 200))])
+    mixed = [first, replace(second, descriptors=second.descriptors[order])]
+    for settings, accepted in ((SETTINGS, False), (lenient(SETTINGS), True)):
+        drive = drive_of(own.keyframes, own.camera, mixed.__getitem__, settings)
+        rig.drives = [drive, drive]
+        assert by_one(rig).accepted.tolist() == [accepted]

@@ -101,6 +101,8 @@ def test_grain_is_not_used() -> None:
     kept = large_enough(features, WeighedMatchSettings(least_size=0.02, features=1000))
     assert (kept.sizes >= least).all()
     assert len(kept) == (features.sizes >= least).sum() < len(features)
+    of_a_network = replace(features, sizes=np.full(len(features), 0.1, np.float32))  # all alike tell nothing of grain
+    assert len(large_enough(of_a_network, WeighedMatchSettings(least_size=0.02, features=1000))) == len(features)
 
 
 @pytest.mark.parametrize("kinds", [{"features": 0}, {"patch_weight": 0.0}, {}])

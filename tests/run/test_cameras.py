@@ -224,6 +224,8 @@ def test_a_pair_of_keyframes_is_once_in_the_ledger_as_the_cameras_that_agree_bes
     inliers, number = np.array([30, 90, 10, 40, 20], np.int32), np.arange(5, dtype=np.int32)
     found = replace(found, verdict=verdicts, inliers=inliers, query_camera=number)
     assert cameras.once([found]).query_camera.tolist() == [2, 3, 4]
+    verdicts = [Verdict.TOO_FEW_INLIERS, Verdict.NO_CALIBRATION, *verdicts[2:]]
+    assert cameras.once([replace(found.rows(number[:2].astype(np.int64)), verdict=verdicts[:2])]).query_camera == [0]
     assert len(cameras.once([found.rows(number[:0].astype(np.int64))])) == 0
 
 

@@ -14,9 +14,11 @@ import pytest
 
 from vplog.data import Camera, Frame, Gps, Keyframes, Odometry
 from vplog.errors import TruthError
+from vplog.execution.execution import Execution
 from vplog.geometry import geodesy, se3
 from vplog.pipeline import load_pipeline, run
 from vplog.results import run_record
+from vplog.run.landmarks import run_drive
 from vplog.run.scale_drift import in_one_scale
 from vplog.run.visual_odometry.metres import in_metres
 from vplog.run.visual_odometry.sensor import Sensor
@@ -195,6 +197,11 @@ def test_places_are_recognised_where_nothing_can_be_tracked(tmp_path: Path) -> N
     pairs = zip(done.closures.query.tolist(), done.closures.match.tolist(), strict=True)
     assert {(10, 0), (11, 1)} <= set(pairs)
     assert not done.closures.accepted.any()
+    # what is looked at later is that of the run, not that of the log
+    assert done.record["calibrations"][0]["matrix"] is None
+    done.record["calibrations"][0]["matrix"] = np.diag([7.0, 7.0, 1.0]).tolist()
+    with run_drive(tmp_path / "run", done.record, load_pipeline("quick", settings), 0, Execution()) as again:
+        assert again.camera.matrix is not None and again.camera.matrix[0, 0] == 7.0
 
 
 def test_the_ratios_of_closures_give_one_scale() -> None:

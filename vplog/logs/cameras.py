@@ -52,6 +52,11 @@ def camera_of(name: str, calibration: CalibrationMessage | None, size: tuple[int
         notes.add(f"{name} is uncalibrated: its K is not set (K[0] = {matrix[0, 0]:g}). Give one with --calibration.")
         return unknown
     known = _model(model, distortion)
+    if known is not None and known[0] == "equidistant" and not known[1].any():
+        notes.add(
+            f"The calibration of {name} is that of a fisheye without coefficients, an ideal one. Where its images are "
+            "rectified, give the matrix of a pinhole with --calibration."
+        )
     if known is None:
         notes.add(
             f"The calibration of {name} has {len(distortion)} coefficients of the distortion model {model[:40]!r}, "
@@ -103,7 +108,7 @@ def _model(name: str, coefficients: Floats) -> tuple[str, Floats] | None:
     if not np.isfinite(coefficients).all():
         return None
     if not coefficients.any():
-        return "none", np.zeros(0)
+        return "equidistant" if lens_of(name) == "equidistant" else "none", np.zeros(0)
     given, used = len(coefficients), int(np.flatnonzero(coefficients)[-1]) + 1
     counts = _COUNTS.get(lens_of(name) or "", {})
     count = given if given in counts else min((n for n in counts if used <= n < given), default=0)

@@ -19,7 +19,7 @@ from vplog.loops.verify_epipolar import EpipolarSettings
 from vplog.loops.verify_metric import MetricSettings, Pose
 from vplog.settings import Settings
 
-_LENIENT = {"min_inliers": 6, "min_spread": 0.0, "max_depths": np.inf, "max_distance_m": np.inf}
+_LENIENT = {"min_inliers": 6, "min_share": 0.0, "min_spread": 0.0, "max_depths": np.inf, "max_distance_m": np.inf}
 """Metric settings under which a pose is found wherever chance does not explain it."""
 _CHI2_6 = 22.458
 """Mahalanobis^2 of a 6D error that 0.1 % of right pairs exceed: chi-square, 6 degrees of freedom, 99.9 %."""

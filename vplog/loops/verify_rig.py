@@ -104,7 +104,9 @@ class Rig:
 def verify_together(closures: Closures, rig: Rig, execution: Execution) -> list[Closures]:
     """The C candidates of several cameras, those with enough matches with the pose and verdict by all cameras that
     share a view. Counts stay those of one pair of cameras."""
-    tried = np.flatnonzero(~closures.of(Verdict.TOO_FEW_MATCHES, Verdict.NO_CALIBRATION))
+    calibrated = np.array([drive.camera.matrix is not None for drive in rig.drives])
+    both = calibrated[closures.query_camera] & calibrated[closures.match_camera]
+    tried = np.flatnonzero(both & ~closures.of(Verdict.TOO_FEW_MATCHES, Verdict.NO_CALIBRATION))
     order = tried[np.argsort(closures.match[tried], kind="stable")].tolist()  # landmarks of a match are remembered
     found = execution.map(lambda at: _verified(closures.rows(np.array([at])), rig), order)
     better = dict(zip(order, found, strict=True))

@@ -155,7 +155,8 @@ class Matcher:
 def large_enough(features: Features, settings: WeighedMatchSettings) -> Features:
     """The strongest features of those that are large enough."""
     least = settings.least_size * np.sqrt(features.width * features.height)
-    return features.rows(np.flatnonzero(features.sizes >= least)[: settings.features])
+    alike = len(features) and features.sizes.max() == features.sizes.min()  # a network's, which tell nothing of grain
+    return features.rows(np.flatnonzero((features.sizes >= least) | alike)[: settings.features])
 
 
 def keypoints_of(features: Features, settings: WeighedMatchSettings) -> Described:

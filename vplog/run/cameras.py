@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from vplog import logs
-from vplog.data import Bytes, Camera, Closures, Ints, Keyframes, Odometry, Reference
+from vplog.data import Bytes, Camera, Closures, Ints, Keyframes, Odometry, Reference, Verdict
 from vplog.errors import LogError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
@@ -241,10 +241,11 @@ def _numbered(ledgers: Sequence[Closures]) -> list[Ints]:
 
 
 def once(ledgers: Sequence[Closures]) -> Closures:
-    """Every pair of keyframes of several ledgers once, ordered by query, then rank: accepted rather than not, then with
-    most inliers, then of the first ledgers."""
+    """Every pair of keyframes of several ledgers once, ordered by query, then rank: accepted rather than not, then
+    calibrated rather than not, then with most inliers, then of the first ledgers."""
     closures = merged(ledgers, _numbered(ledgers))
-    order = np.lexsort([-closures.inliers, -closures.accepted.astype(int), closures.match, closures.query])
+    uncalibrated = closures.of(Verdict.NO_CALIBRATION)
+    order = np.lexsort([-closures.inliers, uncalibrated, ~closures.accepted, closures.match, closures.query])
     pair = np.stack([closures.query, closures.match])[:, order]
     best = order[np.insert((np.diff(pair) != 0).any(axis=0), 0, True)] if len(order) else order
     return closures.rows(best[np.lexsort([closures.match[best], closures.rank[best], closures.query[best]])])

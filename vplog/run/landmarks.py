@@ -19,7 +19,7 @@ from vplog.loops.candidate import Drive
 from vplog.loops.undistort import project
 from vplog.loops.verify import VerifySettings, drive_of
 from vplog.results.landmark_table import write_landmarks
-from vplog.results.run_cameras import camera_pictures, camera_topics
+from vplog.results.run_cameras import camera_pictures, camera_topics, recorded_camera
 from vplog.results.run_record import CACHE
 from vplog.run.cache.code_hash import code_of
 from vplog.run.feature_extraction import Extraction, stored_features
@@ -61,7 +61,8 @@ def run_drive(
         if features is None or not np.array_equal(features.stamp_ns, keyframes.stamp_ns):
             store = stack.enter_context(FeatureStore(stack.enter_context(scratch("features")) / "features"))
             features = ReextractedFeatures(log, keyframes.stamp_ns, settings, store, execution)
-        yield drive_of(keyframes, log.camera(), features.__getitem__, settings.verify)
+        used = recorded_camera(record, camera, log.camera())
+        yield drive_of(keyframes, used, features.__getitem__, settings.verify)
 
 
 def landmark_key(folder: Path, record: dict[str, Any], settings: DriveSettings, camera: int) -> str:

@@ -43,6 +43,7 @@ from vplog.run.figures.run_figures import (
 )
 from vplog.run.report import pictured_keyframes, questions_of, references_of, tracks_of, write_page
 from vplog.storage.image_file import decode_image
+from vplog.storage.json_records import plain
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -224,6 +225,7 @@ def _results_record(run: Run, spacing: int) -> dict[str, Any]:
     constrained = set(run.graph.kind) - {EdgeKind.ODOMETRY} or run.solved.refined.fixes
     return {
         "cameras": [view.camera.name for view in run.views],
+        "calibrations": [plain(dict(vars(view.camera))) for view in run.views],
         "library": {
             "hash": run.state.hash,
             "from": provenance.library_of(run.library),

@@ -15,6 +15,7 @@ from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.pipeline import Pipeline, recorded_pipeline
 from vplog.results import run_record, tables
+from vplog.results.run_cameras import recorded_camera
 from vplog.run.figures.closure_view import SharedBoxes, find_agreement, find_boxes
 from vplog.run.keyframes import row_of
 from vplog.run.provenance import reopened
@@ -132,7 +133,7 @@ def _picture(end: str, row: dict[str, Any], opened: _Opened) -> tuple[Bytes, Fea
         stamps = log.stamps()
         stamp_ns = stamps[[np.abs(stamps - stamp_ns).argmin()]]
     [(image, features)] = frames_at(log, stamp_ns, opened.pipeline, otherwise)
-    return image, features, log.camera()
+    return image, features, recorded_camera(opened.record, number, log.camera())
 
 
 def _boxes(row: dict[str, Any], views: tuple[Features, Features], opened: _Opened) -> tuple[list[SharedBoxes], str]:

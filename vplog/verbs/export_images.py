@@ -22,6 +22,7 @@ from vplog.loops.structure import pairs_to_match, triangulate
 from vplog.pipeline import Pipeline, recorded_pipeline
 from vplog.results import colmap, run_record, tables
 from vplog.results.previews import jpeg
+from vplog.results.run_cameras import recorded_camera
 from vplog.results.staging import check_contents, staged
 from vplog.run.cameras import pictures_at
 from vplog.run.provenance import reopened
@@ -85,15 +86,15 @@ def _cameras(folder: Path, record: dict[str, Any], topics: logs.TopicChoice, log
     """The cameras of a run: the first by the poses of the keyframes, the others by the trajectory at their stamps."""
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     drive, names = reopened(record, log, topics), record.get("cameras") or []
-    first, several = drive.camera(), len(names) > 1
+    first, several = recorded_camera(record, 0, drive.camera()), len(names) > 1
     poses, rows = world_from_body @ first.body_from_camera, np.arange(len(keyframes.stamp_ns))
     found = [_PosedCamera(drive, first, _folder(first.name) if several else "", rows, keyframes.stamp_ns, poses)]
-    for topic in names[1:]:
+    for number, topic in enumerate(names[1:], 1):
         trajectory, odometry = tables.read_trajectory(folder / "trajectory.parquet")
         other = reopened(record, log, topics.of_camera(topic))
         row, pictures = pictures_at(keyframes, other.stamps(), odometry)
         bodies = se3.interpolate_at(trajectory.stamp_ns, trajectory.world_from_body, pictures.stamp_ns)
-        camera = other.camera()
+        camera = recorded_camera(record, number, other.camera())
         poses = bodies @ camera.body_from_camera
         found.append(_PosedCamera(other, camera, _folder(camera.name), row, pictures.stamp_ns, poses))
     return found

@@ -20,6 +20,7 @@ from vplog.pipeline import Pipeline, recorded_pipeline
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.previews import thumbnail
 from vplog.results.report.page import Pictures, TruthComparison
+from vplog.results.run_cameras import recorded_camera
 from vplog.results.run_record import has_metres
 from vplog.run.figures.run_figures import ClosureInputs, choose_views, reference_pictures, view_closures
 from vplog.run.provenance import library_at
@@ -108,7 +109,8 @@ def pictures_from(log: Path, folder: Path, record: dict[str, Any], execution: Ex
     found = frames_at(opened, stamps, pipeline, f"is it the log of {folder}?", execution)
     for node, (image, features[node]) in zip(nodes.tolist(), found, strict=True):
         thumbnails[node] = thumbnail(image)
-    inputs = ClosureInputs(features.__getitem__, opened.camera(), state, state.from_arrow(column))
+    camera = recorded_camera(record, 0, opened.camera())
+    inputs = ClosureInputs(features.__getitem__, camera, state, state.from_arrow(column))
     views = view_closures(rows, inputs, closures, pipeline.verify, execution)
     references = reference_pictures(state.references, pipeline.pictures.quality) if isinstance(state, BoxState) else {}
     return Pictures(views, references, thumbnails)

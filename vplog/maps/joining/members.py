@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog import logs
-from vplog.data import Int32s, Ints
+from vplog.data import Camera, Int32s, Ints
 from vplog.errors import LogError, ResultError
 from vplog.features.store import FeatureStore
 from vplog.loops.calibration import turning_pairs
@@ -20,7 +20,7 @@ from vplog.maps.storage.layout import described_with, folder_name
 from vplog.pipeline import Pipeline
 from vplog.results import run_record, tables
 from vplog.results.feature_table import FeatureTable, write_features
-from vplog.results.run_cameras import CameraPictures, camera_from, camera_pictures, camera_topics
+from vplog.results.run_cameras import CameraPictures, camera_from, camera_pictures, camera_topics, recorded_camera
 from vplog.run.feature_extraction import Extracted, stored_features
 from vplog.run.provenance import stored_log
 from vplog.run.reextraction import ReextractedFeatures
@@ -61,6 +61,8 @@ class Member:
     """Topics of its cameras, the first one's first."""
     camera: int = 0
     """Number of the camera that topics and features are of."""
+    calibrations: list[Any] | None = None
+    """The cameras that its run computed with, as plain values; None where its record lacks them."""
 
     def of_camera(self, number: int) -> Member:
         """The drive with a further camera as the one in use."""
@@ -106,7 +108,7 @@ def member_of(store: Store, about: dict[str, Any]) -> Member:
         drive, file, store.root / ".cache" / folder_name(drive),
         store.root / "joins" / folder_name(drive) / "features.parquet", about["log"], about["inputs"],
         logs.TopicChoice.read(topics if isinstance(topics, dict) else {}, str(record)), pipeline,
-        key_of(made_from), cameras,
+        key_of(made_from), cameras, calibrations=account.get("calibrations"),
     )  # fmt: skip
 
 
@@ -120,6 +122,11 @@ def opened_log(member: Member, check: bool = False) -> Log:
     if any(member.inputs.get(name) != text for name, text in found.items()):
         raise LogError(f"The log of {member.drive}, {path}, has changed since. Run `vplog batch` with it again.")
     return log
+
+
+def camera_of(member: Member) -> Camera:
+    """The camera that the drive's run computed with. Raises LogError where its log is gone."""
+    return recorded_camera({"calibrations": member.calibrations}, member.camera, opened_log(member).camera())
 
 
 @dataclass(frozen=True)
@@ -141,7 +148,7 @@ class CameraTrust:
 
 def camera_trust(member: Member, verify: VerifySettings, execution: Execution) -> CameraTrust:
     """The camera of the log, its rotations compared with the odometry's. Raises LogError where the log is gone."""
-    camera = opened_log(member).camera()
+    camera = camera_of(member)
     unknown = CameraTrust(plain(dict(vars(camera))), 0.0)
     if camera.matrix is None:
         return unknown

@@ -22,7 +22,7 @@ from vplog.loops.verify import VerifySettings
 from vplog.maps.geo_bounds import earth_of_run
 from vplog.maps.joining.drive_pairs import known_camera
 from vplog.maps.joining.joint_record import Component, joint_components, keyframe_poses
-from vplog.maps.joining.members import CameraTrust, member_of, opened_drive, opened_log
+from vplog.maps.joining.members import CameraTrust, camera_of, member_of, opened_drive
 from vplog.maps.search.exact import NO_SCORE, best_places
 from vplog.maps.search.index import SegmentView, pictures_of, update_index
 from vplog.maps.search.query import open_map
@@ -256,7 +256,7 @@ def _map_landmarks(
     def drive() -> Iterator[Drive]:
         trust = known_camera(store, of_drive, pipeline)
         known = None if trust is None else trust.each[camera]
-        known = known or CameraTrust(plain(dict(vars(opened_log(member).camera()))), 0.0)
+        known = known or CameraTrust(plain(dict(vars(camera_of(member)))), 0.0)
         with opened_drive(member, known, member.pipeline.verify, execution) as (found, fetch):
             fetch(np.arange(len(found.keyframes.stamp_ns)))
             yield found
