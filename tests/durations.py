@@ -84,7 +84,9 @@ class Recorder:
             for function in self.users.get(fixture, ()):
                 cost[function] += seconds / len(self.users[fixture])  # type: ignore[assignment]
         ran = {name.partition("::")[0] for name in cost}
-        others = {name: s for name, s in known().items() if name.partition("::")[0] not in ran}
+        top = FILE.parents[1]
+        kept = {file for name in known() if (top / (file := name.partition("::")[0])).exists()} - ran
+        others = {name: s for name, s in known().items() if name.partition("::")[0] in kept}
         noted = {name: round(seconds, 1) for name, seconds in cost.items() if seconds > _NOTED_S}
         FILE.write_text(json.dumps(dict(sorted({**others, **noted}.items())), indent=0) + "\n", encoding="utf-8")
 

@@ -14,9 +14,10 @@ if TYPE_CHECKING:
 
 
 def test_those_that_share_a_fixture_share_what_it_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Files of which no test ran keep their numbers, and tests that are gone from the others go."""
-    file = tmp_path / "durations.json"
-    file.write_text(json.dumps({"a.py::gone": 5.0, "b.py::other": 3.0}))
+    """Files of which no test ran keep their numbers; tests that are gone from the others go, as files that are gone."""
+    (file := tmp_path / "tests" / "durations.json").parent.mkdir()
+    (tmp_path / "b.py").touch()
+    file.write_text(json.dumps({"a.py::gone": 5.0, "b.py::other": 3.0, "c.py::gone": 1.0}))
     monkeypatch.setattr(durations, "FILE", file)
     recorder = durations.Recorder()
     recorder.functions.update({"a.py::first": 1.0, "a.py::second": 0.5, "a.py::short": 0.02})  # type: ignore[arg-type]

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import ast
+import typing
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from pydantic import Field, ValidationError
 
+import vplog
 from vplog.benchmark.recogniser_specs import read_method
 from vplog.errors import SettingsError
 from vplog.pipeline import Pipeline, load_pipeline, pipeline_from
@@ -15,7 +19,6 @@ from vplog.settings import Settings, load_yaml, override
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 
 class Inner(Settings):
@@ -280,3 +283,22 @@ def test_overrides_that_say_nothing(assignment: str) -> None:
 def test_a_value_is_no_group(value: object) -> None:
     with pytest.raises(SettingsError, match="is a value, not a group"):
         override({"a": value}, "a.b=1")
+
+
+def _kinds(settings: type[Settings]) -> Iterator[type[Settings]]:
+    """A kind of settings, and all that it holds."""
+    yield settings
+    for field in settings.model_fields.values():
+        for kind in (field.annotation, *typing.get_args(field.annotation)):
+            if isinstance(kind, type) and issubclass(kind, Settings):
+                yield from _kinds(kind)
+
+
+def test_every_setting_is_read_somewhere() -> None:
+    """One that is not would be taken without a word, and do nothing."""
+    code = Path(vplog.__file__).parent
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in code.rglob("*.py")]
+    read = {node.attr for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    kinds = {one for kind in (Pipeline, *KINDS.values()) for one in _kinds(kind)}
+    assert len(kinds) > 25
+    assert [f"{kind.__name__}.{name}" for kind in kinds for name in kind.model_fields if name not in read] == []

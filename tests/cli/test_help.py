@@ -130,3 +130,23 @@ def test_the_dockerfile_copies_what_is_there_and_starts_the_command() -> None:
     least = re.search(r'requires-python = ">=([\d.]+)"', (PROJECT / "pyproject.toml").read_text())
     assert least is not None
     assert all(f"python:{least[1]}-slim" in rest for kind, rest in words if kind == "FROM")
+
+
+def _documented() -> Iterator[tuple[str, str]]:
+    """Each command of vplog in the documentation, and its file."""
+    for path in (PROJECT / "README.md", *sorted((PROJECT / "docs").rglob("*.md"))):
+        for block in re.findall(r"^```sh\n(.*?)^```", path.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
+            for line in block.replace("\\\n", " ").splitlines():
+                if line.startswith("vplog "):
+                    yield path.name, line
+
+
+def test_every_command_of_the_documentation_parses() -> None:
+    root, commands = main._parser(), list(_documented())
+    assert len(commands) > 60
+    for file, line in commands:
+        words = ["7" if word in ("K", "N") else word for word in shlex.split(line, comments=True)[1:]]
+        try:
+            root.parse_args(words)
+        except SystemExit:
+            pytest.fail(f"{file}: {line}")

@@ -19,6 +19,8 @@ def test_the_wheel_ships_every_template() -> None:
 
     shipped = {file.distribution_path for file in WheelBuilder(str(ROOT)).recurse_included_files()}
     assert {f"vplog/results/templates/{name}" for name in TEMPLATES} <= shipped
+    for folder in ("pipelines", "schemas"):
+        assert {f"vplog/{folder}/{path.name}" for path in (ROOT / folder).iterdir()} <= shipped
     assert set(_environment().list_templates()) == set(TEMPLATES)
 
 

@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -256,10 +255,6 @@ def test_the_formats_own_reader_decodes_every_message(tmp_path: Path, node: list
     transform = found["topics"]["/tf"]["last"]["transforms"][0]
     assert transform["translation"]["x"] == pytest.approx(RUN.solution.world_from_body[-1, 0, 3])
     assert len(found["topics"]["/loop_closures"]["stamps"]) == len(RUN.closures)
-
-
-def test_pictures_are_jpegs_that_opencv_reads() -> None:
-    assert cv2.imdecode(np.frombuffer(picture(7), np.uint8), cv2.IMREAD_GRAYSCALE) is not None
 
 
 @pytest.mark.skipif(importlib.util.find_spec("rerun_cli") is None, reason="rerun-sdk is not installed")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import fields, replace
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,18 @@ from tests.results.example import make_run
 from vplog.data import Closures, Verdict
 from vplog.loops.candidate import VerifySettings
 from vplog.loops.propose import Proposals
+from vplog.results import tables
 from vplog.run import verification
 from vplog.run.cache.codecs import closures_codec
 from vplog.run.cache.stage_cache import digest_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from conftest import Said
+
+    from vplog.verbs.demo.record import Demo
 
 
 @pytest.mark.parametrize("size", [1, 3, 100])
@@ -70,3 +80,23 @@ def _taken(closures: Closures, rows: Any) -> Closures:
         for name, column in columns.items()
     }
     return Closures(**taken)
+
+
+@pytest.mark.parametrize("rate", [0.05, 0.5])
+def test_false_rate_bounds_what_is_accepted(
+    rate: float, finished: Path, drive: Demo, verb: Callable[..., Said], tmp_path: Path
+) -> None:
+    """Whatever no null pair is as good as needs many of them to be that certain, and a line says so."""
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    before = tables.read_closures(folder / "closures.parquet")
+    assert before.accepted.any()
+    said = verb("run", drive.log, "-o", folder, "--false-rate", rate, "--threads", 2, "--json")
+    assert said.code == 0
+    after = tables.read_closures(folder / "closures.parquet")
+    assert (after.p_false[after.accepted] <= rate).all()
+    verified = after.of(Verdict.ACCEPTED, Verdict.NOT_SIGNIFICANT)
+    assert (after.p_false[after.of(Verdict.NOT_SIGNIFICANT)] > rate).all()
+    assert verified.sum() == before.accepted.sum()
+    warned = f"--false-rate {rate:g}: no closure is that certain" in " ".join(said.json["warnings"])
+    assert warned != after.accepted.any()

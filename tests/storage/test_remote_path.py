@@ -7,6 +7,7 @@ import threading
 from contextlib import contextmanager
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -20,7 +21,6 @@ from vplog.storage.remote_path import RemotePath, local_copy, local_output, loca
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from pathlib import Path
 
     from conftest import Said
 
@@ -200,7 +200,7 @@ def test_nothing_is_sent_of_what_failed(bucket: str) -> None:
 
 def test_paths_stay_paths(tmp_path: Path) -> None:
     assert located(tmp_path) == tmp_path
-    assert located("a/b") == located("a/b")
+    assert located("a/b") == Path("a/b")
     remote = RemotePath("s3://bucket/folder/drive.mcap")
     assert (remote.name, remote.stem, remote.suffix) == ("drive.mcap", "drive", ".mcap")
     assert str(remote.relative_to(RemotePath("s3://bucket/folder"))) == "drive.mcap"

@@ -97,6 +97,7 @@ def test_no_verb_writes_or_says_a_signature(server: str, verb: Verb, tmp_path: P
         verb("compare", log, "--min-gap", 15, "--methods", "thumbnail", "--truth", truth, "-o", out / "compare"),
     ]  # fmt: skip
     check(out, *said)
+    assert [number for number, one in enumerate(said) if one.code] == [4, 7, 13]  # as is said below
     for one in said:
         assert "Internal error" not in one.err
         assert "Traceback" not in one.err
