@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 import threading
 from collections import Counter
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from http.client import HTTPConnection
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -45,6 +47,14 @@ def serving() -> Iterator[None]:
         HTTPStore(f"http://{host}:{port}", client_options={"allow_http": True}).put("bucket", b"")
         yield
     started.stop()
+
+
+def make_folder(name: str) -> None:
+    """The empty object by which the console of a store shows a folder: obstore cannot spell its name, as it ends in
+    a slash."""
+    with closing(HTTPConnection(os.environ["AWS_ENDPOINT_URL"].removeprefix("http://"))) as server:
+        server.request("PUT", f"/bucket/{name}/")
+        assert server.getresponse().status == 200
 
 
 @contextmanager

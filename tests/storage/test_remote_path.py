@@ -10,9 +10,11 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2
+import numpy as np
 import pytest
 
-from tests.maps.bucket import serving
+from tests.maps.bucket import make_folder, serving
 from vplog import logs
 from vplog.errors import LibraryError, LogError, ResultError, SettingsError
 from vplog.run.provenance import library_at, library_of
@@ -105,6 +107,30 @@ def test_a_log_on_s3_reads_as_the_file_does(drive: Demo, bucket: str) -> None:
     assert known is not None
     assert len(odometry.stamp_ns) == len(known.stamp_ns)
     assert there.name == "drive"
+
+
+def test_folders_that_a_console_made_are_no_files(bucket: str) -> None:
+    """A folder of images on a store reads as on a disk, with and without the objects that stand for its folders."""
+    picture = cv2.imencode(".png", np.random.default_rng(0).integers(0, 255, (120, 160), np.uint8))[1].tobytes()
+    place = located(f"{bucket}/console")
+    with local_output(place) as folder:
+        for number in range(3):
+            (folder / "deep" / "cam0").mkdir(parents=True, exist_ok=True)
+            (folder / "deep" / "cam0" / f"{number:04}.png").write_bytes(picture)
+        (folder / "deep" / "empty").touch()
+    for markers in ((), ("console", "console/deep", "console/deep/cam0")):
+        for name in markers:
+            make_folder(name)
+        assert [path.name for path in located(f"{bucket}/console/deep").iterdir()] == ["cam0", "empty"]
+        assert [path.name for path in located(f"{bucket}/console").rglob()] == [
+            "0000.png", "0001.png", "0002.png", "empty",
+        ]  # fmt: skip
+        log = logs.open(located(f"{bucket}/console"))
+        assert [frame.decode().image.shape for frame in log.frames(log.stamps())] == [(120, 160)] * 3
+        with local_copy(located(f"{bucket}/console")) as copy:
+            assert sorted(file.name for file in copy.rglob("*.png")) == ["0000.png", "0001.png", "0002.png"]
+    make_folder("nothing")
+    assert not located(f"{bucket}/nothing").exists()
 
 
 def test_a_run_goes_from_s3_to_s3_and_is_evaluated_there(

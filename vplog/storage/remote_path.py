@@ -16,7 +16,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from email.utils import format_datetime
 from functools import cached_property, partial
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
+from stat import S_IFREG
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
@@ -130,7 +132,7 @@ class RemotePath:
         return self._kind == "folder"
 
     def stat(self) -> SimpleNamespace:
-        return SimpleNamespace(st_size=self._length)
+        return SimpleNamespace(st_size=self._length, st_mode=S_IFREG)
 
     def version(self) -> str:
         """A text that changes with the object, without reading it: its length and time, or the server's tag."""
@@ -266,14 +268,20 @@ def names_below(path: RemotePath) -> dict[str, bool]:
     """Names right below a prefix of an object store, and whether each has objects below. Raises OSError."""
     found, skip = path.ask("list_with_delimiter"), path.prefix_length
     below = {one["path"][skip:]: False for one in found["objects"]}
+    below.pop("", None)  # of the folder itself, as in `objects_below`
     return below | {name[skip:]: True for name in found["common_prefixes"]}
 
 
 def objects_below(path: RemotePath) -> dict[str, ObjectMeta]:
-    """All objects with this prefix, by their names behind it. Raises OSError."""
-    found = path.ask("list")
+    """All objects with this prefix, by their names behind it, but for the empty ones named FOLDER/ by which consoles
+    show folders, and of which obstore drops the slash. Raises OSError."""
+    listed = path.ask("list")
     with plain_errors():
-        return {one["path"][path.prefix_length :]: one for one in found.collect()}
+        found = {one["path"][path.prefix_length :]: one for one in listed.collect()}
+    found.pop("", None)
+    names = sorted(found, key=lambda name: f"{name}/")  # what is below a name comes right after it
+    folders = {name for name, after in pairwise(names) if after.startswith(f"{name}/")}
+    return {name: about for name, about in found.items() if about["size"] or name not in folders}
 
 
 def send(path: RemotePath, source: Path) -> PutResult:
