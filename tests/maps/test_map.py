@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import cv2
 import duckdb
@@ -19,7 +19,7 @@ from vplog.execution.execution import Execution
 from vplog.maps.search.query import MapQuery, search
 from vplog.maps.search.sequences import LineSearch
 from vplog.maps.storage import map_store
-from vplog.maps.storage.layout import drive_names
+from vplog.maps.storage.layout import drive_names, folder_name, free_name
 from vplog.pipeline import load_pipeline
 from vplog.results import run_record, tables
 from vplog.storage.json_records import CHECKSUM
@@ -190,3 +190,18 @@ def test_names_are_of_the_log_and_stay() -> None:
     assert named("aa", "31", known, "zz") == ["a-3", "a"], "changed at its place, and a new one"
     assert named("b", "3", known, "y") == ["b"], "another name is another drive"
     assert drive_names([CHECKSUM], ["1"], {}, [{}]) == [f"{CHECKSUM}-2"], "a field of failures.json"
+
+
+def test_drives_have_folders_of_their_own_where_a_disk_does_not_tell_cases_apart() -> None:
+    """As those of macOS, Windows, exFAT and SMB do."""
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        known = dict[str, dict[str, Any]]()
+        for day in ("1", "2"):
+            names = ["".join(rng.permutation([*"aAbB-2"])[:3]) for _ in range(12)]
+            paths, contents = [f"{day}/{at}" for at in range(12)], [{"f": f"{day} {at}"} for at in range(12)]
+            found = drive_names(names, paths, known, contents)
+            known |= {drive: {"log": path, "inputs": {}} for drive, path in zip(found, paths, strict=True)}
+            assert drive_names(names, paths, known, contents) == found, "they stay"
+        assert len({folder_name(drive).casefold() for drive in known}) == 24
+    assert free_name("Drive", "/x/Drive.mcap", ["drive"]) == "Drive-2"

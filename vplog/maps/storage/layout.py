@@ -136,10 +136,11 @@ def drive_names(names: list[str], logs: list[str], known: dict[str, dict[str, An
                 if at not in result and drive not in taken and own.fullmatch(drive):
                     result[at] = drive
                     taken.add(drive)
+    folders = {CHECKSUM, *map(str.casefold, known)}  # failures.json has drives for fields
     for at, name in enumerate(names):
         if at not in result:
-            result[at] = numbered(name, name, taken | known.keys() | {CHECKSUM})  # failures.json has drives for fields
-            taken.add(result[at])
+            result[at] = numbered(name, name, folders)
+            folders.add(result[at].casefold())
     return [result[at] for at in range(len(names))]
 
 
@@ -147,7 +148,8 @@ def free_name(drive: str, log: str, known: Collection[str]) -> str:
     """The ID of a drive from another map: its own, or where that is taken the log's name with the first free number, by
     which `drive_names` still knows it."""
     parts = re.fullmatch(r"(.+)-\d+", drive)
-    return numbered(drive, parts[1] if parts and not PurePath(log).name.startswith(drive) else drive, known)
+    base = parts[1] if parts and not PurePath(log).name.startswith(drive) else drive
+    return numbered(drive, base, set(map(str.casefold, known)))
 
 
 def renamed(record: dict[str, Any], drive: str) -> dict[str, Any]:
