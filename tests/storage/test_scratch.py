@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -122,6 +124,38 @@ with replacing(pathlib.Path({str(path)!r})) as stream:
         process.communicate(b"\n")
     assert sorted(tmp_path.iterdir()) == sorted([path, *others])
     assert path.read_bytes() == b"half"
+
+
+def test_a_file_is_written_through_the_descriptor_that_has_its_lock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On SMB no other may write: its locks are mandatory, see flock(2). What closes the stream does not give it up."""
+    locks = list[Any]()
+    monkeypatch.setattr("fcntl.flock", lambda file, _: locks.append(file))
+    with replacing(tmp_path / "result") as stream:
+        stream.write(b"whole")
+        stream.close()
+        assert os.lseek(locks[-1].fileno(), 0, os.SEEK_CUR) == 5, "each open file has a place of its own"
+    assert (tmp_path / "result").read_bytes() == b"whole"
+
+
+def test_what_is_left_goes_where_only_who_may_write_may_lock(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on NFS, where an exclusive lock of a file open for reading is EBADF."""
+    flock = fcntl.flock
+
+    def of_nfs(file: Any, how: int) -> None:
+        if fcntl.fcntl(file, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY and how & fcntl.LOCK_EX:
+            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+        flock(file, how)
+
+    monkeypatch.setattr("fcntl.flock", of_nfs)
+    left, part = machine / "run-1-left", machine / ".result.1-01234567.part"
+    left.mkdir()
+    (left / ".lock").touch()
+    part.touch()
+    with scratch("run", machine), replacing(machine / "result"):
+        assert not left.exists()
+        assert not part.exists()
 
 
 def test_a_folder_of_somebody_else_is_not_used(tmp_path: Path, machine: Path) -> None:

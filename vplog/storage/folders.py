@@ -66,8 +66,8 @@ def is_unicode(name: str) -> bool:
 
 
 def numbered(name: str, base: str, taken: Container[str]) -> str:
-    """The name, or where it is taken `base` with the first free number. `taken` are names by `casefold`, as file systems
-    of macOS, Windows and memory cards do not tell cases apart."""
+    """The name, or where it is taken `base` with the first free number. `taken` are names by `casefold`, as disks of
+    macOS and Windows and memory cards do not tell cases apart."""
     number, free = 2, name
     while free.casefold() in taken:
         free, number = f"{base}-{number}", number + 1

@@ -70,7 +70,7 @@ def _sweep(among: Path) -> None:
 
 
 def _is_left(path: Path) -> bool:
-    with suppress(OSError), path.open() as lock:
+    with suppress(OSError), path.open("r+b") as lock:  # NFS locks what is open for writing alone
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # OSError where its process lives
         return True
     return False
@@ -134,7 +134,7 @@ def replacing(path: Path, parents: bool = False) -> Iterator[BinaryIO]:
             with part.open("wb") as lock:
                 with suppress(OSError):  # a file system without locks
                     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                with part.open("wb") as stream:
+                with os.fdopen(lock.fileno(), "wb", closefd=False) as stream:  # SMB lets no other descriptor write
                     yield stream
                 put_in_place(part, path)
         finally:
