@@ -206,6 +206,21 @@ def test_a_drive_may_be_called_anything(tmp_path: Path, name: str) -> None:
     assert not ledger.exists()
 
 
+def test_a_drive_whose_tables_are_not_linked_is_in_the_map(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a disk that fills up after the rename. The next writer links them."""
+
+    def full(*_: Any) -> None:
+        raise ResultError("No space left on device")
+
+    with map_store.writing(root) as store, monkeypatch.context() as patch:
+        patch.setattr(local, "link_tables", full)
+        put(store, "three", 3)
+        assert "three" in store.drives()
+    assert not (root / "keyframes" / "drive=three").exists()
+    with map_store.writing(root):
+        assert (root / "keyframes" / "drive=three" / "keyframes.parquet").exists()
+
+
 def test_the_tables_are_a_data_set_by_drive(root: Path) -> None:
     for name in map_store.TABLES:
         found = ds.dataset(root / name, partitioning="hive", exclude_invalid_files=True)

@@ -98,7 +98,8 @@ def publish(store: Store, drive: str, made: Path) -> None:
     except OSError as error:
         raise ResultError(f"Cannot put {drive} into {store.root}: {error.strerror}.") from None
     shutil.rmtree(replaced, ignore_errors=True)
-    link_tables(store, drive)
+    with suppress(ResultError):  # the drive is in the map; the next writer links them
+        link_tables(store, drive)
 
 
 def exchange_folders(one: Path, other: Path) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 import shutil
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from typing import Any
 
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.storage import objects
-from vplog.maps.storage.damage import complete_record, rows_of
+from vplog.maps.storage.damage import UnreachableError, complete_record, rows_of
 from vplog.maps.storage.layout import (
     RUN_TABLES,
     TABLES,
@@ -78,6 +78,12 @@ def _copy(mirror: Mirror, copies: Copies) -> None:
                 with suppress(FileNotFoundError):  # replaced once more, and vacuumed
                     objects.copy(mirror.remote / source, mirror.remote / name)
         mirror.copied[name] = source
+
+
+def _copy_committed(mirror: Mirror, is_new: Callable[[str], object]) -> None:
+    """`_copy` of those that a commit has named, which stands where the store refuses: the next writer copies."""
+    with suppress(UnreachableError):
+        _copy(mirror, {name: source for name, source in mirror.manifest.now["copies"].items() if is_new(name)})
 
 
 def finish(mirror: Mirror) -> None:
@@ -153,7 +159,7 @@ def publish(mirror: Mirror, drive: str, sent: SentRun, made: Path) -> str:
         if name not in RUN_TABLES:  # a batch would fill the disk
             (made / name).unlink(missing_ok=True)
     mirror.adopt(drive, entry, made)
-    _copy(mirror, {name: source for name, source in mirror.manifest.now["copies"].items() if name in copies})
+    _copy_committed(mirror, copies.__contains__)
     return drive
 
 
@@ -283,7 +289,7 @@ def remove(mirror: Mirror, drives: Sequence[str]) -> None:
         del mirror.held[name]
     for folder in [folder for name in named for folder in mirror.local.glob(f"*/{name}")]:
         shutil.rmtree(folder)
-    _copy(mirror, {name: source for name, source in mirror.manifest.now["copies"].items() if drives_in(name) & named})
+    _copy_committed(mirror, lambda name: drives_in(name) & named)
 
 
 def send_rest(mirror: Mirror) -> None:
@@ -324,7 +330,7 @@ def send_rest(mirror: Mirror) -> None:
         _remove_quietly(mirror.remote / "rest" / generation)
         raise
     mirror.held = {name: mirror.manifest.now["rest"][name] for name in hashes if name in mirror.manifest.now["rest"]}
-    _copy(mirror, {name: source for name, source in mirror.manifest.now["copies"].items() if name in changes})
+    _copy_committed(mirror, changes.__contains__)
 
 
 def _replace_rest(snapshot: Snapshot, changes: dict[str, Any]) -> None:
