@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import signal
@@ -17,6 +18,7 @@ from tests.maps.runs import PLACES, make_map, put, seeds, write_run
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.joining import drive_pairs
 from vplog.maps.storage import local, map_store
+from vplog.maps.storage.layout import sha256_of
 from vplog.storage.scratch import replacing
 
 if TYPE_CHECKING:
@@ -206,19 +208,47 @@ def test_a_drive_may_be_called_anything(tmp_path: Path, name: str) -> None:
     assert not ledger.exists()
 
 
+def test_copies_of_tables_are_compared_of_new_drives_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where there are no hard links: to read all tables of a map twice takes as long as it is large."""
+    hashed = list[Any]()
+
+    def refuse(*_: Any) -> None:
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+    monkeypatch.setattr("os.link", refuse)
+    root = make_map(tmp_path / "map", {"one": 1, "two": 2})
+    monkeypatch.setattr(local, "sha256_of", lambda path: hashed.append(path) or sha256_of(path))
+    with map_store.writing(root):
+        assert not hashed
+    run, other = root / "runs" / "drive=one", tmp_path / "run"
+    shutil.copytree(run, other)
+    shutil.rmtree(run)
+    other.rename(run)
+    path = run / "edges.parquet"
+    path.write_bytes(path.read_bytes()[:-9] + b"anything!")
+    (root / "keyframes" / "drive=two" / "keyframes.parquet").unlink()
+    with map_store.writing(root):
+        assert hashed
+    assert not any("drive=two" in str(one) for one in hashed)
+    assert (root / "edges" / "drive=one" / "edges.parquet").read_bytes() == path.read_bytes()
+    assert (root / "keyframes" / "drive=two" / "keyframes.parquet").exists()
+
+
 def test_a_drive_whose_tables_are_not_linked_is_in_the_map(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on a disk that fills up after the rename. The next writer links them."""
+    """As on a disk that fills up after the rename. The next writer links them; until then none is that of the drive
+    before."""
 
     def full(*_: Any) -> None:
         raise ResultError("No space left on device")
 
     with map_store.writing(root) as store, monkeypatch.context() as patch:
         patch.setattr(local, "link_tables", full)
-        put(store, "three", 3)
-        assert "three" in store.drives()
-    assert not (root / "keyframes" / "drive=three").exists()
-    with map_store.writing(root):
-        assert (root / "keyframes" / "drive=three" / "keyframes.parquet").exists()
+        put(store, "two", 3)
+        assert store.read("two", seeds) == {3}
+    assert not (root / "keyframes" / "drive=two").exists()
+    with map_store.writing(root) as store:
+        source = store.run("two") / "keyframes.parquet"
+        assert (root / "keyframes" / "drive=two" / "keyframes.parquet").samefile(source)
 
 
 def test_the_tables_are_a_data_set_by_drive(root: Path) -> None:

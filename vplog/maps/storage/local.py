@@ -69,7 +69,7 @@ def recover(store: Store) -> None:
                 shutil.rmtree(left, ignore_errors=True)
     for drive in store.drives():
         try:
-            link_tables(store, drive)
+            link_tables(store, drive, folder_name(drive) not in store.uncatalogued)
         except ResultError as error:
             store.damaged[drive] = str(error)
 
@@ -98,8 +98,11 @@ def publish(store: Store, drive: str, made: Path) -> None:
     except OSError as error:
         raise ResultError(f"Cannot put {drive} into {store.root}: {error.strerror}.") from None
     shutil.rmtree(replaced, ignore_errors=True)
-    with suppress(ResultError):  # the drive is in the map; the next writer links them
+    try:
         link_tables(store, drive)
+    except ResultError:  # the drive is in the map; the next writer links its tables, of which none stays as it was
+        for name in TABLES:
+            shutil.rmtree(store.root / name / folder_name(drive), ignore_errors=True)
 
 
 def exchange_folders(one: Path, other: Path) -> bool:
@@ -108,14 +111,17 @@ def exchange_folders(one: Path, other: Path) -> bool:
     return rename is not None and rename(_HERE, os.fsencode(one), _HERE, os.fsencode(other), _EXCHANGE) == 0
 
 
-def link_tables(store: Store, drive: str) -> None:
-    """Link each table of the run folder into its data set, MAP/NAME/drive=ID; a copy where there are no hard links."""
+def link_tables(store: Store, drive: str, catalogued: bool = False) -> None:
+    """Link each table of the run folder into its data set, MAP/NAME/drive=ID; a copy where there are no hard links,
+    which of a drive that is `catalogued`, so was linked before, is not read again."""
     for name in TABLES:
         source = store.run(drive) / f"{name}.parquet"
         path = store.root / name / folder_name(drive) / source.name
         with suppress(OSError):  # they are not both there
-            alike = path.stat().st_size == source.stat().st_size
-            if path.samefile(source) or (alike and sha256_of(path) == sha256_of(source)):  # a file system without links
+            if path.samefile(source):
+                continue
+            alike = path.stat().st_size == source.stat().st_size  # copies, on a file system without links
+            if alike and (catalogued or sha256_of(path) == sha256_of(source)):
                 continue
         if not source.is_file():
             raise ResultError(f"{source} is not there. Copy it back, or {ADD_AGAIN}")
