@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -16,16 +18,18 @@ import pytest
 
 from tests.maps.bucket import serving
 from tests.maps.runs import put_rows
+from vplog.errors import ResultError
 from vplog.execution.execution import Execution
 from vplog.maps.search.query import MapQuery, open_map, search
 from vplog.maps.search.sequences import LineSearch
 from vplog.maps.storage import map_store, objects
 from vplog.maps.storage.download_cache import Cache, cache_in
 from vplog.maps.storage.layout import sha256_of
+from vplog.maps.storage.remote_map import StoredFile
 from vplog.pipeline import load_pipeline
 from vplog.places.sequence import SequenceSettings
 from vplog.results import tables
-from vplog.storage.remote_path import located
+from vplog.storage.remote_path import RemotePath, located
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -175,6 +179,41 @@ def test_the_oldest_goes_first(tmp_path: Path) -> None:
     assert own.exists(), "no file of the cache"
 
 
+def test_what_workers_fetch_is_within_the_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And what one leaves that is killed goes a day later, as all half-written files."""
+    cache, old = Cache(tmp_path, 2500), time.time() - 10**5
+    parts = list[Path]()
+
+    def fetch(place: RemotePath, target: Path, _: int) -> str:
+        parts.append(target)
+        target.write_bytes(place.name.encode() * 1000)
+        if place.name == "x":
+            raise OSError("reset")
+        return hashlib.sha256(target.read_bytes()).hexdigest()
+
+    def fetched(name: str, content: str = "") -> bytes:
+        digest = hashlib.sha256((content or name).encode() * 1000).hexdigest()
+        return StoredFile(f"s3://map/{name}", digest, 1000).fetched(cache).read_bytes()
+
+    monkeypatch.setattr("vplog.maps.storage.objects.fetch", fetch)
+    for number, name in enumerate("abacde"):
+        assert fetched(name) == name.encode() * 1000
+        os.utime(parts[-1].parent / hashlib.sha256(name.encode() * 1000).hexdigest(), (old + number, old + number))
+    assert {file.read_text()[0] for file in files(cache)} == {"c", "d", "e"}, "one more than is kept"
+    assert len(parts) == 5
+    fetched("c")
+    fetched("f")
+    assert {file.read_text()[0] for file in files(cache)} == {"c", "e", "f"}, "what was read last"
+    for given in (("x", ""), ("y", "z")):
+        with pytest.raises(ResultError, match=r"reset|damaged"):
+            fetched(*given)
+    assert not any(file.name.startswith(".") for file in files(cache))
+    parts[0].touch()
+    os.utime(parts[0], (old, old))
+    cache.trim()
+    assert not parts[0].exists()
+
+
 def test_several_read_and_trim_at_once(root: Any, cache: Cache) -> None:
     """With room for next to nothing: what one takes away another has open, or fetches anew."""
     cache = replace(cache, max_bytes=1000)
@@ -196,7 +235,7 @@ import sys, time
 from pathlib import Path
 from vplog.maps.storage import map_store as store
 from vplog.maps.storage.download_cache import cache_in
-from vplog.storage.remote_path import located
+from vplog.storage.remote_path import RemotePath, located
 root, cache = located(sys.argv[1]), cache_in(Path(sys.argv[2]), 1.0)
 with store.reading(root, cache) as reader, store.reading(root) as other:
     print(reader.root, other.root, flush=True)

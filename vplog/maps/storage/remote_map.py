@@ -15,6 +15,7 @@ none, is removed by `map vacuum` a day later.
 
 from __future__ import annotations
 
+import os
 import secrets
 import shutil
 import threading
@@ -62,15 +63,19 @@ class StoredFile:
         if cache is None:
             raise ResultError("A worker has no cache for the index of the map. Set VPLOG_CACHE to a folder there.")
         target = cache.root / "objects" / self.sha256
-        part, place = target.with_name(f".{secrets.token_hex(8)}.part"), cast("RemotePath", located(self.url))
-        if not target.exists():
+        with suppress(FileNotFoundError):
+            os.utime(target)
+            return target
+        part, place = target.with_name(f".{secrets.token_hex(16)}.part"), cast("RemotePath", located(self.url))
+        cache.trim()  # not afterwards: the file may be longer than its bound
+        try:
             with store_errors(place):
                 target.parent.mkdir(parents=True, exist_ok=True)
-                digest = objects.fetch(place, part, self.bytes)
-                if digest != self.sha256:
-                    part.unlink()
+                if objects.fetch(place, part, self.bytes) != self.sha256:
                     raise ResultError(f"{place} is damaged. Move it aside: the next join builds it again.")
                 part.replace(target)
+        finally:
+            part.unlink(missing_ok=True)
         return target
 
 
