@@ -22,7 +22,7 @@ from tests.maps.runs import LIBRARY, PLACES, make_map, put, seeds, write_run
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.info import describe_map
 from vplog.maps.joining import join
-from vplog.maps.storage import map_store, objects, snapshot, upload
+from vplog.maps.storage import delta, map_store, objects, snapshot, upload
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import UnreachableError
 from vplog.pipeline import load_pipeline
@@ -213,6 +213,24 @@ def test_what_no_snapshot_names_goes_by_age(
     monkeypatch.setattr(upload, "VACUUM_S", -1)
     with pytest.raises(ResultError, match="stopped for too long"), map_store.writing(root) as writer:
         put(writer, "two", 5)
+
+
+def test_vacuum_removes_many_objects_with_few_requests(root: Any) -> None:
+    make_map(root, {"one": 1})
+    stale = [*(f"runs/drive=one/{'0' * 16}/{number}" for number in range(40)), "joint/none/graph.g2o"]
+    parts = [f"part-{number}.parquet" for number in range(40)]
+    for place in (*map(root.__truediv__, stale), *map((root / "delta" / "keyframes").__truediv__, parts)):
+        place.ask("put", b"{}")
+    with map_store.writing(root) as store, counting() as requests:
+        assert upload.vacuum(store.mirror, -1.0)["objects"] >= 41  # pyrefly: ignore[bad-argument-type]
+        assert delta.vacuum(store, time.time() + 10.0) == {"objects": 40, "bytes": 80}
+    assert requests.total() < 30
+    assert not names(root / "joint") | names(root / "delta")
+    assert same_state(root) == {"one": {1}}
+    for name in ("one", "two"):
+        (root / "listed" / name).ask("put", b"")
+    objects.delete(root / "listed", ["two", "three", "one"])
+    assert not names(root / "listed")
 
 
 def as_of(root: Any, then: str) -> dict[str, set[Any]]:

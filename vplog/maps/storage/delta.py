@@ -122,8 +122,8 @@ def update(store: Store, patience_s: float = 0.0, *, compact: bool = False) -> d
                 _write_logs(place, [*commits, commit])
                 commits.append(commit)
                 break
-            for name in commit["added"]:
-                _remove(place, (f"{table}/{name}.parquet" for table in TABLES))
+            added = commit["added"].items()
+            _remove(place, (f"{table}/{name}.parquet" for name, file in added for table in file["tables"]))
         files = _files(commits)
     return {
         "version": commits[-1]["version"] if commits else None,
@@ -161,9 +161,8 @@ def _version(name: str) -> int:
 
 def _remove(place: RemotePath, names: Iterable[str]) -> None:
     """Remove objects; what is left `map vacuum` removes."""
-    for name in names:
-        with suppress(OSError):
-            (place / name).ask("delete")
+    with suppress(OSError):
+        objects.delete(place, names)
 
 
 def _commits(place: RemotePath, store: Store, at: int | None = None) -> list[delta_log.Commit]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
@@ -85,7 +86,15 @@ def copy(source: RemotePath, target: RemotePath) -> None:
 
 def remove(path: RemotePath) -> None:
     """An object and all with this prefix; nothing where there is none. Raises OSError."""
+    delete(path, remote_path.objects_below(path))
     store, name = path.place
-    for names in ([f"{name}/{below}" for below in remote_path.objects_below(path)], [name]):
-        with suppress(FileNotFoundError), plain_errors():  # S3 says nothing of what is not there
-            store.delete(names)
+    with suppress(FileNotFoundError), plain_errors():  # S3 says nothing of what is not there
+        store.delete([name])
+
+
+def delete(path: RemotePath, names: Iterable[str]) -> None:
+    """Objects with this prefix, which are there, by their names behind it, a thousand a request on S3. Raises
+    OSError."""
+    store, name = path.place
+    with suppress(FileNotFoundError), plain_errors():  # another removes them, too
+        store.delete([f"{name}/{below}".lstrip("/") for below in names])

@@ -388,18 +388,18 @@ def vacuum(mirror: Mirror, hours: float) -> dict[str, int]:
     if snapshot.get("by_drive", True):
         needed |= {f"{name}/{folder_name(drive)}/{name}.parquet" for drive in snapshot["drives"] for name in TABLES}
     needed |= snapshot["rest"].keys()
-    removed = {"objects": 0, "bytes": 0}
+    gone = dict[str, int]()
     with store_errors(mirror.remote):
         for name, meta in objects_below(mirror.remote).items():
             parts = name.split("/")
             above = {"/".join(parts[:count]) for count in range(1, len(parts) + 1)}
             if parts[0] in _OWN and not above & needed and meta["last_modified"] < before:
-                objects.remove(mirror.remote / name)
-                removed = {"objects": removed["objects"] + 1, "bytes": removed["bytes"] + meta["size"]}
+                gone[name] = meta["size"]
+        objects.delete(mirror.remote, gone)
 
     def change(snapshot: Snapshot) -> None:
         left = snapshot["replaced"].items()
         snapshot["replaced"] = {name: when for name, when in left if datetime.fromisoformat(when) > before}
 
     mirror.commit("vacuum", change)
-    return removed
+    return {"objects": len(gone), "bytes": sum(gone.values())}
