@@ -213,5 +213,6 @@ def test_a_removal_on_a_store_that_fails_anywhere_takes_all_or_none(
         if found == ["two"]:
             left_there = [name for name in objects_below(root) if not name.startswith(("runs/", "rest/"))]
             assert not any("one" in name or "three" in name for name in left_there)
-        assert failed == (step < 1000)
+        assert failed or found == ["two"]
+        assert not failed or found != ["two"] or how == "for good", "the next writer removes its tables"
     assert outcomes == {True, False}
