@@ -39,7 +39,7 @@ from vplog.logs import TopicChoice
 from vplog.maps.storage import map_store, objects
 from vplog.maps.storage.layout import drive_names
 from vplog.pipeline import load_pipeline
-from vplog.results.run_record import read_run_json
+from vplog.results.run_record import read_run_json, write_run_json
 from vplog.run.reference_library import build_library
 from vplog.storage.remote_path import located
 from vplog.verbs.demo.record import IMAGE
@@ -496,6 +496,39 @@ def test_a_moved_log_is_followed_and_a_copy_is_said(whole: Path, logs: list[Path
     with map_store.reading(tmp_path / "other") as store:
         assert store.drives()["drive"]["log"] == str(moved)
     assert tables(tmp_path / "other") == before
+
+
+def test_a_recording_at_the_place_of_another_is_said_to_replace_it(
+    whole: Path, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where each day is written over the one before; not where settings change, or a part of the drive is added."""
+
+    def compute(_: LocalEngine, task: Task) -> Future[Outcome]:
+        shutil.copytree(whole / "runs" / "drive=drive", task.folder)
+        write_run_json(task.folder / "drive.json", task.record)
+        future: Future[Outcome] = Future()
+        future.set_result(Outcome(""))
+        return future
+
+    def batch_of(log: Path, *settings: str) -> list[str]:
+        pipeline = load_pipeline("default", [*QUICK, *settings])
+        told = run_batch([log], root, pipeline, options=BatchOptions(join=False))
+        assert [(one["drive"], one["state"]) for one in told["drives"]] == [(log.stem, "computed")]
+        return [warning for warning in told["warnings"] if "replaced" in warning]
+
+    monkeypatch.setattr(LocalEngine, "start", compute)
+    root, log, folder = Path(shutil.copytree(whole, tmp_path / "map")), tmp_path / "today.mcap", tmp_path / "bag"
+    folder.mkdir()
+    shutil.copy2(logs[0], log)
+    shutil.copy2(logs[0], folder / "part_0.mcap")
+    for place in (log, folder):
+        assert batch_of(place) == []
+        assert batch_of(place, "propose.per_query=2") == []
+    shutil.copy2(logs[1], folder / "part_1.mcap")
+    assert batch_of(folder) == []
+    shutil.copy2(logs[1], log)
+    [warning] = batch_of(log)
+    assert warning.startswith(f"today is replaced: {log} holds another recording")
 
 
 def test_a_join_that_fails_takes_no_fates_along(

@@ -14,7 +14,7 @@ from typing import Any
 
 from vplog.batch.drive_inputs import drive_inputs
 from vplog.batch.engine import BatchOptions, Engine, LocalEngine, as_completed, open_engine
-from vplog.batch.log_hashes import NAME, known_hashes
+from vplog.batch.log_hashes import BESIDE, NAME, known_hashes
 from vplog.batch.map_library import map_library
 from vplog.batch.plan import DriveInput, PlannedDrive, common_record, plan_drives, with_topics
 from vplog.batch.worker import DriveState, Outcome, Task, made_by
@@ -138,6 +138,7 @@ def run_batch(
             *failures_warning,
             *([] if joined else damage_warnings(store)),
             *_duplicate_recordings(outcomes, [one.record["inputs"] for one in plan], known),
+            *_replaced_recordings(outcomes, [one.record["inputs"] for one in plan], known),
             *_other_versions([record for drive, record in known.items() if drive not in done], common),
         ],
     }
@@ -185,6 +186,22 @@ def _duplicate_recordings(
         for these in common.values()
         if len(these) > 1
     ]
+
+
+def _replaced_recordings(
+    outcomes: Sequence[DriveState], inputs: Sequence[dict[str, str]], known: Mapping[str, Mapping[str, Any]]
+) -> list[str]:
+    """A warning for each drive that took the place of one whose log had its path, and no file in common with it."""
+    result = []
+    for one, new in zip(outcomes, inputs, strict=True):
+        before = known.get(one.drive, {}).get("inputs", {})
+        old = {text for name, text in before.items() if not name.startswith(BESIDE)}
+        if one.state == "computed" and old and old.isdisjoint(new.values()):
+            result.append(
+                f"{one.drive} is replaced: {one.log} holds another recording than before. To have both in the map, "
+                "give each a path of its own, or a name in a manifest."
+            )
+    return result
 
 
 def _other_versions(others: Sequence[dict[str, Any]], common: dict[str, Any]) -> list[str]:
