@@ -198,7 +198,7 @@ def test_drives_have_folders_of_their_own_where_a_disk_does_not_tell_cases_apart
     for _ in range(50):
         known = dict[str, dict[str, Any]]()
         for day in ("1", "2"):
-            names = ["".join(rng.permutation([*"aAbB-2"])[:3]) for _ in range(12)]
+            names = [str("".join(rng.permutation([*"aAbB-2"])[:3])) for _ in range(12)]
             paths, contents = [f"{day}/{at}" for at in range(12)], [{"f": f"{day} {at}"} for at in range(12)]
             found = drive_names(names, paths, known, contents)
             known |= {drive: {"log": path, "inputs": {}} for drive, path in zip(found, paths, strict=True)}

@@ -122,7 +122,7 @@ def test_folders_that_a_console_made_are_no_files(bucket: str) -> None:
         for name in markers:
             make_folder(name)
         assert [path.name for path in located(f"{bucket}/console/deep").iterdir()] == ["cam0", "empty"]
-        assert [path.name for path in located(f"{bucket}/console").rglob()] == [
+        assert [path.name for path in located(f"{bucket}/console").rglob("*")] == [
             "0000.png", "0001.png", "0002.png", "empty",
         ]  # fmt: skip
         log = logs.open(located(f"{bucket}/console"))
