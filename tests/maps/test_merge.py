@@ -73,11 +73,11 @@ def test_a_merge_that_was_stopped_goes_on_to_the_same_end(tmp_path: Path, monkey
     merge_maps([a, b], whole)
     publish, left = map_store.publish, [0]
 
-    def stopping(*arguments: Any) -> None:
+    def stopping(*arguments: Any) -> str:
         left[0] -= 1
         if left[0] == 0:
             raise KeyboardInterrupt
-        publish(*arguments)
+        return publish(*arguments)
 
     monkeypatch.setattr(map_store, "publish", stopping)
     for stop in (2, 2, 2, 2):
