@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Container, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -65,11 +65,11 @@ def is_unicode(name: str) -> bool:
     return not any("\ud800" <= character <= "\udfff" for character in name)
 
 
-def numbered(name: str, base: str, taken: Container[str]) -> str:
-    """The name, or where it is taken `base` with the first free number. `taken` are names by `casefold`, as disks of
-    macOS and Windows and memory cards do not tell cases apart."""
-    number, free = 2, name
-    while free.casefold() in taken:
+def numbered(name: str, base: str, taken: Iterable[str]) -> str:
+    """The name, or where it is taken `base` with the first free number. Names that differ in case alone are one, as
+    on disks of macOS and Windows and on memory cards."""
+    number, free, folded = 2, name, {one.casefold() for one in taken}
+    while free.casefold() in folded:
         free, number = f"{base}-{number}", number + 1
     return free
 

@@ -74,7 +74,7 @@ def run_joint(
     opened = [logs.open(path, topics) for path in paths]
     drives_at: dict[str, Path] = {}
     for log, path in zip(opened, paths, strict=True):
-        drives_at[numbered(log.name, log.name, {"library", *map(str.casefold, drives_at)})] = path
+        drives_at[numbered(log.name, log.name, {"library", *drives_at})] = path
     check_library(library, pipeline)
     for log in opened:  # before the first drive is computed
         check_metric(log, topics or logs.TopicChoice())

@@ -139,7 +139,7 @@ def drive_names(names: list[str], logs: list[str], known: dict[str, dict[str, An
     folders = {CHECKSUM, *map(str.casefold, known)}  # failures.json has drives for fields
     for at, name in enumerate(names):
         if at not in result:
-            result[at] = numbered(name, name, folders)
+            result[at] = numbered(name, name, folders) if name.casefold() in folders else name
             folders.add(result[at].casefold())
     return [result[at] for at in range(len(names))]
 
@@ -148,8 +148,7 @@ def free_name(drive: str, log: str, known: Collection[str]) -> str:
     """The ID of a drive from another map: its own, or where that is taken the log's name with the first free number, by
     which `drive_names` still knows it."""
     parts = re.fullmatch(r"(.+)-\d+", drive)
-    base = parts[1] if parts and not PurePath(log).name.startswith(drive) else drive
-    return numbered(drive, base, set(map(str.casefold, known)))
+    return numbered(drive, parts[1] if parts and not PurePath(log).name.startswith(drive) else drive, known)
 
 
 def renamed(record: dict[str, Any], drive: str) -> dict[str, Any]:
