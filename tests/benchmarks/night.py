@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import resource
+import shutil
 import sys
 import tempfile
 import time
@@ -48,6 +49,8 @@ if TYPE_CHECKING:
 EACH, PASSES, CLOSURES = 20, 12, np.arange(0, 20, 5)
 FILES_BAR = 0.05
 """Opened files but twenty, by drives of the map, of a join of nothing new."""
+_LINKS = 10_000
+"""Drives that share the files of one run: ext4 has at most 65,000 links of a file, and a map makes more of each."""
 _MOST = 40
 """Drives that are added."""
 _ABOUT_DEG = 0.001
@@ -83,8 +86,11 @@ class Night:
     def write(self, run: Path, number: int) -> None:
         """The run folder of a drive."""
         run.mkdir(parents=True)
+        linked = self.run.with_name(f"{self.run.name}-{number // _LINKS}")
+        if not linked.exists():
+            shutil.copytree(self.run, linked)
         for name in self.sizes:
-            os.link(self.run / name, run / name)
+            os.link(linked / name, run / name)
         road = number % self.roads
         if road not in self.base:
             self.base[road] = make_places(EACH, self.settings, seed=1000 + road)
