@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.linalg import lapack
 
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed, parts, subgraph
@@ -369,26 +370,34 @@ def _as_one(graph: PoseGraph, run: Ints, chain: OdometryChain) -> tuple[float, _
     Ad = se3.adjoint(se3.between(X[to][None], X[b]))[:, axes][:, :, axes]
     covariance[range(size), :, range(size), :] += Ad @ noise @ np.swapaxes(Ad, 1, 2)
     try:
-        inner, displaced, noise = _log_common(error, covariance)
+        inner, displaced, information = _log_common(error, covariance)
     except np.linalg.LinAlgError:
         return 0.0, None
     twist = np.zeros(6)
     twist[axes] = displaced
-    return inner, _Run(at, to, measured[middle] @ se3.exp(twist[None])[0], noise)
+    return inner, _Run(at, to, measured[middle] @ se3.exp(twist[None])[0], np.linalg.inv(information))
 
 
 def _log_common(error: Floats, covariance: Floats) -> tuple[float, Floats, Floats]:
     """Log density of errors (K, d) of `covariance` (K, d, K, d) about a common mean that may be anything; the mean (d,)
-    and its covariance (d, d). Raises LinAlgError where the covariance is not positive definite."""
+    and its information (d, d). Raises LinAlgError where the covariance is not positive definite."""
     size, d = error.shape
-    root = np.linalg.cholesky(covariance.reshape(size * d, size * d))
-    whitened = np.linalg.solve(root, np.column_stack([np.tile(np.eye(d), (size, 1)), error.ravel()]))
-    J, e = whitened[:, :d], whitened[:, d]
-    information, gradient = J.T @ J, J.T @ e
-    mean = np.asarray(np.linalg.solve(information, gradient), np.float64)
-    density = -0.5 * float(e @ e - gradient @ mean) - float(np.log(np.diag(root)).sum())
-    density -= 0.5 * float(np.linalg.slogdet(information)[1]) + 0.5 * (size - 1) * d * _LOG_2PI
-    return density, mean, np.asarray(np.linalg.inv(information), np.float64)
+    side = np.zeros((size, d, d + 1))
+    side[:, range(d), range(d)], side[:, :, d] = 1.0, error
+    # LAPACK itself: there are tens of thousands, so small that numpy.linalg would take longer to call it
+    root, failed = lapack.dpotrf(covariance.reshape(size * d, size * d), lower=1)
+    if failed:
+        raise np.linalg.LinAlgError
+    whitened = lapack.dtrtrs(root, side.reshape(size * d, d + 1), lower=1)[0]
+    moments = whitened.T @ whitened
+    information, gradient = moments[:d, :d], moments[:d, d]
+    low, failed = lapack.dpotrf(information, lower=1)
+    if failed:
+        raise np.linalg.LinAlgError
+    mean = lapack.dpotrs(low, gradient, lower=1)[0]
+    volume = np.log(root.diagonal()).sum() + np.log(low.diagonal()).sum()
+    density = -0.5 * (moments[d, d] - gradient @ mean) - volume - 0.5 * (size - 1) * d * _LOG_2PI
+    return float(density), mean, information
 
 
 def forward(graph: PoseGraph, edges: Ints) -> tuple[Ints, Ints, Floats, Floats]:
