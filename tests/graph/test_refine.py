@@ -12,7 +12,7 @@ from tests.graph.drive import CLOSURE_SIGMA, Drive, position_error, ring, withou
 from vplog.data import EdgeKind, Gps, Keyframes, Odometry, PoseGraph
 from vplog.errors import GraphError
 from vplog.geometry import se3
-from vplog.geometry.geodesy import local_enu
+from vplog.geometry.geodesy import geodetic, local_enu
 from vplog.graph.build import build_graph
 from vplog.graph.consistency import residual_sigma
 from vplog.graph.factors import Factors
@@ -345,6 +345,45 @@ def test_fixes_along_a_straight_road_do_not_turn_it_about_itself(bend_deg: float
     assert found.world_from_enu is not None
     up = found.world_from_enu[:3, 2] @ found.solution.world_from_body[:, :3, :3]  # in the frames of the bodies
     assert np.degrees(np.arccos((up * true[:, 2, :3]).sum(1))).max() < 8.0
+
+
+def test_fixes_of_centimetres_are_not_judged_in_the_frame_of_poor_ones() -> None:
+    """A third of the drive has no corrections: its fixes claim 3 m and are 4 m off, all to one side."""
+    drive = ring(240, 80)
+    gps, poor = satellites(drive, 0.02), np.arange(240) >= 160
+    gps = replace(
+        gps,
+        latitude_deg=gps.latitude_deg + poor * 4.0 / DEGREE_M,
+        covariance=np.where(poor, 9.0, 4e-4)[:, None, None] * np.eye(3),
+    )
+    found = refined(drive.graph, fixes_on(gps, drive.odometry, drive.keyframes, GpsSettings()))
+    assert found.inlier[~poor].mean() > 0.9
+
+
+def test_fixes_without_altitude_do_not_lay_a_climbing_road_flat() -> None:
+    """4 km at 10 %, straight and winding; the altitudes are 0 and without weight, as of NMEA's RMC."""
+    random, n = np.random.default_rng(1), 200
+    yaw = np.concatenate([np.zeros(n // 2), 0.6 * np.sin(np.arange(n // 2) / 8.0)])
+    heading, climb = np.stack([0.0 * yaw, 0.0 * yaw, yaw], axis=1), np.array([0.0, -np.arctan(0.1), 0.0])
+    rotation = se3.so3_exp(heading) @ se3.so3_exp(np.tile(climb, (n, 1)))
+    true = se3.pose(rotation, np.cumsum(20.0 * rotation[:, :, 0], axis=0))
+    sigma = np.repeat([0.0005, 0.1], 3)
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    for k, step in enumerate(se3.between(true[:-1], true[1:]) @ se3.exp(random.normal(size=(n - 1, 6)) * sigma)):
+        poses[k + 1] = poses[k] @ step
+    stamps = np.arange(n, dtype=np.int64) * 1_000_000_000
+    keyframes, odometry = Keyframes("road", stamps, poses), Odometry(stamps, poses, None)
+    graph, _, _ = build_graph(keyframes, np.tile(np.diag(sigma**2), (n - 1, 1, 1)), None)
+    noisy = true[:, :3, 3] * [1.0, 1.0, 0.0] + random.normal(size=(n, 3)) * [1.0, 1.0, 0.0]
+    latitude, longitude, _ = geodetic(noisy, (48.0, 8.0, 0.0)).T
+    gps = Gps(stamps, latitude, longitude, np.zeros(n), np.tile(np.diag([1.0, 1.0, 1e10]), (n, 1, 1)), None)
+    fixes = fixes_on(gps, odometry, keyframes, GpsSettings())
+    found = refine(graph, LmSettings()(graph), graph.odometry, RefineSettings(scale=False), fixes)
+    assert found.world_from_enu is not None
+    there = se3.inverse(found.world_from_enu) @ found.solution.world_from_body
+    off = (there - true)[:, :2, 3]
+    assert np.linalg.norm(off - off.mean(0), axis=1).max() < 1.5
+    assert np.ptp(there[:, 2, 3]) == pytest.approx(np.ptp(true[:, 2, 3]), rel=0.1)
 
 
 @pytest.mark.parametrize("seed", [856073560, 856073489])

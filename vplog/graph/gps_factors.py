@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from pydantic import Field
 
 from vplog.data import RECEIVER_SIGMA_M, Bools, Floats, Gps, Ints, Keyframes, Odometry
@@ -29,6 +30,8 @@ _VERTICAL_SIGMA = 0.1
 """rad; how far a body's vertical is from the plumb line, the mean over a drive: vehicles within some 3 degrees, what is
 held or mounted askew within some 10. It tells the turn about a straight road, which fixes leave open, and little beside
 what they tell of a road that bends."""
+_MOST_EVALUATIONS = 100
+"""Of the errors of fixes moved as one; 3 are usual, and many where hardly anything tells the slope of the ground."""
 _FORWARD = 0.7
 """Share of the way along the body's z from which it is a camera's optical axis, with y down: within 45 degrees."""
 _JUMP = 2
@@ -162,19 +165,32 @@ def antennas(poses: Floats, fixes: Fixes) -> Floats:
 
 
 def world_from_enu(poses: Floats, fixes: Fixes, weight: Floats) -> Floats:
-    """(4, 4) rigid motion from the plane of the first fix to the world of the poses: Umeyama 1991, eq. 40-43.
+    """(4, 4) rigid motion from the plane of the first fix to the world of the poses, the likeliest by the covariances
+    of the weighted fixes and the body's vertical, of `_VERTICAL_SIGMA`.
 
-    The body's vertical counts as one more measurement, of `_VERTICAL_SIGMA`.
+    Umeyama 1991, eq. 40-43, with the mean variance of each fix, then Levenberg-Marquardt with the whole covariances.
     """
-    target, share = antennas(poses, fixes), weight / weight.sum()
-    middle, target_middle = share @ fixes.enu_m, share @ target
-    spread = (share[:, None] * (target - target_middle)).T @ (fixes.enu_m - middle)
-    variance = float(np.median(np.trace(fixes.covariance[:, :2, :2], axis1=1, axis2=2))) / 2.0
+    target, confidence = antennas(poses, fixes), 3.0 * weight / np.trace(fixes.covariance, axis1=1, axis2=2)
     vertical = (poses[fixes.row, :3, :3] @ fixes.up).mean(0)
-    spread[:, 2] += vertical * variance / (_VERTICAL_SIGMA**2 * weight.sum())
+    share = confidence / confidence.sum()
+    middle, target_middle = share @ fixes.enu_m, share @ target
+    spread = (confidence[:, None] * (target - target_middle)).T @ (fixes.enu_m - middle)
+    spread[:, 2] += vertical / _VERTICAL_SIGMA**2
     left, _, right = np.linalg.svd(spread)
     rotation = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
-    return se3.pose(rotation, target_middle - rotation @ middle)
+    start = se3.pose(rotation.T, np.zeros(3))
+    root = np.sqrt(weight)[:, None, None] * np.linalg.cholesky(np.linalg.inv(fixes.covariance), upper=True)
+
+    def error(twist: Floats) -> Floats:
+        enu_from_world = start @ se3.exp(twist)
+        off = se3.transform(enu_from_world, target - target_middle) - (fixes.enu_m - middle)
+        tilt = (enu_from_world[:3, :3] @ vertical - [0.0, 0.0, 1.0]) / _VERTICAL_SIGMA
+        return np.concatenate([(root @ off[:, :, None]).ravel(), tilt])
+
+    moved = start @ se3.exp(
+        scipy.optimize.least_squares(error, np.zeros(6), method="lm", x_scale="jac", max_nfev=_MOST_EVALUATIONS).x
+    )
+    return se3.pose(np.eye(3), target_middle) @ se3.inverse(moved) @ se3.pose(np.eye(3), -middle)
 
 
 def chi2_of_fixes(poses: Floats, fixes: Fixes, world: Floats) -> Floats:
@@ -299,8 +315,8 @@ def _whitened(poses: Floats, fixes: Fixes, inlier: Floats) -> Floats:
     """(K, 3) errors of the inliers (F,), 0 or 1, in their sigma."""
     world, sound = world_from_enu(poses, fixes, np.maximum(inlier, 1e-9)), np.flatnonzero(inlier)
     error = ((antennas(poses, fixes) - world[:3, 3]) @ world[:3, :3] - fixes.enu_m)[sound]
-    root = np.linalg.cholesky(np.linalg.inv(fixes.covariance[sound]))
-    return (np.swapaxes(root, 1, 2) @ error[:, :, None])[:, :, 0]
+    root = np.linalg.cholesky(np.linalg.inv(fixes.covariance[sound]), upper=True)
+    return (root @ error[:, :, None])[:, :, 0]
 
 
 def _autoregressive_cost(white: Floats) -> float:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vplog.data import Bools, Floats, Ints
+from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.build import AXES, parts
 from vplog.graph.least_squares import Objective
@@ -85,16 +86,17 @@ def _by_scales(objective: Objective, poses: Floats, scales: Sequence[SharedScale
 
 
 def positions_redundancy(objective: Objective, poses: Floats) -> float:
-    """Degrees of freedom with which the rest of what is minimised checks its positions (Foerstner 1979).
-
-    Raises GraphError where the poses are not determined.
-    """
+    """Degrees of freedom with which the rest of what is minimised checks its positions (Foerstner 1979): all of them
+    where rounding leaves poses undetermined, as heights by centimetre fixes without altitude."""
     positions = objective.positions
     if positions is None:
         return 0.0
     used = positions.Omega.any((1, 2))
     jacobian = positions.jacobian(se3.between(poses[:1], poses))[used]
-    own = pose_covariances(objective, poses)[positions.row[used]]
+    try:
+        own = pose_covariances(objective, poses)[positions.row[used]]
+    except GraphError:
+        return 3.0 * float(used.sum())
     spread = jacobian @ own @ np.swapaxes(jacobian, 1, 2)
     return 3.0 * float(used.sum()) - float(np.einsum("fij,fji->", positions.Omega[used], spread))
 
