@@ -180,6 +180,17 @@ def test_sigmas_are_those_of_the_world() -> None:
     assert found.closure_translation == pytest.approx(2.0 * honest.closure_translation, rel=0.1)
 
 
+def test_a_closure_that_hardly_counts_tells_nothing_of_the_noise() -> None:
+    """As the weights of robust kernels have false closures."""
+    drive = ring(120, 20, false=1)
+    factors, found = Factors.of(drive.graph), []
+    for least in (0.0, 1e-6):
+        weight = np.where(drive.false, least, 1.0)
+        poses = descend(factors, weight, drive.graph.world_from_body, 30, 1e-9).world_from_body
+        found.append(estimate(Objective(factors, weight), poses, Sigmas()))
+    np.testing.assert_allclose(found[1], found[0], rtol=0.01)
+
+
 def test_the_evidence_of_true_closures_is_their_density_under_the_odometry() -> None:
     """Against the dense joint covariance of closures that are linear in small errors."""
     drive = ring(30, loops=6, seed=7)

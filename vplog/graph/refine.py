@@ -145,7 +145,7 @@ def refine(
     scales = []
     if fixes is not None:
         scales = [Scale("odometry", of_odometry, settings.scale_sigma, settings.significance, scale)]
-    metric = loops & ~of_odometry & (weight > 0)
+    metric = loops & ~of_odometry & (weight > 0.5)
     if metric.any() and np.median(_lengths(graph, metric)) >= _LONG:
         own, expected = loops & ~of_odometry, settings.closure_scale_sigma
         witnesses = sum(1 for _ in runs(graph, np.flatnonzero(metric))) / float(metric.sum())

@@ -95,7 +95,7 @@ def estimate(objective: Objective, poses: Floats, present: Sigmas) -> Sigmas:
     """
     graph, weight = objective.factors.graph, objective.weight
     loops = ~graph.odometry & (weight > 0)
-    closures_dof = float(degrees_of_freedom(graph) * np.count_nonzero(loops))
+    closures_dof = float(degrees_of_freedom(graph) * weight[loops].sum())
     most = closures_dof
     if objective.positions is not None:
         most += 3.0 * np.count_nonzero(objective.positions.Omega.any((1, 2)))
@@ -142,10 +142,12 @@ def extrapolated(first: Sigmas, second: Sigmas, third: Sigmas) -> Sigmas:
 
 
 def _of_parts(objective: Objective, poses: Floats, kinds: list[Bools]) -> list[tuple[Floats, Floats]]:
-    """Chi-square and redundancy of the rotations and of the translations of each kind of edges (E,), (2,) each."""
+    """Weighted chi-square and redundancy of the rotations and of the translations of each kind of edges (E,), (2,)
+    each."""
     graph = objective.factors.graph
     axes = np.array(AXES[graph.dimension])
     edges = np.flatnonzero(np.logical_or.reduce(kinds))
+    weight = objective.weight[edges]
     claimed = np.linalg.inv(informed(graph, edges))
     error = residual_twists(graph, poses, edges)
     chi2, trusted = np.zeros((2, len(edges))), np.zeros((2, len(edges)))
@@ -162,6 +164,7 @@ def _of_parts(objective: Objective, poses: Floats, kinds: list[Bools]) -> list[t
     size = np.array([int(part.sum()) for part in parts])
     found = []
     for kind in kinds:
-        own = kind[edges]
-        found.append((chi2[:, own].sum(1), np.maximum(own.sum() * size - trusted[:, own].sum(1), 0.0)))
+        own = kind[edges] * weight
+        checked = own.sum() * size - (own * trusted).sum(1)
+        found.append(((own * chi2).sum(1), np.maximum(checked, 0.0)))
     return found
