@@ -194,6 +194,25 @@ def test_fixes_share_the_say_of_a_keyframe() -> None:
     np.testing.assert_allclose(fixes.covariance[fixes.row == 30], np.broadcast_to(3.0 * np.eye(3), (3, 3, 3)))
 
 
+def test_fixes_hang_on_keyframes_of_their_own_piece_of_the_odometry() -> None:
+    """20 m along x at 10 m/s, a sample and a fix each tenth of a second, and a break of 1.3 s after the first 10 m."""
+    seconds = np.concatenate([np.arange(11), np.arange(24, 35)]) / 10.0
+    x = np.arange(22) - (np.arange(22) > 10)  # the position is held across the gap
+    odometry = Odometry(
+        (seconds * 1e9).astype(np.int64), se3.pose(np.tile(np.eye(3), (22, 1, 1)), x[:, None] * np.eye(3)[0]),
+        None, breaks=np.array([11]),
+    )  # fmt: skip
+    rows = np.array([0, 7, 15, 21])
+    keyframes = Keyframes("gap", odometry.stamp_ns[rows], odometry.odom_from_body[rows])
+    stamps = np.arange(0, 3_500_000_000, 100_000_000)
+    zero = np.zeros(len(stamps))
+    gps = Gps(stamps, 48.0 + zero, 8.0 + zero, zero, np.tile(np.eye(3), (len(stamps), 1, 1)), np.zeros(3))
+    fixes = fixes_on(gps, odometry, keyframes, GpsSettings())
+    assert len(fixes) == 22  # none from within the break
+    np.testing.assert_array_equal(keyframes.stamp_ns[fixes.row] > 10**9, np.arange(22) > 10)
+    np.testing.assert_allclose(fixes.arm_m[:, 0], x - x[rows][fixes.row], atol=1e-9)
+
+
 def test_too_little_gps_is_one_clear_error() -> None:
     drive = ring(60, 5)
     with pytest.raises(GraphError, match="no GPS fixes"):

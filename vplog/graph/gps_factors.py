@@ -99,17 +99,23 @@ class Fixes:
 def fixes_on(gps: Gps | None, odometry: Odometry, keyframes: Keyframes, settings: GpsSettings) -> Fixes:
     """The fixes of a log on the keyframes nearest in time. Raises GraphError where fewer than three are within reach.
 
+    No odometry leads across a break, so fixes stay in their piece of it, and those within a break are left out.
     Fixes that share a keyframe share the information of one: their errors are those of the same satellites.
     """
     keys, warnings = keyframes.stamp_ns, []
     if gps is None:
         raise GraphError("The log has no GPS fixes to use. `vplog info` lists the topics; run without --gps.")
     local = local_enu(gps)
+    begin, end = odometry.stamp_ns[odometry.breaks], odometry.stamp_ns[odometry.breaks - 1]  # of what breaks part
     inside = (local.stamp_ns >= odometry.stamp_ns[0]) & (local.stamp_ns <= odometry.stamp_ns[-1])
+    inside &= end.searchsorted(local.stamp_ns, "left") == begin.searchsorted(local.stamp_ns, "right")
     stamps = local.stamp_ns[inside]
+    piece, of_key = begin.searchsorted(stamps, "right"), begin.searchsorted(keys, "right")
     after = np.clip(np.searchsorted(keys, stamps), 1, len(keys) - 1)
-    row = np.where(stamps - keys[after - 1] <= keys[after] - stamps, after - 1, after)
-    near = np.abs(stamps - keys[row]) <= settings.reach_s * 1e9
+    is_after = stamps - keys[after - 1] > keys[after] - stamps
+    own_before, own_after = of_key[after - 1] == piece, of_key[after] == piece
+    row = after - 1 + np.where(own_before == own_after, is_after, own_after)
+    near = (np.abs(stamps - keys[row]) <= settings.reach_s * 1e9) & (of_key[row] == piece)
     if near.sum() < _LEAST:
         raise GraphError(
             f"{int(near.sum())} of {len(gps.stamp_ns)} GPS fixes are within {settings.reach_s:g} s of a keyframe, and "
