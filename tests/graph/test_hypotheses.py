@@ -13,7 +13,7 @@ from tests.benchmarks.worlds import draw, make, world
 from tests.graph.drive import CLOSURE_SIGMA, ODOMETRY_SIGMA, Drive, ledger, position_error, ring
 from vplog.geometry import se3
 from vplog.graph import hypotheses
-from vplog.graph.build import build_graph
+from vplog.graph.build import build_graph, checked
 from vplog.graph.consistency import OdometryChain, is_loop
 from vplog.graph.evidence import Accidents, log_evidence, log_partition, log_room, log_tails, runs
 from vplog.graph.factors import Factors
@@ -170,6 +170,19 @@ def test_no_closure_outweighs_a_hundred_others() -> None:
     drive = replace(drive, graph=replace(drive.graph, information=information))
     assert bounded(drive.graph).information[loops[7]].max() <= 1.0001e4 * np.median(information[loops].max((1, 2)))
     assert decided(drive.graph, GncSettings()).solution.weight[loops].sum() >= 39
+
+
+PLANAR = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
+"""1 for yaw, x and y."""
+
+
+def test_a_closure_keeps_its_information_beside_planar_ones() -> None:
+    drive = ring(60, loops=20)
+    loops = np.flatnonzero(is_loop(drive.graph))
+    information = drive.graph.information.copy()
+    information[loops[1:]] *= np.outer(PLANAR, PLANAR)
+    graph, _ = checked(replace(drive.graph, information=information))
+    np.testing.assert_array_equal(bounded(graph).information, graph.information)
 
 
 def test_sigmas_are_those_of_the_world() -> None:

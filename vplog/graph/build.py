@@ -120,7 +120,7 @@ def checked(graph: PoseGraph) -> tuple[PoseGraph, list[str]]:
     open_ = values[:, 0] < _LEAST_SHARE * values[:, -1]
     values = np.maximum(values, 2.0 * _LEAST_SHARE * values[:, -1:])
     mended = (vectors * values[:, None, :]) @ np.swapaxes(vectors, 1, 2) * scale[rows]
-    mended[open_] += _weakest_information(graph)
+    mended[open_] += weakest_information(graph)
     axes = np.array(AXES[graph.dimension])
     repaired = graph.information.copy()
     repaired[rows[:, None, None], axes[:, None], axes] = mended
@@ -135,7 +135,7 @@ def checked(graph: PoseGraph) -> tuple[PoseGraph, list[str]]:
     return replace(graph, information=repaired), warnings
 
 
-def _weakest_information(graph: PoseGraph) -> Floats:
+def weakest_information(graph: PoseGraph) -> Floats:
     """(d, d) information of what is known of any edge: it turns by no half circle, and is no longer than all together.
 
     Else axes of which an edge says nothing would be as uncertain as no false closure is.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.errors import GraphError
-from vplog.graph.build import informed
+from vplog.graph.build import informed, weakest_information
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, is_loop, residual_sigma
 from vplog.graph.evidence import (
     TAIL,
@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 
 _MOST_INFORMATION = 1e4
 """A closure's information as a multiple of the median one's, so that none outweighs a hundred others."""
+_KNOWN = 10.0
+"""Information of an axis that a closure knows, as a multiple of what is known of any."""
 _ROUNDS = 4
 """Most rounds of estimating the sigmas and testing the closures again; 2 are usual."""
 _STEADY = 0.2
@@ -407,12 +409,15 @@ def _flipped(at: AtSigmas, best: Hypothesis, run: Ints) -> list[Hypothesis]:
 
 
 def bounded(graph: PoseGraph) -> PoseGraph:
-    """The graph with the information of each closure at most `_MOST_INFORMATION` times the median one's."""
+    """The graph with the information of each closure at most `_MOST_INFORMATION` times the median one's, of those that
+    know the axis."""
     loops = np.flatnonzero(~graph.odometry)
     if not len(loops):
         return graph
     axes = np.diagonal(informed(graph, loops), axis1=1, axis2=2)
-    excess = (axes / (np.median(axes, axis=0) * _MOST_INFORMATION)).max(1)
+    unknown = axes <= _KNOWN * np.diagonal(weakest_information(graph))  # as height where closures are planar
+    median = np.ma.median(np.ma.masked_array(axes, unknown), axis=0).filled(np.inf)
+    excess = (axes / (median * _MOST_INFORMATION)).max(1)
     information = graph.information.copy()
     information[loops] /= np.maximum(excess, 1.0)[:, None, None]
     return replace(graph, information=information)
