@@ -12,7 +12,7 @@ from vplog.graph.consistency import is_loop
 from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
 from vplog.graph.hypotheses import best_hypothesis, bounded
-from vplog.graph.lm import LmSettings, solve_weighted
+from vplog.graph.lm import LmSettings, half_chi2, solve_weighted
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import CauchySettings, DcsSettings, GemanMcClureSettings
 from vplog.graph.variance_components import Sigmas
@@ -54,7 +54,10 @@ def decided(
     count, inliers = int(loops.sum()), int(best.weight[loops].sum())
     if inliers == 0:
         why = f"Odometry was kept: the {count} closures are likelier to be all false than any of them to be true."
-        return Decision(graph, Solution(best.poses, best.weight, 0.0, 0.0, 0, True, why), Sigmas())  # nothing tells
+        before, after = (half_chi2(graph, best.weight, poses) for poses in (graph.world_from_body, best.poses))
+        return Decision(
+            graph, Solution(best.poses, best.weight, before, after, 0, True, why), Sigmas()
+        )  # nothing tells
     if not isinstance(optimiser, GncSettings):
         return Decision(graph, optimiser(graph), best.sigmas)
     found = f"{inliers} of {count} closures were kept. "

@@ -54,7 +54,8 @@ def optimize(path: Path, out: Path, method: str = "gnc", certify: bool = False) 
     with watch.stage("write"):
         solution = _with_fixed(solution, graph, part == part[file.held], file.held)
         write_g2o(out, file.graph, solution.world_from_body, ids, file.held)
-    record = _record(path, out, method, file, solution, warnings + repairs, watch)
+    warnings += repairs + _about_rejected(graph, solution, part, ids)
+    record = _record(path, out, method, file, solution, warnings, watch)
     if certificate is not None:
         record["certificate"] = certificate.record()
     return Optimised(file, solution, record)
@@ -72,6 +73,19 @@ def _about_parts(part: Ints, ids: Ints) -> list[str]:
             f"on{', ..' if (size > 1).sum() > 5 else ''}); each is solved by itself with its first pose fixed."
         )
     return warnings
+
+
+def _about_rejected(graph: PoseGraph, solution: Solution, part: Ints, ids: Ints) -> list[str]:
+    """A warning where rejected edges alone join some of a part (N,)."""
+    used = solution.weight >= 0.5
+    first = np.unique(parts(len(ids), graph.a[used], graph.b[used]), return_index=True)[1]
+    alone = ids[np.setdiff1d(first, np.unique(part, return_index=True)[1])]
+    if not len(alone):
+        return []
+    return [
+        f"Only rejected edges join {plural(len(alone), 'part')} (from {', '.join(map(str, alone[:5].tolist()))} "
+        f"on{', ..' if len(alone) > 5 else ''}) to the others: poses of one are not known relative to those of another."
+    ]
 
 
 def solve_parts(
