@@ -135,6 +135,16 @@ def test_a_vain_part_is_said_even_beside_a_sound_one(part: slice) -> None:
     assert any("is implausible" in warning and "raised" in warning for warning in vain)
 
 
+@pytest.mark.parametrize("rest", [1.0, 1e-4])
+def test_constants_of_a_driver_are_bounded_by_the_model(rest: float) -> None:
+    """One for motion, and one for each fifth sample, where the robot stands."""
+    covariance = 1e4 * SMALL * np.where(np.arange(T) % 5 == 0, rest, 1.0)[:, None, None]
+    result, warnings, _ = edge_covariance(odometry(covariance), STAMPS[::7], NoiseSettings())
+    model, _, _ = edge_covariance(odometry(None), STAMPS[::7], NoiseSettings())
+    np.testing.assert_allclose(result, model, atol=1e-12)
+    assert any(f"{1 + (rest < 1.0)} constant" in warning and "lowered" in warning for warning in warnings)
+
+
 def test_keyframes_outside_of_the_odometry_are_refused() -> None:
     with pytest.raises(GraphError, match="within the odometry"):
         edge_covariance(odometry(None), STAMPS[[0, 50]] - 1, NoiseSettings())

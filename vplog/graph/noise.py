@@ -8,12 +8,14 @@ import numpy as np
 from pydantic import Field
 
 from vplog.data import Bools, Floats, Ints, Odometry
-from vplog.errors import GraphError
+from vplog.errors import GraphError, plural
 from vplog.geometry import se3
 from vplog.settings import Settings
 
 _UNKNOWN_VARIANCE = 1e3
 """m^2 or rad^2; drivers write 1e3, 99999, 1e6 or more on an axis that they do not measure."""
+_MOST_CONSTANTS = 4
+"""Covariances that a driver chooses from: for motion and rest, or for straight ways and turns."""
 _CHUNK = 1 << 15
 """Rows handled at once; bounds the memory of (rows, 6, 6) arrays to some 10 MB each."""
 _AXES = ("roll", "pitch", "yaw", "x", "y", "z")
@@ -37,7 +39,7 @@ class NoiseSettings(Settings):
     best_share: float = Field(default=0.2, gt=0, le=1)
     """Least sigma of an edge as a share of the model's: 0.4 % and 0.006 deg/m are better than odometry gets."""
     worst_share: float = Field(default=1.0, ge=1)
-    """Largest sigma of an edge as a share of the model's where the log holds one constant covariance."""
+    """Largest sigma of an edge as a share of the model's where the log holds a constant covariance, or a few."""
     floor_m: float = Field(default=0.001, gt=0)
     """Least sigma of an edge's translation: 1 mm, below what any odometry resolves."""
     floor_rad: float = Field(default=0.0002, gt=0)
@@ -87,8 +89,9 @@ def covariance_without_breaks(
 
     Single axes that are zero or beyond 1e3 (a planar robot), and edges with unusable samples, take the model. No edge
     has less noise than `best_share` of the model's: over-confident odometry would throw every closure out. A covariance
-    that never changes is a figure in a driver, not an estimate (it has a parked robot drift away), so its edges have no
-    more than `worst_share` of the model's: odometry that may be anywhere cannot tell a false closure.
+    that never changes, or only between a few values as from motion to rest, is a figure in a driver, not an estimate
+    (it has a parked robot drift away), so its edges have no more than `worst_share` of the model's: odometry that may
+    be anywhere cannot tell a false closure.
 
     Raises GraphError where the keyframes are not increasing or the odometry does not cover them.
     """
@@ -147,8 +150,9 @@ def covariance_without_breaks(
             f"The odometry's covariance is unusable at {int((~usable).sum())} of {len(usable)} samples, "
             f"so {int(broken.sum())} edges take the drift model."
         )
-    most = np.inf
-    if (np.ptp(variance, axis=0) <= 1e-9 * variance.max(0)).all():
+    most, likes = np.inf, np.round(variance / np.where(variance.any(0), variance.max(0), 1.0), 8)
+    constants = len(np.unique(likes, axis=0))
+    if constants <= max(min(_MOST_CONSTANTS, len(variance) // 10), 1):
         most = settings.worst_share
     within, share = _bounded(covariance, modelled, settings.best_share, most)
     # judged by the surest and the least sure direction of an edge: a sound heading must not hide a vain position
@@ -161,8 +165,8 @@ def covariance_without_breaks(
         )
     if largest > most:
         warnings.append(
-            f"The odometry's covariance is implausible: it is one constant, {largest:.1f} times the drift model in "
-            f"sigma, so it is lowered to {most:g} times."
+            f"The odometry's covariance is implausible: it is {plural(constants, 'constant')}, {largest:.1f} times the "
+            f"drift model in sigma, so it is lowered to {most:g} times."
         )
     return within, warnings, source
 

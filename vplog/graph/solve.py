@@ -55,9 +55,8 @@ def decided(
     if inliers == 0:
         why = f"Odometry was kept: the {count} closures are likelier to be all false than any of them to be true."
         before, after = (half_chi2(graph, best.weight, poses) for poses in (graph.world_from_body, best.poses))
-        return Decision(
-            graph, Solution(best.poses, best.weight, before, after, 0, True, why), Sigmas()
-        )  # nothing tells
+        solution = Solution(best.poses, best.weight, before, after, 0, True, why)
+        return Decision(graph, solution, Sigmas())  # nothing tells
     if not isinstance(optimiser, GncSettings):
         return Decision(graph, optimiser(graph), best.sigmas)
     found = f"{inliers} of {count} closures were kept. "
