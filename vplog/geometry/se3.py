@@ -67,17 +67,17 @@ def so3_log(rotation: Floats) -> Floats:
 def exp(xi: Floats) -> Floats:
     """(..., 4, 4) of twists (..., 6): the exact exponential, as GTSAM's Pose3.Expmap."""
     omega, v = xi[..., :3], xi[..., 3:]
-    return pose(so3_exp(omega), (_left_jacobian(omega) @ v[..., None])[..., 0])
+    return pose(so3_exp(omega), (left_jacobian(omega) @ v[..., None])[..., 0])
 
 
 def log(a_from_b: Floats) -> Floats:
     """Twists (..., 6) of poses (..., 4, 4); the inverse of exp for angles below pi."""
     omega = so3_log(a_from_b[..., :3, :3])
-    v = np.linalg.solve(_left_jacobian(omega), a_from_b[..., :3, 3:])[..., 0]
+    v = np.linalg.solve(left_jacobian(omega), a_from_b[..., :3, 3:])[..., 0]
     return np.asarray(np.concatenate([omega, v], axis=-1), np.float64)
 
 
-def _left_jacobian(omega: Floats) -> Floats:
+def left_jacobian(omega: Floats) -> Floats:
     """V of the exponential: translation = V @ v."""
     angle = np.linalg.norm(omega, axis=-1)[..., None, None]
     k = skew(omega)

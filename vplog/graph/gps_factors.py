@@ -184,19 +184,30 @@ def world_from_enu(poses: Floats, fixes: Fixes, weight: Floats) -> Floats:
     spread[:, 2] += vertical / _VERTICAL_SIGMA**2
     left, _, right = np.linalg.svd(spread)
     rotation = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
-    start = se3.pose(rotation.T, np.zeros(3))
     root = np.sqrt(weight)[:, None, None] * np.linalg.cholesky(np.linalg.inv(fixes.covariance), upper=True)
 
-    def error(twist: Floats) -> Floats:
-        enu_from_world = start @ se3.exp(twist)
-        off = se3.transform(enu_from_world, target - target_middle) - (fixes.enu_m - middle)
-        tilt = (enu_from_world[:3, :3] @ vertical - [0.0, 0.0, 1.0]) / _VERTICAL_SIGMA
+    seen, measured = target - target_middle, fixes.enu_m - middle
+
+    def turned(x: Floats) -> Floats:
+        return rotation.T @ se3.so3_exp(x[:3])
+
+    def error(x: Floats) -> Floats:
+        R = turned(x)
+        off = seen @ R.T + x[3:] - measured
+        tilt = (R @ vertical - [0.0, 0.0, 1.0]) / _VERTICAL_SIGMA
         return np.concatenate([(root @ off[:, :, None]).ravel(), tilt])
 
-    moved = start @ se3.exp(
-        scipy.optimize.least_squares(error, np.zeros(6), method="lm", x_scale="jac", max_nfev=_MOST_EVALUATIONS).x
-    )
-    return se3.pose(np.eye(3), target_middle) @ se3.inverse(moved) @ se3.pose(np.eye(3), -middle)
+    def jacobian(x: Floats) -> Floats:
+        around = turned(x), se3.left_jacobian(-x[:3])  # R exp(w + d) = R exp(w) exp(J(-w) d)
+        moved, tilted = (-around[0] @ se3.skew(v) @ around[1] for v in (seen, vertical))
+        of_fixes = np.concatenate([root @ moved, root], axis=2).reshape(-1, 6)
+        return np.concatenate([of_fixes, np.column_stack([tilted, np.zeros((3, 3))]) / _VERTICAL_SIGMA])
+
+    found = scipy.optimize.least_squares(
+        error, np.zeros(6), jacobian, method="lm", x_scale="jac", max_nfev=_MOST_EVALUATIONS
+    ).x
+    enu_from_world = se3.pose(turned(found), found[3:])
+    return se3.pose(np.eye(3), target_middle) @ se3.inverse(enu_from_world) @ se3.pose(np.eye(3), -middle)
 
 
 def chi2_of_fixes(poses: Floats, fixes: Fixes, world: Floats) -> Floats:
