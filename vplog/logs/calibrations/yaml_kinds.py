@@ -118,7 +118,8 @@ def _listed(part: dict) -> CalibratedCamera:
 
 def _settings(tree: dict, sections: list[str]) -> list[CalibratedCamera]:
     """The settings of ORB-SLAM 2 and 3, and of VSLAM-LAB before its list of cameras."""
-    factor = tree.get("RGBD.DepthMapFactor", tree.get("DepthMapFactor"))
+    names = ("RGBD.DepthMapFactor", "DepthMapFactor", "Depth0.factor")
+    factor = next((tree[name] for name in names if name in tree), None)
     per_m = None if factor is None else float(numbers_of([factor], 1)[0])
     return [CalibratedCamera(name, "", _section(tree, name), depth_per_m=per_m) for name in sections]
 

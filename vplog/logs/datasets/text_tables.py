@@ -14,6 +14,8 @@ from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.tf_odometry import are_usable
 
+_UNIT = re.compile(r"[(\[](s|ms|us|ns)[)\]]")
+_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 _LINE_LIMIT = 65536
 """Characters; a line of COLMAP's images.txt has some thousand, and a file without line ends is not read whole."""
 
@@ -50,6 +52,18 @@ def rows_of(path: Path, least: int) -> list[list[str]]:
     if not found:
         raise LogError(f"{path} holds no row. Copy the data set again.")
     return found
+
+
+def unit_ns(name: str) -> int:
+    """ns of the unit in brackets in the name of a column of stamps, as `ts (s)`; 1 without one."""
+    named = _UNIT.search(name)
+    return 1 if named is None else _NS[named[1]]
+
+
+def header_of(path: Path) -> list[str]:
+    """Names of the columns, where the first line has names; else its values. Raises LogError."""
+    _, head = next(lines_of(path), (0, ""))
+    return [name.strip() for name in head.split(",")]
 
 
 def stamps_ns(path: Path, texts: list[str], unit_ns: int) -> Ints:

@@ -8,7 +8,7 @@ from vplog.errors import LogError
 from vplog.logs.calibration_file import read_calibrations
 from vplog.logs.calibrations.camera import CalibratedCamera
 from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, depth_stream, imu_stream
-from vplog.logs.datasets.text_tables import lines_of, listed_images, poses_of
+from vplog.logs.datasets.text_tables import header_of, listed_images, poses_of, unit_ns
 
 
 def roots(path: Path) -> list[Path]:
@@ -27,16 +27,18 @@ def read(path: Path) -> DataSet:
         streams = camera_streams("rgb", *listed_images(path / "rgb.txt", path, 10**9), first)
     if (imu := path / "imu_0.csv").is_file():
         streams.append(imu_stream("imu_0", imu))
-    truths = (("groundtruth.csv", 1), ("groundtruth.txt", 10**9))
-    truth = next((poses_of(path / name, unit_ns) for name, unit_ns in truths if (path / name).is_file()), None)
+    truth = None
+    if (table := path / "groundtruth.csv").is_file():
+        truth = poses_of(table, unit_ns(header_of(table)[0]))
+    elif (table := path / "groundtruth.txt").is_file():
+        truth = poses_of(table, 10**9)
     return DataSet("vslam-lab", streams, truth)
 
 
 def _columns(path: Path, cameras: dict[str, CalibratedCamera]) -> list[Stream]:
-    """The streams of rgb.csv, whose columns are `ts_NAME (ns)` and `path_NAME` for each."""
+    """The streams of rgb.csv, whose columns are `ts_NAME (ns)`, or `(s)`, and `path_NAME` for each."""
     table = path / "rgb.csv"
-    _, head = next(lines_of(table), (0, ""))
-    names = [name.strip() for name in head.split(",")]
+    names = header_of(table)
     streams: list[Stream] = []
     for column, name in enumerate(names):
         topic = name.removeprefix("path_")
@@ -45,10 +47,11 @@ def _columns(path: Path, cameras: dict[str, CalibratedCamera]) -> list[Stream]:
         stamped = next((i for i, other in enumerate(names) if other.split(" ")[0] == f"ts_{topic}"), None)
         if stamped is None:
             raise LogError(f"{table} has a column {name[:40]} without ts_{topic[:40]}. Copy the data set again.")
-        listed = listed_images(table, path, 1, (stamped, column))
-        camera = cameras.get(topic.replace("depth", "rgb"))
+        listed = listed_images(table, path, unit_ns(names[stamped]), (stamped, column))
+        image = topic.replace("depth", "rgb")
+        camera = cameras.get(image, cameras.get(image.replace("rgb", "Camera")))  # before its list of cameras
         if not topic.startswith("depth"):
             streams += camera_streams(topic, *listed, camera)
         elif camera is not None and camera.depth_per_m is not None:
-            streams.append(depth_stream(topic, *listed, camera.depth_per_m, topic.replace("depth", "rgb")))
+            streams.append(depth_stream(topic, *listed, camera.depth_per_m, image))
     return streams

@@ -1,0 +1,54 @@
+"""Data sets as other versions of their tools, and people's own recordings in their layouts, have them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from tests.logs.test_datasets import (
+    COUNT,
+    STAMPS,
+    K,
+    check_frames,
+    check_truth,
+    images,
+    numbers,
+    poses,
+    quaternions,
+    text,
+    vslam_lab,
+)
+from vplog import logs
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.mark.parametrize(("unit", "unit_ns"), [("s", 10**9), ("ms", 10**6), ("us", 10**3)])
+def test_tables_of_vslam_lab_name_the_unit_of_their_stamps(unit: str, unit_ns: int, tmp_path: Path) -> None:
+    """Seconds, `rgb0` and `Camera0` as in earlier versions."""
+    vslam_lab(tmp_path)
+    stamps = STAMPS // 10**6 * 10**6
+    times = [f"{stamp // unit_ns}.{stamp % unit_ns:09d}" if unit == "s" else str(stamp // unit_ns) for stamp in stamps]
+    rows = [f"{time},rgb_0/{row}.png,{time},depth_0/{row}.png" for row, time in enumerate(times)]
+    text(tmp_path / "rgb.csv", f"ts_rgb0 ({unit}),path_rgb0,ts_depth0 ({unit}),path_depth0", *rows)
+    camera = zip(("fx", "fy", "cx", "cy"), K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True)
+    section = [f"Camera0.{name}: {value}" for name, value in camera]
+    text(tmp_path / "calibration.yaml", "%YAML:1.0", "Camera0.model: PINHOLE", *section, "Depth0.factor: 2500.0")
+    each = zip(times, poses(), quaternions(poses()), strict=True)
+    rows = [",".join([time, *numbers([*pose[:3, 3], *turn]).split()]) for time, pose, turn in each]
+    text(tmp_path / "groundtruth.csv", f"ts ({unit}),tx (m),ty (m),tz (m),qx,qy,qz,qw", *rows)
+    text(tmp_path / "imu_0.csv", f"ts ({unit}),wx,wy,wz,ax,ay,az", *(f"{time},0,0,0,0,0,9.8" for time in times))
+    log = logs.open(tmp_path)
+    check_frames(log, stamps, images())
+    check_truth(log, stamps, poses())
+    assert log.camera().matrix is not None
+    np.testing.assert_allclose(np.asarray(log.camera().matrix), K)
+    frame = next(iter(log.frames(stamps[:1]))).decode()
+    assert frame.depth is not None
+    assert frame.depth[1, 1] == pytest.approx(1.0)
+    info = log.info()
+    assert (info.start_ns, info.end_ns) == (stamps[0], stamps[-1])
+    assert {topic.name: topic.count for topic in info.topics}["imu_0"] == COUNT
