@@ -18,6 +18,8 @@ from vplog import logs
 from vplog.errors import LogError
 from vplog.logs import TopicChoice
 from vplog.logs.calibration_file import camera_for, read_calibrations
+from vplog.logs.cameras import camera_of
+from vplog.logs.formats.container import Notes
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -89,6 +91,15 @@ def test_a_folder_of_images_is_calibrated_by_a_file(tmp_path: Path) -> None:
     log = logs.open(folder, TopicChoice(calibration_file=write(tmp_path / "zero.yaml", uncalibrated)))
     assert log.camera().matrix is None
     assert "K[0] = 0" in " ".join(log.warnings)
+
+
+@pytest.mark.parametrize("fisheye", [0, 1])
+def test_opencvs_sample_marks_fisheye_lenses(fisheye: int, tmp_path: Path) -> None:
+    """It writes no distortion_model (opencv/samples/cpp/tutorial_code/calib3d/camera_calibration)."""
+    tree = {"fisheye_model": fisheye, "camera_matrix": matrix(K), "distortion_coefficients": matrix([D[:4]])}
+    (camera,) = read_calibrations(write(tmp_path / "out_camera_data.xml.yaml", tree))
+    found = camera_of("camera", camera.calibration, (WIDTH, HEIGHT), Notes())
+    assert found.distortion_model == ("equidistant" if fisheye else "plumb_bob")
 
 
 def test_kalibrs_camchain_by_topic_and_by_name(tmp_path: Path) -> None:

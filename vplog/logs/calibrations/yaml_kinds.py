@@ -82,7 +82,8 @@ def _camera_info(tree: dict) -> CalibrationMessage:
         matrix_of(tree.get(f"{name}_matrix", unset.ravel().tolist()), unset.size).reshape(unset.shape)
         for name, unset in (("camera", np.eye(3)), ("projection", np.zeros((3, 4))), ("rectification", np.eye(3)))
     )
-    return CalibrationMessage(0, "", *size, text_of(tree.get("distortion_model")), lens, k, p, r)
+    model = text_of(tree.get("distortion_model")) or ("equidistant" if tree.get("fisheye_model") else "")
+    return CalibrationMessage(0, "", *size, model, lens, k, p, r)
 
 
 def _intrinsics(tree: dict) -> CalibrationMessage:
