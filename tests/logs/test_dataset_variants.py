@@ -9,7 +9,9 @@ import pytest
 
 from tests.logs.test_datasets import (
     COUNT,
+    HEIGHT,
     STAMPS,
+    WIDTH,
     K,
     check_frames,
     check_truth,
@@ -17,10 +19,13 @@ from tests.logs.test_datasets import (
     numbers,
     poses,
     quaternions,
+    seconds,
     text,
     vslam_lab,
+    write_images,
 )
 from vplog import logs
+from vplog.logs import TopicChoice
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -38,7 +43,7 @@ def test_tables_of_vslam_lab_name_the_unit_of_their_stamps(unit: str, unit_ns: i
     section = [f"Camera0.{name}: {value}" for name, value in camera]
     text(tmp_path / "calibration.yaml", "%YAML:1.0", "Camera0.model: PINHOLE", *section, "Depth0.factor: 2500.0")
     each = zip(times, poses(), quaternions(poses()), strict=True)
-    rows = [",".join([time, *numbers([*pose[:3, 3], *turn]).split()]) for time, pose, turn in each]
+    rows = [",".join([time, *numbers(np.array([*pose[:3, 3], *turn])).split()]) for time, pose, turn in each]
     text(tmp_path / "groundtruth.csv", f"ts ({unit}),tx (m),ty (m),tz (m),qx,qy,qz,qw", *rows)
     text(tmp_path / "imu_0.csv", f"ts ({unit}),wx,wy,wz,ax,ay,az", *(f"{time},0,0,0,0,0,9.8" for time in times))
     log = logs.open(tmp_path)
@@ -52,3 +57,39 @@ def test_tables_of_vslam_lab_name_the_unit_of_their_stamps(unit: str, unit_ns: i
     info = log.info()
     assert (info.start_ns, info.end_ns) == (stamps[0], stamps[-1])
     assert {topic.name: topic.count for topic in info.topics}["imu_0"] == COUNT
+
+
+def recording(root: Path) -> None:
+    """Colour and depth of an own camera in the layout of TUM RGB-D, 1000 counts a metre."""
+    depth = np.full((COUNT, HEIGHT, WIDTH), 2500, np.uint16)
+    for kind, pictures in (("rgb", images()), ("depth", depth)):
+        write_images(root / kind, [f"{row}.png" for row in range(COUNT)], pictures)
+        text(root / f"{kind}.txt", *(f"{seconds(int(s))} {kind}/{i}.png" for i, s in enumerate(STAMPS)))
+
+
+ORB = ("%YAML:1.0", "Camera.fx: 70.0", "Camera.fy: 71.0", "Camera.cx: 31.0", "Camera.cy: 23.0")
+
+
+@pytest.mark.parametrize("factor", [1000.0, 0.0, None])
+@pytest.mark.parametrize("beside", [False, True])
+def test_a_calibration_has_the_unit_of_a_recordings_depth(beside: bool, factor: float | None, tmp_path: Path) -> None:
+    """Given by --calibration, or as calibration.yaml in the folder; 5000 counts a metre, with a line, where it does not
+    name them."""
+    recording(tmp_path / "desk")
+    file = tmp_path / ("desk/calibration.yaml" if beside else "orb.yaml")
+    text(file, *ORB, *([] if factor is None else [f"RGBD.DepthMapFactor: {factor}"]))
+    log = logs.open(tmp_path / "desk", TopicChoice(calibration_file=None if beside else file))
+    assert log.info().kind == ("vslam-lab" if beside else "tum-rgbd")
+    depth = next(iter(log.frames(log.stamps()[:1]))).decode().depth
+    assert depth is not None
+    np.testing.assert_allclose(depth, 2.5 if factor else 0.5, rtol=1e-6)
+    assert ("5000 are taken" in " ".join(log.warnings)) == (not factor)
+
+
+def test_the_chosen_calibration_has_the_unit_of_vslam_labs_depth(tmp_path: Path) -> None:
+    vslam_lab(tmp_path / "drive")
+    text(tmp_path / "orb.yaml", *ORB, "DepthMapFactor: 5000")
+    log = logs.open(tmp_path / "drive", TopicChoice(calibration_file=tmp_path / "orb.yaml"))
+    depth = next(iter(log.frames(log.stamps()[:1]))).decode().depth
+    assert depth is not None
+    assert depth[1, 1] == pytest.approx(0.5)

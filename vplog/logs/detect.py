@@ -15,6 +15,7 @@ import zstandard
 
 from vplog.errors import LogError, nearest_path, plural
 from vplog.logs import image_folder
+from vplog.logs.calibration_file import read_calibrations
 from vplog.logs.datasets import colmap, euroc, kitti, tum_rgbd, utm_images, video, vslam_lab
 from vplog.logs.datasets.images import read as read_images
 from vplog.logs.datasets.streams import DataSet, DataSetContainer
@@ -249,8 +250,7 @@ def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> RecordedLog:
         raise LogError(f"{problem} Copy the whole bag folder, or give a storage file itself.")
     roots = _data_sets(path)
     if len(roots) == 1:
-        found = next(one.read(roots[0]) for one in _DATA_SETS if one.roots(roots[0]))
-        return _published(path, path.resolve().name, found, notes, choice)
+        return _published(path, path.resolve().name, _read(roots[0], choice), notes, choice)
     if roots:
         names = ", ".join(str(root.relative_to(path)) for root in roots[:_LISTED])
         raise LogError(f"{path} holds {len(roots)} drives of data sets. Give one of them: {names}.")
@@ -259,6 +259,16 @@ def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> RecordedLog:
         found = read_images(path, *images, choice)
         return _published(path, path.name, found, notes, choice.model_copy(update={"image": None}))
     raise LogError(_no_folder(path, files))
+
+
+def _read(root: Path, choice: TopicChoice) -> DataSet:
+    """The drive of a data set; a calibration that is chosen may name the unit of its depth."""
+    kind = next(one for one in _DATA_SETS if one.roots(root))
+    with_depth = next((one for one in (vslam_lab, tum_rgbd) if one is kind), None)
+    if with_depth is None:
+        return kind.read(root)
+    cameras = [] if choice.calibration_file is None else read_calibrations(choice.calibration_file)
+    return with_depth.read(root, next((one.depth_per_m for one in cameras if one.depth_per_m), None))
 
 
 def _data_sets(path: Path) -> list[Path]:

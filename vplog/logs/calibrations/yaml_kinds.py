@@ -113,16 +113,19 @@ def _listed(part: dict) -> CalibratedCamera:
     named = {kalibrs: part[own] for kalibrs, own in _VSLAM_LAB.items() if own in part}
     calibration = _intrinsics(part | named | {"intrinsics": [*focal, *centre]})
     placed = rigid_of(part["T_BS"]) if "T_BS" in part else None
-    per_m = float(numbers_of([part["depth_factor"]], 1)[0]) if "depth_factor" in part else None
-    return CalibratedCamera(text_of(part.get("cam_name")), "", calibration, None, placed, per_m)
+    return CalibratedCamera(text_of(part.get("cam_name")), "", calibration, None, placed, _per_m(part, "depth_factor"))
 
 
 def _settings(tree: dict, sections: list[str]) -> list[CalibratedCamera]:
     """The settings of ORB-SLAM 2 and 3, and of VSLAM-LAB before its list of cameras."""
-    names = ("RGBD.DepthMapFactor", "DepthMapFactor", "Depth0.factor")
-    factor = next((tree[name] for name in names if name in tree), None)
-    per_m = None if factor is None else float(numbers_of([factor], 1)[0])
+    per_m = _per_m(tree, "RGBD.DepthMapFactor", "DepthMapFactor", "Depth0.factor")
     return [CalibratedCamera(name, "", _section(tree, name), depth_per_m=per_m) for name in sections]
+
+
+def _per_m(tree: dict, *names: str) -> float | None:
+    """Counts of a metre by the first name that is there; None without one, or where it is not positive."""
+    factor = next((float(numbers_of([tree[name]], 1)[0]) for name in names if name in tree), 0.0)
+    return factor if factor > 0 else None
 
 
 def _section(tree: dict, name: str) -> CalibrationMessage:

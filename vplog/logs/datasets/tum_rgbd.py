@@ -8,11 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from vplog.logs.calibrations.camera import CalibratedCamera, pinhole
-from vplog.logs.datasets.streams import DataSet, camera_streams, depth_stream
+from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, depth_stream
 from vplog.logs.datasets.text_tables import listed_images, poses_of
 
 _PER_M = 5000.0
 """Counts of a metre in the depth images (cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats)."""
+_ASSUMED = (
+    "No calibration names the counts of a metre in the depth images; 5000 are taken, as in TUM RGB-D. --calibration "
+    "takes them from a file (RGBD.DepthMapFactor of ORB-SLAM)."
+)
 _CALIBRATIONS = {
     "1": ((517.3, 516.5), (318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "2": ((520.9, 521.0), (325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
@@ -28,13 +32,26 @@ def roots(path: Path) -> list[Path]:
     return [path] if found else []
 
 
-def read(path: Path) -> DataSet:
-    """The body is the colour camera, whose poses are the truth. Raises LogError."""
-    streams = camera_streams("rgb", *listed_images(path / "rgb.txt", path, 10**9), _calibration(path))
-    if (path / "depth.txt").is_file():
-        streams.append(depth_stream("depth", *listed_images(path / "depth.txt", path, 10**9), _PER_M, "rgb"))
+def read(path: Path, depth_per_m: float | None = None) -> DataSet:
+    """The body is the colour camera, whose poses are the truth. `depth_per_m` are counts of a metre in the depth
+    images, where they are known. Raises LogError."""
+    streams, remarks = listed_streams(path, _calibration(path), depth_per_m)
     truth = path / "groundtruth.txt"
-    return DataSet("tum-rgbd", streams, poses_of(truth, 10**9) if truth.is_file() else None)
+    return DataSet("tum-rgbd", streams, poses_of(truth, 10**9) if truth.is_file() else None, remarks)
+
+
+def listed_streams(
+    path: Path, camera: CalibratedCamera | None, depth_per_m: float | None
+) -> tuple[list[Stream], list[str]]:
+    """The streams of rgb.txt and depth.txt, and remarks. Raises LogError."""
+    streams, remarks = camera_streams("rgb", *listed_images(path / "rgb.txt", path, 10**9), camera), []
+    if (path / "depth.txt").is_file():
+        per_m = depth_per_m or (camera and camera.depth_per_m)
+        if per_m is None:
+            remarks = [_ASSUMED]
+        listed = listed_images(path / "depth.txt", path, 10**9)
+        streams.append(depth_stream("depth", *listed, per_m or _PER_M, "rgb"))
+    return streams, remarks
 
 
 def _calibration(path: Path) -> CalibratedCamera | None:
@@ -44,4 +61,4 @@ def _calibration(path: Path) -> CalibratedCamera | None:
     if named is None:
         return None
     focal, centre, lens = (np.array(values, np.float64) for values in _CALIBRATIONS[named[1]])
-    return CalibratedCamera("rgb", "", pinhole(focal, centre, _SIZE, "plumb_bob", lens), body_from_camera=np.eye(4))
+    return CalibratedCamera("rgb", "", pinhole(focal, centre, _SIZE, "plumb_bob", lens), None, np.eye(4), _PER_M)

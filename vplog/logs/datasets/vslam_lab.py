@@ -7,6 +7,7 @@ from pathlib import Path
 from vplog.errors import LogError
 from vplog.logs.calibration_file import read_calibrations
 from vplog.logs.calibrations.camera import CalibratedCamera
+from vplog.logs.datasets import tum_rgbd
 from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, depth_stream, imu_stream
 from vplog.logs.datasets.text_tables import header_of, listed_images, poses_of, unit_ns
 
@@ -16,15 +17,15 @@ def roots(path: Path) -> list[Path]:
     return [path] if (path / "rgb.csv").is_file() or ((path / "rgb.txt").is_file() and calibrated) else []
 
 
-def read(path: Path) -> DataSet:
-    """The body is that of T_BS. Raises LogError."""
+def read(path: Path, depth_per_m: float | None = None) -> DataSet:
+    """The body is that of T_BS. `depth_per_m` are counts of a metre in the depth images, None as calibration.yaml has
+    them. Raises LogError."""
     calibration = path / "calibration.yaml"
     cameras = {one.name: one for one in read_calibrations(calibration)} if calibration.is_file() else {}
     if (path / "rgb.csv").is_file():
-        streams = _columns(path, cameras)
+        streams, remarks = _columns(path, cameras, depth_per_m), []
     else:  # before 2025: one camera, in the lists of TUM RGB-D
-        first = next(iter(cameras.values()))
-        streams = camera_streams("rgb", *listed_images(path / "rgb.txt", path, 10**9), first)
+        streams, remarks = tum_rgbd.listed_streams(path, next(iter(cameras.values()), None), depth_per_m)
     if (imu := path / "imu_0.csv").is_file():
         streams.append(imu_stream("imu_0", imu))
     truth = None
@@ -32,10 +33,10 @@ def read(path: Path) -> DataSet:
         truth = poses_of(table, unit_ns(header_of(table)[0]))
     elif (table := path / "groundtruth.txt").is_file():
         truth = poses_of(table, 10**9)
-    return DataSet("vslam-lab", streams, truth)
+    return DataSet("vslam-lab", streams, truth, remarks)
 
 
-def _columns(path: Path, cameras: dict[str, CalibratedCamera]) -> list[Stream]:
+def _columns(path: Path, cameras: dict[str, CalibratedCamera], depth_per_m: float | None) -> list[Stream]:
     """The streams of rgb.csv, whose columns are `ts_NAME (ns)`, or `(s)`, and `path_NAME` for each."""
     table = path / "rgb.csv"
     names = header_of(table)
@@ -52,6 +53,6 @@ def _columns(path: Path, cameras: dict[str, CalibratedCamera]) -> list[Stream]:
         camera = cameras.get(image, cameras.get(image.replace("rgb", "Camera")))  # before its list of cameras
         if not topic.startswith("depth"):
             streams += camera_streams(topic, *listed, camera)
-        elif camera is not None and camera.depth_per_m is not None:
-            streams.append(depth_stream(topic, *listed, camera.depth_per_m, image))
+        elif per_m := depth_per_m or (camera and camera.depth_per_m):
+            streams.append(depth_stream(topic, *listed, per_m, image))
     return streams
