@@ -72,6 +72,27 @@ def test_camera_info_takes_the_place_of_the_logs_own(tmp_path: Path) -> None:
         logs.open(path, TopicChoice(calibration_file=file, camera_info="/cam/camera_info"))
 
 
+@pytest.mark.parametrize("name", ["front", "cam"])
+def test_a_file_of_one_camera_is_of_that_in_use_and_of_those_it_names(name: str, tmp_path: Path) -> None:
+    path = write_ros2(tmp_path / "drive", ros_messages(Drive(), 2))
+    topics = TopicChoice(calibration_file=write(tmp_path / "one.yaml", camera_info() | {"camera_name": name}))
+    further = logs.open(path, topics.of_camera("/cam/image/compressed"))
+    used = logs.open(path, topics)
+    assert np.array_equal(np.asarray(used.camera().matrix), K)
+    assert np.array_equal(np.asarray(further.camera().matrix), K) == (name == "cam")
+    assert further.camera().matrix is not None
+    assert ("whose own calibration is used" in " ".join(further.warnings)) == (name == "front")
+
+
+def test_a_calibration_of_another_topic_is_said(tmp_path: Path) -> None:
+    path = write_ros2(tmp_path / "drive", ros_messages(Drive(), 2))
+    for topic in ("/cam0/image_raw", "/cam/image"):
+        chain = {"cam0": kalibr((topic, ""))["cam0"]}
+        log = logs.open(path, TopicChoice(calibration_file=write(tmp_path / "chain.yaml", chain)))
+        log.camera()
+        assert (f"The calibration is of {topic}" in " ".join(log.warnings)) == (topic == "/cam0/image_raw")
+
+
 def test_a_folder_of_images_is_calibrated_by_a_file(tmp_path: Path) -> None:
     folder = tmp_path / "images"
     folder.mkdir()

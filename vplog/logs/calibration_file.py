@@ -65,8 +65,12 @@ class SidecarFiles:
             logged = Odometry(*read_tum(choice.odometry_file, LogError, "--odometry-file"), None)
             self.odometry = without_jumps(logged, choice.odometry_file.name, notes)
             notes.add(f"{choice.odometry_file.name} carries no covariance; its noise is that of the drift model.")
-        self._path = choice.calibration_file
-        self._cameras = [] if self._path is None else read_calibrations(self._path)
+        self._cameras = [] if choice.calibration_file is None else read_calibrations(choice.calibration_file)
+        if self._cameras and choice.of_further_camera and not named_for(self._cameras, choice.image or ""):
+            notes.add(f"{choice.calibration_file} names no camera {choice.image}, whose own calibration is used.")
+            choice = choice.model_copy(update={"calibration_file": None})
+        self.choice, self._path = choice, choice.calibration_file
+        """Choice of topics, without a calibration file that is of another camera."""
 
     def camera(self, topic: str) -> CalibratedCamera | None:
         """The camera of an image topic; None without a file. Raises LogError where the file does not say which."""
@@ -84,9 +88,13 @@ def camera_for(cameras: list[CalibratedCamera], topic: str, path: Path) -> Calib
     """The camera of an image topic: by its topic, by its name in the topic, or the only one. Raises LogError."""
     if len(cameras) == 1:
         return cameras[0]
-    named = [c for c in cameras if c.topic and (topic == c.topic or topic.startswith(f"{c.topic.rstrip('/')}/"))]
-    named = named or [c for c in cameras if c.name in topic.strip("/").split("/")]
-    if len(named) == 1:
+    if len(named := named_for(cameras, topic)) == 1:
         return named[0]
     known = ", ".join(f"{c.name} ({c.topic})" if c.topic else c.name for c in cameras[:8])
     raise LogError(f"{path} does not say which of its cameras is {topic}: {known}. Choose a topic with --image-topic.")
+
+
+def named_for(cameras: list[CalibratedCamera], topic: str) -> list[CalibratedCamera]:
+    """Those that have the topic of images, or else a name in it."""
+    named = [c for c in cameras if c.topic and (topic == c.topic or topic.startswith(f"{c.topic.rstrip('/')}/"))]
+    return named or [c for c in cameras if c.name in topic.strip("/").split("/")]

@@ -13,7 +13,7 @@ import numpy as np
 from vplog.data import Bytes, Camera, Floats, Gps, Imu, Ints, Lidar, LogInfo, Odometry, Scan, Topic, Trajectory
 from vplog.errors import LogError
 from vplog.geometry import se3
-from vplog.logs.calibration_file import SidecarFiles
+from vplog.logs.calibration_file import SidecarFiles, named_for
 from vplog.logs.cameras import BODY, body_from_camera, camera_of, optical_frame
 from vplog.logs.content import LogContent, read_content
 from vplog.logs.depth_registration import DepthRegistration, registration_of
@@ -54,8 +54,9 @@ class RecordedLog:
         self._contents: Contents = container.contents()
         self._container = messages_unpacked(container, self._contents, notes)
         self._candidates = read_candidates(self._container, self._contents)
+        self._sidecar = SidecarFiles(choice, notes)
+        self._choice = choice = self._sidecar.choice
         self._selection = select(self._candidates, choice, path.name)
-        self._sidecar, self._choice = SidecarFiles(choice, notes), choice
         topics = {c.channel.topic: self._contents.files.get(c.channel.topic, {}) for c in self._candidates}
         self._masks = masks_of(choice.masks, topics, self._selection.image, self._selection.right)
 
@@ -292,6 +293,8 @@ class RecordedLog:
         logged, size = self._images.first(image, [*content.places], self._path.name)
         frame = self._optical(logged)
         known = self._sidecar.camera(image.topic)
+        if known and known.topic and not self._contents.body and not named_for([known], image.topic):
+            notes.add(f"The calibration is of {known.topic} by its file; {image.topic} takes it all the same.")
         calibration = known.calibration if known else content.calibration
         camera = camera_of(image.topic, calibration, size, notes)
         for masks in self._masks:

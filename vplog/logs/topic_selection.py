@@ -78,7 +78,7 @@ class TopicChoice(Settings):
     transforms have no base_link; its clock is that of the images' stamps."""
     calibration_file: Path | None = None
     """YAML file beside the log that calibrates the camera, or both of a pair: ROS camera_info, a Kalibr camchain or
-    EuRoC's sensor.yaml."""
+    EuRoC's sensor.yaml; and those further cameras that it names."""
     gps: str | None = None
     """Topic of the satellite fixes; an empty string uses none."""
     mask: str | None = None
@@ -109,6 +109,11 @@ class TopicChoice(Settings):
         own |= {"mask": self.mask_topics.get(topic), "mask_topics": {}}
         masks = {image: path for image, path in self.masks.items() if image}
         return self.model_copy(update={**own, "image": topic, "masks": masks})
+
+    @property
+    def of_further_camera(self) -> bool:
+        """Whether it is by `of_camera`: others leave `cameras` out beside an image topic."""
+        return self.image is not None and self.cameras == ()
 
     @property
     def files(self) -> dict[str, Path]:
