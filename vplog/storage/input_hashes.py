@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import cast
@@ -72,8 +73,25 @@ def _named(drive: Path | Sequence[Path]) -> list[tuple[str, Path]]:
     named = [
         (str(file.relative_to(path)) if path.is_dir() else file.name, file)
         for path in files_of(drive)
-        for file in (sorted(one for one in path.rglob("*") if one.is_file()) if path.is_dir() else [path])
+        for file in (sorted(_below(path)) if path.is_dir() else [path])
     ]
     if wrong := [file for name, file in named if not is_unicode(name)]:
         raise LogError(f"{wrong[0]} has a name that is not UTF-8, which records are. Rename it.")
     return named
+
+
+def _below(folder: Path) -> list[Path]:
+    """The files in a folder and in those below it, behind links too, as logs are read, but each folder once: a link may
+    lead back to one that holds it."""
+    if isinstance(folder, RemotePath):
+        return [one for one in folder.rglob("*") if one.is_file()]
+    found, real = list[Path](), folder.resolve()
+    visited = {*map(str, real.parents)}
+    for place, folders, names in os.walk(folder, followlinks=True):
+        if (own := os.path.realpath(place)) in visited:
+            folders.clear()
+            continue
+        visited.add(own)
+        folders.sort()
+        found += [file for name in names if (file := Path(place, name)).is_file()]
+    return found
