@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,7 @@ from tests.logs.test_datasets import (
     K,
     check_frames,
     check_truth,
+    colmap,
     images,
     numbers,
     poses,
@@ -28,6 +30,7 @@ from vplog import logs
 from vplog.logs import TopicChoice
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
 
@@ -93,3 +96,25 @@ def test_the_chosen_calibration_has_the_unit_of_vslam_labs_depth(tmp_path: Path)
     depth = next(iter(log.frames(log.stamps()[:1]))).decode().depth
     assert depth is not None
     assert depth[1, 1] == pytest.approx(0.5)
+
+
+def vslam_lab_without_mounts(root: Path) -> None:
+    vslam_lab(root)
+    file = root / "calibration.yaml"
+    text(file, re.sub(r",\s*T_BS: \[.*\]", "", file.read_text()))
+
+
+def vslam_lab_of_orb_slam(root: Path) -> None:
+    recording(root)
+    text(root / "calibration.yaml", *ORB)
+
+
+@pytest.mark.parametrize("write", [recording, colmap, vslam_lab_without_mounts, vslam_lab_of_orb_slam])
+def test_where_nothing_places_the_camera_it_is_the_body(write: Callable[[Path], None], tmp_path: Path) -> None:
+    """Whose poses are the truth, also where visual odometry is used."""
+    write(tmp_path / "drive")
+    text(tmp_path / "orb.yaml", *ORB)
+    chosen = tmp_path / "orb.yaml" if write is recording else None
+    log = logs.open(tmp_path / "drive", TopicChoice(calibration_file=chosen))
+    assert log.odometry() is None
+    np.testing.assert_allclose(log.camera().body_from_camera, np.eye(4), atol=1e-12)

@@ -13,7 +13,7 @@ from vplog.data import Floats, Trajectory
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.calibration_file import read_calibrations
-from vplog.logs.datasets.streams import DataSet, calibration_stream, camera_streams
+from vplog.logs.datasets.streams import DataSet, calibration_stream, camera_streams, mount_stream
 from vplog.logs.datasets.text_tables import lines_of
 from vplog.logs.image_folder import named_stamps, natural_order
 from vplog.logs.tf_odometry import are_usable
@@ -70,6 +70,7 @@ def read(path: Path) -> DataSet:
         known = [cameras[one.camera].calibration for one in group]  # COLMAP may have a camera for every image
         streams += [*camera_streams(topic, stamp_ns, files, None), calibration_stream(topic, stamp_ns, known)]
     stamp_ns, rows = np.unique(named_stamps([folder / one.name for one in groups[main]])[0], return_index=True)
+    streams.append(mount_stream(folder.name if main == "." else main, stamp_ns[:1], np.eye(4)))
     values = np.array([groups[main][row].pose for row in rows], np.float64)
     camera_from_world: Floats = se3.pose(se3.rotation(values[:, [1, 2, 3, 0]]), values[:, 4:])
     return DataSet("colmap", streams, Trajectory(stamp_ns, se3.inverse(camera_from_world)), [_UNITS])

@@ -10,7 +10,7 @@ from stat import S_ISREG
 
 import numpy as np
 
-from vplog.data import Bytes, Float32s, Gps, Ints, Trajectory
+from vplog.data import Bytes, Float32s, Floats, Gps, Ints, Trajectory
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.calibrations.camera import CalibratedCamera
@@ -121,11 +121,16 @@ def camera_streams(
     found, first = [Stream(channel, stamp_ns, message, length, files)], stamp_ns[:1]
     if camera is not None and len(first):
         found.append(calibration_stream(topic, first, [camera.calibration]))
-        if (pose := camera.body_from_camera) is not None:
-            turn = se3.quaternion(pose[:3, :3]).tolist()
-            placed = PoseMessage(int(first[0]), BODY, topic, pose[:3, 3].tolist(), turn, None)
-            found.append(Stream(Channel("tf_static", "tf2_msgs/TFMessage", "ros1"), first, lambda _: [placed]))
+        if camera.body_from_camera is not None:
+            found.append(mount_stream(topic, first, camera.body_from_camera))
     return found
+
+
+def mount_stream(topic: str, stamp_ns: Ints, body_from_camera: Floats) -> Stream:
+    """The place (4, 4) on the body of the camera of an image topic, at each stamp."""
+    turn, shift = se3.quaternion(body_from_camera[:3, :3]).tolist(), body_from_camera[:3, 3].tolist()
+    channel = Channel("tf_static", "tf2_msgs/TFMessage", "ros1")
+    return Stream(channel, stamp_ns, lambda row: [PoseMessage(int(stamp_ns[row]), BODY, topic, shift, turn, None)])
 
 
 def calibration_stream(topic: str, stamp_ns: Ints, known: Sequence[CalibrationMessage]) -> Stream:

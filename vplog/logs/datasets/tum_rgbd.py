@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from vplog.logs.calibrations.camera import CalibratedCamera, pinhole
-from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, depth_stream
+from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, depth_stream, mount_stream
 from vplog.logs.datasets.text_tables import listed_images, poses_of
 
 _PER_M = 5000.0
@@ -43,8 +43,12 @@ def read(path: Path, depth_per_m: float | None = None) -> DataSet:
 def listed_streams(
     path: Path, camera: CalibratedCamera | None, depth_per_m: float | None
 ) -> tuple[list[Stream], list[str]]:
-    """The streams of rgb.txt and depth.txt, and remarks. Raises LogError."""
-    streams, remarks = camera_streams("rgb", *listed_images(path / "rgb.txt", path, 10**9), camera), []
+    """The streams of rgb.txt and depth.txt, the camera at the body where it is not placed, and remarks. Raises
+    LogError."""
+    stamp_ns, files = listed_images(path / "rgb.txt", path, 10**9)
+    streams, remarks = camera_streams("rgb", stamp_ns, files, camera), []
+    if camera is None or camera.body_from_camera is None:
+        streams.append(mount_stream("rgb", stamp_ns[:1], np.eye(4)))
     if (path / "depth.txt").is_file():
         per_m = depth_per_m or (camera and camera.depth_per_m)
         if per_m is None:
@@ -61,4 +65,4 @@ def _calibration(path: Path) -> CalibratedCamera | None:
     if named is None:
         return None
     focal, centre, lens = (np.array(values, np.float64) for values in _CALIBRATIONS[named[1]])
-    return CalibratedCamera("rgb", "", pinhole(focal, centre, _SIZE, "plumb_bob", lens), None, np.eye(4), _PER_M)
+    return CalibratedCamera("rgb", "", pinhole(focal, centre, _SIZE, "plumb_bob", lens), depth_per_m=_PER_M)

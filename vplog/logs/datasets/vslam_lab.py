@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from vplog.errors import LogError
 from vplog.logs.calibration_file import read_calibrations
 from vplog.logs.calibrations.camera import CalibratedCamera
 from vplog.logs.datasets import tum_rgbd
-from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, depth_stream, imu_stream
+from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, depth_stream, imu_stream, mount_stream
 from vplog.logs.datasets.text_tables import header_of, listed_images, poses_of, unit_ns
 
 
@@ -18,8 +20,8 @@ def roots(path: Path) -> list[Path]:
 
 
 def read(path: Path, depth_per_m: float | None = None) -> DataSet:
-    """The body is that of T_BS. `depth_per_m` are counts of a metre in the depth images, None as calibration.yaml has
-    them. Raises LogError."""
+    """The body is that of T_BS, without one the first camera. `depth_per_m` are counts of a metre in the depth
+    images, None as calibration.yaml has them. Raises LogError."""
     calibration = path / "calibration.yaml"
     cameras = {one.name: one for one in read_calibrations(calibration)} if calibration.is_file() else {}
     if (path / "rgb.csv").is_file():
@@ -52,6 +54,8 @@ def _columns(path: Path, cameras: dict[str, CalibratedCamera], depth_per_m: floa
         image = topic.replace("depth", "rgb")
         camera = cameras.get(image, cameras.get(image.replace("rgb", "Camera")))  # before its list of cameras
         if not topic.startswith("depth"):
+            if not streams and not any(one.body_from_camera is not None for one in cameras.values()):
+                streams.append(mount_stream(topic, listed[0][:1], np.eye(4)))
             streams += camera_streams(topic, *listed, camera)
         elif per_m := depth_per_m or (camera and camera.depth_per_m):
             streams.append(depth_stream(topic, *listed, per_m, image))
