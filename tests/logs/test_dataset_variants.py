@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+import shutil
+import sqlite3
+from contextlib import closing
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +30,7 @@ from tests.logs.test_datasets import (
     write_images,
 )
 from vplog import logs
+from vplog.errors import LogError
 from vplog.logs import TopicChoice
 
 if TYPE_CHECKING:
@@ -118,3 +122,28 @@ def test_where_nothing_places_the_camera_it_is_the_body(write: Callable[[Path], 
     log = logs.open(tmp_path / "drive", TopicChoice(calibration_file=chosen))
     assert log.odometry() is None
     np.testing.assert_allclose(log.camera().body_from_camera, np.eye(4), atol=1e-12)
+
+
+def pictures(root: Path) -> None:
+    write_images(root, [f"{row}.png" for row in range(COUNT)], images())
+
+
+@pytest.mark.parametrize(("write", "name"), [(colmap, "database.db"), (pictures, "digikam4.db")])
+def test_a_database_beside_pictures_is_no_log(write: Callable[[Path], None], name: str, tmp_path: Path) -> None:
+    write(tmp_path)
+    with closing(sqlite3.connect(tmp_path / name)) as database, database:
+        database.execute("CREATE TABLE images (name TEXT)")
+    logs.check(tmp_path)
+    assert len(logs.open(tmp_path).stamps()) == COUNT
+    for place in [file for file in tmp_path.iterdir() if file.name != name]:
+        shutil.rmtree(place) if place.is_dir() else place.unlink()
+    with pytest.raises(LogError, match="an SQLite file"):
+        logs.open(tmp_path)
+
+
+def test_an_imu_that_nothing_places_is_not_taken_to_be_the_camera(tmp_path: Path) -> None:
+    vslam_lab_without_mounts(tmp_path)
+    text(tmp_path / "imu_0.csv", "ts (ns),wx,wy,wz,ax,ay,az", *(f"{stamp},0,0,0.1,0,0,9.8" for stamp in STAMPS))
+    log = logs.open(tmp_path)
+    assert log.imu() is None
+    assert "imu_0: the static transforms do not place it" in " ".join(log.warnings)

@@ -244,7 +244,8 @@ def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> RecordedLog:
     logs = [file for file in files if _magic(file) in (*_READERS, "zstd")]
     if [log.name for log in logs] == ["result.mcap"] and (path / "run.json").is_file():
         raise LogError(_no_folder(path, files))
-    if logs:
+    databases = all(_magic(log) == "ros2-db3" and ".db3" not in log.name.lower() for log in logs)
+    if logs and not (databases and (_data_sets(path) or _images_in(path, files))):  # COLMAP's, a catalogue of pictures
         return _open_found(path, logs, problem or f"{path.name} has no metadata.yaml", choice, notes)
     if problem:
         raise LogError(f"{problem} Copy the whole bag folder, or give a storage file itself.")

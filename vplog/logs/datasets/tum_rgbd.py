@@ -36,6 +36,7 @@ def read(path: Path, depth_per_m: float | None = None) -> DataSet:
     """The body is the colour camera, whose poses are the truth. `depth_per_m` are counts of a metre in the depth
     images, where they are known. Raises LogError."""
     streams, remarks = listed_streams(path, _calibration(path), depth_per_m)
+    streams.append(mount_stream("rgb", streams[0].stamp_ns[:1], np.eye(4)))
     truth = path / "groundtruth.txt"
     return DataSet("tum-rgbd", streams, poses_of(truth, 10**9) if truth.is_file() else None, remarks)
 
@@ -43,12 +44,8 @@ def read(path: Path, depth_per_m: float | None = None) -> DataSet:
 def listed_streams(
     path: Path, camera: CalibratedCamera | None, depth_per_m: float | None
 ) -> tuple[list[Stream], list[str]]:
-    """The streams of rgb.txt and depth.txt, the camera at the body where it is not placed, and remarks. Raises
-    LogError."""
-    stamp_ns, files = listed_images(path / "rgb.txt", path, 10**9)
-    streams, remarks = camera_streams("rgb", stamp_ns, files, camera), []
-    if camera is None or camera.body_from_camera is None:
-        streams.append(mount_stream("rgb", stamp_ns[:1], np.eye(4)))
+    """The streams of rgb.txt and depth.txt, and remarks. Raises LogError."""
+    streams, remarks = camera_streams("rgb", *listed_images(path / "rgb.txt", path, 10**9), camera), []
     if (path / "depth.txt").is_file():
         per_m = depth_per_m or (camera and camera.depth_per_m)
         if per_m is None:

@@ -20,8 +20,8 @@ def roots(path: Path) -> list[Path]:
 
 
 def read(path: Path, depth_per_m: float | None = None) -> DataSet:
-    """The body is that of T_BS, without one the first camera. `depth_per_m` are counts of a metre in the depth
-    images, None as calibration.yaml has them. Raises LogError."""
+    """The body is that of T_BS; without one the IMU, or else the first camera. `depth_per_m` are counts of a
+    metre in the depth images, None as calibration.yaml has them. Raises LogError."""
     calibration = path / "calibration.yaml"
     cameras = {one.name: one for one in read_calibrations(calibration)} if calibration.is_file() else {}
     if (path / "rgb.csv").is_file():
@@ -29,7 +29,9 @@ def read(path: Path, depth_per_m: float | None = None) -> DataSet:
     else:  # before 2025: one camera, in the lists of TUM RGB-D
         streams, remarks = tum_rgbd.listed_streams(path, next(iter(cameras.values()), None), depth_per_m)
     if (imu := path / "imu_0.csv").is_file():
-        streams.append(imu_stream("imu_0", imu))
+        streams.append(imu_stream("imu_0", imu))  # of the body, so that only T_BS places a camera
+    elif all(one.body_from_camera is None for one in cameras.values()):
+        streams += [mount_stream(one.channel.topic, one.stamp_ns[:1], np.eye(4)) for one in streams[:1]]
     truth = None
     if (table := path / "groundtruth.csv").is_file():
         truth = poses_of(table, unit_ns(header_of(table)[0]))
@@ -54,8 +56,6 @@ def _columns(path: Path, cameras: dict[str, CalibratedCamera], depth_per_m: floa
         image = topic.replace("depth", "rgb")
         camera = cameras.get(image, cameras.get(image.replace("rgb", "Camera")))  # before its list of cameras
         if not topic.startswith("depth"):
-            if not streams and not any(one.body_from_camera is not None for one in cameras.values()):
-                streams.append(mount_stream(topic, listed[0][:1], np.eye(4)))
             streams += camera_streams(topic, *listed, camera)
         elif per_m := depth_per_m or (camera and camera.depth_per_m):
             streams.append(depth_stream(topic, *listed, per_m, image))
