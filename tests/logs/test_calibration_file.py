@@ -153,9 +153,9 @@ def imu_messages(frame: str, gravity: float) -> list[Written]:
     return [Written("/imu", kind, stamp, message(kind, header=header(stamp, frame), **values)) for stamp in stamps]
 
 
-def with_imu(folder: Path, found: list[Written], frame: str = "imu", gravity: float = 9.8) -> Log:
-    """A log with an IMU of this frame, and the file that Kalibr makes of the two."""
-    tree = {"cam0": kalibr()["cam0"] | {"T_cam_imu": np.linalg.inv(RIGHT_FROM_LEFT).tolist()}}
+def with_imu(folder: Path, found: list[Written], frame: str = "imu", gravity: float = 9.8, **more: Any) -> Log:
+    """A log with an IMU of this frame, and the file that Kalibr makes of the two, with `more` of its camera."""
+    tree = {"cam0": kalibr()["cam0"] | {"T_cam_imu": np.linalg.inv(RIGHT_FROM_LEFT).tolist(), **more}}
     ordered = sorted([*found, *imu_messages(frame, gravity)], key=lambda m: m.stamp_ns)
     file = write(folder / "chain.yaml", tree)
     return logs.open(write_ros2(folder / "drive", ordered), TopicChoice(calibration_file=file))
@@ -187,6 +187,82 @@ def test_kalibrs_imu_is_placed_on_the_body_of_the_odometry(placed: str, frame: s
     body_from_imu = drive.body_from_camera if placed else np.eye(4)
     np.testing.assert_allclose(log.camera().body_from_camera, body_from_imu @ RIGHT_FROM_LEFT, atol=1e-9)
     assert ("calibration's IMU is taken to be base_link" in " ".join(log.warnings)) == (not placed and frame == "imu")
+
+
+@pytest.mark.parametrize("shift_s", [0.025, -0.004, 0.0])
+def test_kalibrs_time_shift_puts_the_imu_on_the_cameras_clock(shift_s: float, tmp_path: Path) -> None:
+    """t_imu = t_cam + timeshift_cam_imu."""
+    found = [m for m in ros_messages(Drive(), 2) if m.topic not in ("/tf_static", "/odom", "/fix")]
+    imu = with_imu(tmp_path, found, timeshift_cam_imu=shift_s).imu()
+    assert imu is not None
+    np.testing.assert_array_equal(Drive().stamp_ns - imu.stamp_ns, round(shift_s * 1e9))
+    chain = {"cam0": kalibr()["cam0"] | {"timeshift_cam_imu": 1e12}}
+    with pytest.raises(LogError, match="longer than an hour"):
+        read_calibrations(write(tmp_path / "long.yaml", chain))
+
+
+def test_the_body_of_a_data_sets_calibration_is_that_of_the_odometry(tmp_path: Path) -> None:
+    """It is no IMU that the log's transforms place elsewhere on that body; which one Kalibr's is, a line says."""
+    found = ros_messages(Drive(), 2)
+    found[0].message.transforms[1].child_frame_id = "imu"
+    log = with_imu(tmp_path, found)
+    log.camera()
+    assert "The calibration's IMU is taken to be that of /imu." in log.warnings
+    sensor = kalibr()["cam0"] | {"T_BS": matrix(RIGHT_FROM_LEFT)}
+    for tree in (sensor, {"cameras": [sensor | {"focal_length": [150, 151], "principal_point": [31, 22]}]}):
+        file = write(tmp_path / "sensor.yaml", tree)
+        log = logs.open(tmp_path / "drive", TopicChoice(calibration_file=file))
+        assert log.odometry() is not None
+        np.testing.assert_allclose(log.camera().body_from_camera, RIGHT_FROM_LEFT, atol=1e-9)
+
+
+def orb_slam(**more: Any) -> dict:
+    """Settings of a pair whose Camera.fx is of the rectified images, in the form of ORB-SLAM 2."""
+    shared = {"Camera.fx": 140.0, "Camera.fy": 140.0, "Camera.cx": 30.0, "Camera.cy": 20.0, "Camera.bf": 14.0}
+    sides = {}
+    for side, (fx, shift) in {"LEFT": (150.0, 0.0), "RIGHT": (152.0, -14.0)}.items():
+        sides |= {
+            f"{side}.height": HEIGHT, f"{side}.width": WIDTH, f"{side}.D": matrix([D]), f"{side}.R": matrix(np.eye(3)),
+            f"{side}.K": matrix([[fx, 0, 31], [0, 151, 22], [0, 0, 1]]),
+            f"{side}.P": matrix([[140, 0, 30, shift], [0, 140, 20, 0], [0, 0, 1, 0]]),
+        }  # fmt: skip
+    return shared | sides | more
+
+
+def test_orb_slams_raw_lenses_are_those_of_the_images(tmp_path: Path) -> None:
+    path = write(tmp_path / "EuRoC.yaml", orb_slam(Tbc=matrix(RIGHT_FROM_LEFT)))
+    left, right = read_calibrations(path)
+    np.testing.assert_array_equal(left.calibration.matrix, K)
+    np.testing.assert_array_equal(left.calibration.distortion, D)
+    assert right.calibration.projection[0, 3] == -14.0
+    assert (left.calibration.width, left.calibration.height) == (WIDTH, HEIGHT)
+    assert left.body_from_camera is not None
+    np.testing.assert_allclose(left.body_from_camera, RIGHT_FROM_LEFT, atol=1e-9)
+    for topic in ("cam1", "/stereo/right/image_raw", "image_1"):
+        assert camera_for([left, right], topic, path) is right
+    assert camera_for([left, right], "/cam0/image_raw", path) is left
+    with pytest.raises(LogError, match="LEFT, RIGHT"):
+        camera_for([left, right], "/front", path)
+
+
+def test_the_imu_of_openvins_and_of_orb_slam_3(tmp_path: Path) -> None:
+    chain = kalibr()
+    for part, placed in zip(chain.values(), (np.eye(4), np.linalg.inv(RIGHT_FROM_LEFT)), strict=True):
+        part |= {"T_imu_cam": placed.tolist()}
+    chain["cam1"].pop("T_cn_cnm1")
+    _, second = read_calibrations(write(tmp_path / "kalibr_imucam_chain.yaml", chain))
+    assert second.body_from_camera is not None
+    assert second.from_first is not None
+    np.testing.assert_allclose(second.body_from_camera, np.linalg.inv(RIGHT_FROM_LEFT), atol=1e-6)
+    np.testing.assert_allclose(second.from_first, RIGHT_FROM_LEFT, atol=1e-6)
+    numbers = {"fx": 150.0, "fy": 151.0, "cx": 31.0, "cy": 22.0}
+    tree = {f"{name}.{one}": value for name in ("Camera1", "Camera2") for one, value in numbers.items()}
+    tree |= {"IMU.T_b_c1": matrix(RIGHT_FROM_LEFT), "Stereo.T_c1_c2": matrix(np.linalg.inv(RIGHT_FROM_LEFT))}
+    first, second = read_calibrations(write(tmp_path / "orb3.yaml", tree))
+    assert first.body_from_camera is not None
+    assert second.from_first is not None
+    np.testing.assert_allclose(first.body_from_camera, RIGHT_FROM_LEFT, atol=1e-6)
+    np.testing.assert_allclose(second.from_first, RIGHT_FROM_LEFT, atol=1e-6)
 
 
 def test_camchain_makes_a_pair_without_any_calibration_in_the_log(tmp_path: Path) -> None:

@@ -15,10 +15,12 @@ from vplog.logs.calibrations.text_kinds import colmap_binary, colmap_text, kitti
 from vplog.logs.calibrations.yaml_kinds import load_tree, yaml_cameras
 from vplog.logs.continuity import without_jumps
 from vplog.logs.formats.container import Notes
-from vplog.logs.topic_selection import TopicChoice
+from vplog.logs.topic_selection import PAIRS, TopicChoice
 
 _LARGEST = 1_000_000
 """Bytes; a calibration has some kB, and the parser is not to be blown up."""
+_SIDES = {"LEFT": 0, "RIGHT": 1, "Camera1": 0, "Camera2": 1}
+"""Names of the cameras of a pair in the settings of ORB-SLAM 2 and 3, by their place in PAIRS."""
 _KINDS = (
     "A calibration is YAML (ROS camera_info, OpenCV, Kalibr, EuRoC, VSLAM-LAB, ORB-SLAM), KITTI's calib.txt or "
     "COLMAP's cameras.txt or cameras.bin"
@@ -95,6 +97,8 @@ def camera_for(cameras: list[CalibratedCamera], topic: str, path: Path) -> Calib
 
 
 def named_for(cameras: list[CalibratedCamera], topic: str) -> list[CalibratedCamera]:
-    """Those that have the topic of images, or else a name in it."""
+    """Those that have the topic of images, or else a name in it; of ORB-SLAM's two by words for left and right."""
     named = [c for c in cameras if c.topic and (topic == c.topic or topic.startswith(f"{c.topic.rstrip('/')}/"))]
-    return named or [c for c in cameras if c.name in topic.strip("/").split("/")]
+    named = named or [c for c in cameras if c.name in topic.strip("/").split("/")]
+    sides = {number for pair in PAIRS for number, word in enumerate(pair) if word in topic}
+    return named or [c for c in cameras if _SIDES.get(c.name) in sides]

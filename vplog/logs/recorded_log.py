@@ -184,6 +184,9 @@ class RecordedLog:
             )
             self._notes.add(f"{topic}: {why}; visual odometry does without its measurements.")
             return None
+        if known is not None and known.timeshift_cam_imu_s:
+            stamp_ns = stamp_ns - round(known.timeshift_cam_imu_s * 1e9)
+            self._notes.add(f"{topic} is shifted by its calibration's {known.timeshift_cam_imu_s * 1e3:.1f} ms.")
         gyro, accel = values[finite, :3], values[finite, 3:]
         return Imu(topic, stamp_ns[finite], gyro, accel, camera.body_from_camera @ placed)
 
@@ -196,6 +199,7 @@ class RecordedLog:
         imus = [c for c in self._candidates if c.role == "imu" and self._choice.imu in (None, c.channel.topic)]
         for one in sorted(imus, key=lambda c: -c.count):
             if one.frame and (placed := self._content.tree.between(body, one.frame)) is not None:
+                self._notes.add(f"The calibration's IMU is taken to be that of {one.channel.topic}.")
                 return placed
         self._notes.add(f"No static transforms place an IMU on {body}; the calibration's IMU is taken to be {body}.")
         return np.eye(4)
@@ -303,7 +307,8 @@ class RecordedLog:
         named = body and frame and frame == logged and content.tree.between(body, frame) is not None
         visual = camera.matrix is not None or self._contents.names is None
         if known is not None and known.body_from_camera is not None and not named:
-            camera = replace(camera, body_from_camera=self._body_from_calibrated_imu() @ known.body_from_camera)
+            placed = self._body_from_calibrated_imu() if known.body_is_imu else np.eye(4)
+            camera = replace(camera, body_from_camera=placed @ known.body_from_camera)
         elif self.odometry() is not None or content.chosen.lidar is not None or visual:
             ahead = self.odometry() is None  # it is computed then
             ahead |= any(source.used and source.kind in ("gps", "twist") for source in content.sources)

@@ -7,7 +7,7 @@ Static transforms are those of all topics whose name ends in `static`. Of severa
 other parts the first by these rules does, unless TopicChoice names another:
 - image: encodings that can be decoded first, thermal cameras last, then calibrated ones, then those that are not the
   right one of a pair, then those that do not look back by their name, then most messages, then name;
-- right: the topic named like the image's with `right` for `left` (or another of _PAIRS), where no depth is used;
+- right: the topic named like the image's with `right` for `left` (or another of PAIRS), where no depth is used;
 - depth: with the image's frame_id first, then the longest namespace in common with it, then most messages, then name;
 - camera_info: of those whose namespace holds the image (`/cam0/camera_info` and `/cam0/image_raw/compressed`), else of
   those with the image's frame_id: longest namespace in common, then the same frame_id, calibrated, most messages, name;
@@ -215,7 +215,7 @@ _NAMES = {
 }  # fmt: skip
 _ROLES = {"right": "image", "mask": "image"}
 """Parts whose topics are candidates of another part until topics are assigned."""
-_PAIRS = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("infra1", "infra2"), ("cam0", "cam1"),
+PAIRS = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("infra1", "infra2"), ("cam0", "cam1"),
           ("image_0", "image_1"), ("image_2", "image_3"), ("rgb_0", "rgb_1"))  # fmt: skip
 """Words that tell the topics of a stereo pair apart: most drivers', RealSense's, EuRoC's, KITTI's and VSLAM-LAB's."""
 _BACKWARD = re.compile(r"(?<![a-z])(back|rear)(?![a-z])", re.IGNORECASE)
@@ -397,7 +397,7 @@ def _geometry(c: Candidate, choice: TopicChoice) -> tuple[float, float] | None:
 
 def _partner(image: Candidate, usable: list[Candidate], back: bool = False) -> Candidate | None:
     """The right image topic of a pair whose left one is `image`, or back, the left one of the right."""
-    for left, right in _PAIRS:
+    for left, right in PAIRS:
         here, there = (right, left) if back else (left, right)
         name = image.channel.topic.replace(here, there)
         if here in image.channel.topic:

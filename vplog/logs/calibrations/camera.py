@@ -33,7 +33,11 @@ class CalibratedCamera:
     from_first: Floats | None = None
     """(4, 4) this camera from the first one of the chain; None where the file has no chain."""
     body_from_camera: Floats | None = None
-    """(4, 4) where the IMU is the body, as EuRoC and Kalibr have it; None where the file has none."""
+    """(4, 4) None where the file has none."""
+    body_is_imu: bool = False
+    """Whether that body is the IMU by the kind of the file, as in Kalibr's, and not what a data set takes for it."""
+    timeshift_cam_imu_s: float = 0.0
+    """s that the IMU's stamps are later than the camera's: Kalibr's t_imu = t_cam + shift."""
     depth_per_m: float | None = None
     """Counts of a metre in the camera's depth images; None where the file does not name it."""
 

@@ -27,6 +27,8 @@ from vplog.logs.messages.records import CalibrationMessage
 _VSLAM_LAB = {"camera_model": "cam_model", "resolution": "image_dimension", "distortion_model": "distortion_type"}
 """VSLAM-LAB's names of what Kalibr has, by Kalibr's."""
 _SECTION = re.compile(r"(Camera\d?)\.fx")
+_LONGEST_S = 3600.0
+"""s between the clocks of camera and IMU, at most."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -54,23 +56,33 @@ def yaml_cameras(tree: dict) -> list[CalibratedCamera]:
         return [CalibratedCamera("camera", "", _intrinsics(tree), body_from_camera=placed)]
     if isinstance(listed := tree.get("cameras"), list):
         return [_listed(part) for part in listed if isinstance(part, dict)]
+    if "LEFT.K" in tree:  # Camera.fx is of the images that ORB-SLAM 2 makes of these (its Examples/Stereo/EuRoC.yaml)
+        return [_raw(tree, side) for side in ("LEFT", "RIGHT") if f"{side}.K" in tree]
     if sections := [match[1] for name in tree if isinstance(name, str) and (match := _SECTION.fullmatch(name))]:
         return _settings(tree, sections)
     return _chain(tree)
 
 
 def _chain(tree: dict) -> list[CalibratedCamera]:
-    """Kalibr's camchain: each camera by the one before it (github.com/ethz-asl/kalibr/wiki/yaml-formats)."""
+    """Kalibr's camchain: each camera by the one before it (github.com/ethz-asl/kalibr/wiki/yaml-formats); and that of
+    OpenVINS, with `T_imu_cam`."""
     chain = [(name, part) for name, part in tree.items() if isinstance(part, dict) and "intrinsics" in part]
     if not chain:
         raise BadCalibrationError("it has neither camera_matrix nor intrinsics")
-    found, from_first = [], np.eye(4)
-    for number, (name, part) in enumerate(chain):
-        step = rigid_of(part["T_cn_cnm1"]) if "T_cn_cnm1" in part else None
-        from_first = from_first if number == 0 else (None if step is None or from_first is None else step @ from_first)
+    found, from_first = list[CalibratedCamera](), np.eye(4)
+    for name, part in chain:
         placed = se3.inverse(rigid_of(part["T_cam_imu"])) if "T_cam_imu" in part else None
-        topic = text_of(part.get("rostopic"))
-        found.append(CalibratedCamera(text_of(name), topic, _intrinsics(part), from_first, placed))
+        placed = rigid_of(part["T_imu_cam"]) if "T_imu_cam" in part else placed
+        step = rigid_of(part["T_cn_cnm1"]) if "T_cn_cnm1" in part else None
+        if step is None and found and placed is not None and (last := found[-1].body_from_camera) is not None:
+            step = se3.inverse(placed) @ last
+        if found:
+            from_first = None if step is None or from_first is None else step @ from_first
+        topic, shift_s = text_of(part.get("rostopic")), float(numbers_of([part.get("timeshift_cam_imu", 0.0)], 1)[0])
+        if abs(shift_s) > _LONGEST_S:
+            raise BadCalibrationError(f"its timeshift_cam_imu of {shift_s:g} s is longer than an hour")
+        known = _intrinsics(part)
+        found.append(CalibratedCamera(text_of(name), topic, known, from_first, placed, True, shift_s))
     return found
 
 
@@ -113,13 +125,42 @@ def _listed(part: dict) -> CalibratedCamera:
     named = {kalibrs: part[own] for kalibrs, own in _VSLAM_LAB.items() if own in part}
     calibration = _intrinsics(part | named | {"intrinsics": [*focal, *centre]})
     placed = rigid_of(part["T_BS"]) if "T_BS" in part else None
-    return CalibratedCamera(text_of(part.get("cam_name")), "", calibration, None, placed, _per_m(part, "depth_factor"))
+    per_m = _per_m(part, "depth_factor")
+    return CalibratedCamera(text_of(part.get("cam_name")), "", calibration, body_from_camera=placed, depth_per_m=per_m)
 
 
 def _settings(tree: dict, sections: list[str]) -> list[CalibratedCamera]:
     """The settings of ORB-SLAM 2 and 3, and of VSLAM-LAB before its list of cameras."""
     per_m = _per_m(tree, "RGBD.DepthMapFactor", "DepthMapFactor", "Depth0.factor")
-    return [CalibratedCamera(name, "", _section(tree, name), depth_per_m=per_m) for name in sections]
+    from_first, mounts = {sections[0]: np.eye(4)}, {sections[0]: _mount(tree)}
+    if "Stereo.T_c1_c2" in tree:
+        from_first["Camera2"] = se3.inverse(rigid_of(tree["Stereo.T_c1_c2"]))
+    return [
+        CalibratedCamera(
+            name, "", _section(tree, name), from_first.get(name), mounts.get(name), True, depth_per_m=per_m
+        )
+        for name in sections
+    ]
+
+
+def _raw(tree: dict, side: str) -> CalibratedCamera:
+    """A camera of a pair before it is rectified, with the R and P by which it is."""
+    info = {"camera": "K", "rectification": "R", "projection": "P"}
+    named = {f"{name}_matrix": tree[f"{side}.{own}"] for name, own in info.items() if f"{side}.{own}" in tree}
+    size = {f"image_{name}": tree.get(f"{side}.{name}", tree.get(f"Camera.{name}", 0)) for name in ("width", "height")}
+    lens = {"distortion_coefficients": tree.get(f"{side}.D", []), "distortion_model": _lens(tree, side)}
+    mount = _mount(tree) if side == "LEFT" else None
+    return CalibratedCamera(side, "", _camera_info(named | size | lens), None, mount, True)
+
+
+def _mount(tree: dict) -> Floats | None:
+    """(4, 4) IMU from the first camera, as ORB-SLAM 3 has it since 1.0, and before; None without."""
+    return next((rigid_of(tree[name]) for name in ("IMU.T_b_c1", "Tbc") if name in tree), None)
+
+
+def _lens(tree: dict, name: str) -> str:
+    kind = text_of(tree.get("Camera.type", tree.get(f"{name}.model")))
+    return "equidistant" if lens_of(kind) == "equidistant" else "plumb_bob"
 
 
 def _per_m(tree: dict, *names: str) -> float | None:
@@ -132,8 +173,8 @@ def _section(tree: dict, name: str) -> CalibrationMessage:
     def numbers(names: str) -> Floats:
         return numbers_of([tree.get(f"{name}.{one}", tree.get(f"Camera.{one}", 0.0)) for one in names.split()], None)
 
-    kind = text_of(tree.get("Camera.type", tree.get(f"{name}.model")))
-    model, lens = ("equidistant", "k1 k2 k3 k4") if lens_of(kind) == "equidistant" else ("plumb_bob", "k1 k2 p1 p2 k3")
+    model = _lens(tree, name)
+    lens = "k1 k2 k3 k4" if model == "equidistant" else "k1 k2 p1 p2 k3"
     width, height = np.maximum(numbers("width height"), numbers("w h"))
     size = size_of(float(width)), size_of(float(height))
     return pinhole(numbers("fx fy"), numbers("cx cy"), size, model, numbers(lens))
