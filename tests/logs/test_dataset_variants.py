@@ -6,6 +6,7 @@ import re
 import shutil
 import sqlite3
 from contextlib import closing
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +22,7 @@ from tests.logs.test_datasets import (
     check_truth,
     colmap,
     images,
+    kitti,
     numbers,
     poses,
     quaternions,
@@ -35,7 +37,6 @@ from vplog.logs import TopicChoice
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
 
 @pytest.mark.parametrize(("unit", "unit_ns"), [("s", 10**9), ("ms", 10**6), ("us", 10**3)])
@@ -139,6 +140,21 @@ def test_a_database_beside_pictures_is_no_log(write: Callable[[Path], None], nam
         shutil.rmtree(place) if place.is_dir() else place.unlink()
     with pytest.raises(LogError, match="an SQLite file"):
         logs.open(tmp_path)
+
+
+def test_a_drive_is_the_same_from_within_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kitti(tmp_path / "kitti")
+    monkeypatch.chdir(tmp_path / "kitti" / "sequences")
+    assert logs.open(Path("07")).truth() is not None
+    Path("link").symlink_to("07", target_is_directory=True)
+    assert logs.open(Path("link")).truth() is not None
+    monkeypatch.chdir("07")
+    assert logs.open(Path()).truth() is not None
+    write_images(tmp_path / "pictures", [f"{row}.png" for row in range(COUNT)], images())
+    (tmp_path / "pictures" / "notes").mkdir()
+    monkeypatch.chdir(tmp_path / "pictures" / "notes")
+    log = logs.open(Path(".."))
+    assert (log.name, log.camera().name) == ("pictures", "pictures")
 
 
 def test_an_imu_that_nothing_places_is_not_taken_to_be_the_camera(tmp_path: Path) -> None:

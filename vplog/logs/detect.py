@@ -63,6 +63,7 @@ def open(path: Path, topics: TopicChoice | None = None) -> RecordedLog:
     """The drive at `path`, its kind found by content, its topics by the rules of `topic_selection.py` or by name.
     Raises LogError where there is no log, or where a topic of `topics` is not in it."""
     path, choice, notes = located(path), topics or TopicChoice(), Notes()
+    path = path.resolve() if path.name in ("", "..") else path  # it has a name
     with _reading(path):
         _check_there(path)
         return _open_folder(path, choice, notes) if path.is_dir() else _open_file(path, choice, notes)

@@ -50,8 +50,9 @@ def read(path: Path) -> DataSet:
 def _truth(path: Path, stamp_ns: Ints) -> tuple[Trajectory | None, list[str]]:
     """poses/NN.txt beside the sequences: rows of world_from_camera (3, 4), one for each image; those without a pose are
     left out; and remarks."""
-    file = path.parent.parent / "poses" / f"{path.resolve().name}.txt"
-    if not file.is_file():
+    named = (path.absolute(), path.resolve())  # of a link both: poses are a download of their own
+    files = (one.parent.parent / "poses" / f"{one.name}.txt" for one in named)
+    if (file := next((one for one in files if one.is_file()), None)) is None:
         return None, []
     rows, remarks = rows_of(file, 12), []
     if len(rows) != len(stamp_ns):
