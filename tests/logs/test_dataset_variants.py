@@ -157,6 +157,20 @@ def test_a_drive_is_the_same_from_within_its_folder(tmp_path: Path, monkeypatch:
     assert (log.name, log.camera().name) == ("pictures", "pictures")
 
 
+@pytest.mark.parametrize("below", [".", "day"])
+def test_pictures_of_a_kind_that_is_not_read_are_counted(below: str, tmp_path: Path) -> None:
+    pictures(tmp_path / below)
+    for name in ("IMG_1.HEIC", "IMG_2.HEIC", "a.avif"):
+        (tmp_path / below / name).write_bytes(b"\0\0\0\x18ftypheic")
+    log = logs.open(tmp_path)
+    assert len(log.stamps()) == COUNT
+    assert "3 pictures of kinds that are not read left out (AVIF, HEIC)" in " ".join(log.warnings)
+    for file in (tmp_path / below).glob("*.png"):
+        file.unlink()
+    with pytest.raises(LogError, match=r"no images\. 3 pictures of kinds" if below == "." else "nothing"):
+        logs.open(tmp_path)
+
+
 def test_an_imu_that_nothing_places_is_not_taken_to_be_the_camera(tmp_path: Path) -> None:
     vslam_lab_without_mounts(tmp_path)
     text(tmp_path / "imu_0.csv", "ts (ns),wx,wy,wz,ax,ay,az", *(f"{stamp},0,0,0.1,0,0,9.8" for stamp in STAMPS))

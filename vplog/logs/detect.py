@@ -45,6 +45,8 @@ _READERS = {"mcap": McapFile, "ros1": Ros1Bag, "ros2-db3": SqliteBag}
 _DATA_SETS = (kitti, euroc, vslam_lab, tum_rgbd, colmap, utm_images)
 _LOG_NAME = re.compile(r"\.(mcap|bag|db3)(\.zstd?)?$", re.IGNORECASE)
 """Names of logs among other files: to look into each of a bucket costs a request."""
+_UNREAD = {".heic", ".heif", ".avif", ".jxl", ".jp2"}
+"""Endings of pictures that OpenCV's wheels do not decode."""
 _LISTED = 5
 """Files that an error lists."""
 _DEEPEST, _MOST_FILES = 4, 10**6
@@ -256,9 +258,9 @@ def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> RecordedLog:
     if roots:
         names = ", ".join(str(root.relative_to(path)) for root in roots[:_LISTED])
         raise LogError(f"{path} holds {len(roots)} drives of data sets. Give one of them: {names}.")
-    images = _images_in(path, files)
-    if images is not None:
+    if (images := _images_in(path, files)) is not None:
         found = read_images(path, *images, choice)
+        found.remarks.extend(_unread(files if images[0][0] in files else _files_below(path)))
         return _published(path, path.name, found, notes, choice.model_copy(update={"image": None}))
     raise LogError(_no_folder(path, files))
 
@@ -317,6 +319,17 @@ def _images_in(path: Path, files: list[Path]) -> tuple[list[Path], set[Path]] | 
     endings = {file.suffix for file in images if file.suffix}
     damaged = {file for file in files if file.suffix in endings}.difference(images)
     return ([*images, *damaged], damaged) if images else None
+
+
+def _unread(files: list[Path]) -> list[str]:
+    """A remark on pictures of kinds that are not read; none without."""
+    kinds = [file.suffix[1:].upper() for file in files if file.suffix.lower() in _UNREAD]
+    if not kinds:
+        return []
+    listed = ", ".join(sorted(set(kinds)))
+    return [
+        f"{plural(len(kinds), 'picture')} of kinds that are not read left out ({listed}). Convert them to JPEG or PNG."
+    ]
 
 
 def _files_below(path: Path) -> list[Path]:
@@ -385,7 +398,7 @@ def _no_folder(path: Path, files: list[Path]) -> str:
     if ours := [what for name, what in _RESULTS.items() if (path / name).is_file()]:
         return f"{path} is {ours[0]} that vplog wrote, not a log. Give the log of a drive."
     found = f"{plural(len(files), 'file')}, but no log and no images" if files else "nothing"
-    return f"{path} holds {found}. A log is {_KNOWN}."
+    return " ".join([f"{path} holds {found}.", *_unread(files), f"A log is {_KNOWN}."])
 
 
 def _no_log(path: Path) -> str:
