@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.logs.test_datasets import (
     COUNT,
@@ -21,12 +22,14 @@ from tests.logs.test_datasets import (
     check_frames,
     check_truth,
     colmap,
+    euroc,
     images,
     kitti,
     numbers,
     poses,
     quaternions,
     seconds,
+    sensor_yaml,
     text,
     vslam_lab,
     write_images,
@@ -169,6 +172,20 @@ def test_pictures_of_a_kind_that_is_not_read_are_counted(below: str, tmp_path: P
         file.unlink()
     with pytest.raises(LogError, match=r"no images\. 3 pictures of kinds" if below == "." else "nothing"):
         logs.open(tmp_path)
+
+
+@pytest.mark.parametrize(("turn_deg", "shift_m"), [(0.0, 0.06), (2.0, 0.06), (60.0, 0.06), (0.0, 3.0)])
+def test_a_camera_with_the_view_of_another_is_no_further_one(turn_deg: float, shift_m: float, tmp_path: Path) -> None:
+    """As KITTI's grey and colour cameras, beside one that looks elsewhere or from elsewhere."""
+    euroc(tmp_path)
+    placed = np.eye(4)
+    placed[:3, :3] = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
+    placed[0, 3] = shift_m
+    for camera in ("cam2", "cam3"):  # the same place both
+        shutil.copytree(tmp_path / "mav0" / "cam0", tmp_path / "mav0" / camera)
+        text(tmp_path / "mav0" / camera / "sensor.yaml", sensor_yaml(placed))
+    expected = ["cam2"] if turn_deg > 50 or shift_m > 1 else []
+    assert logs.open(tmp_path, TopicChoice(odometry="truth")).further_cameras() == expected
 
 
 def test_an_imu_that_nothing_places_is_not_taken_to_be_the_camera(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -46,7 +46,7 @@ _DATA_SETS = (kitti, euroc, vslam_lab, tum_rgbd, colmap, utm_images)
 _LOG_NAME = re.compile(r"\.(mcap|bag|db3)(\.zstd?)?$", re.IGNORECASE)
 """Names of logs among other files: to look into each of a bucket costs a request."""
 _UNREAD = {".heic", ".heif", ".avif", ".jxl", ".jp2"}
-"""Endings of pictures that OpenCV's wheels do not decode."""
+"""Endings of other pictures than those of `image_folder.is_image`."""
 _LISTED = 5
 """Files that an error lists."""
 _DEEPEST, _MOST_FILES = 4, 10**6
@@ -260,7 +260,8 @@ def _open_folder(path: Path, choice: TopicChoice, notes: Notes) -> RecordedLog:
         raise LogError(f"{path} holds {len(roots)} drives of data sets. Give one of them: {names}.")
     if (images := _images_in(path, files)) is not None:
         found = read_images(path, *images, choice)
-        found.remarks.extend(_unread(files if images[0][0] in files else _files_below(path)))
+        others = {*(files if images[0][0] in files else _files_below(path))}
+        found.remarks.extend(_unread(others.difference(images[0])))
         return _published(path, path.name, found, notes, choice.model_copy(update={"image": None}))
     raise LogError(_no_folder(path, files))
 
@@ -321,7 +322,7 @@ def _images_in(path: Path, files: list[Path]) -> tuple[list[Path], set[Path]] | 
     return ([*images, *damaged], damaged) if images else None
 
 
-def _unread(files: list[Path]) -> list[str]:
+def _unread(files: Collection[Path]) -> list[str]:
     """A remark on pictures of kinds that are not read; none without."""
     kinds = [file.suffix[1:].upper() for file in files if file.suffix.lower() in _UNREAD]
     if not kinds:

@@ -39,6 +39,8 @@ from vplog.logs.stamps import rows_of
 from vplog.logs.topic_candidates import read_candidates
 from vplog.logs.topic_selection import Candidate, TopicChoice, further_cameras, select, wheel_options
 
+_SAME_VIEW_RAD, _SAME_VIEW_M = np.radians(5.0), 1.0
+"""Turn and distance of two cameras below which they see the same: as far as those of a stereo head."""
 _LISTED = 8
 """Topics that an error lists."""
 
@@ -130,12 +132,23 @@ class RecordedLog:
         choice, body = self._choice, self._body or BODY
         if choice.cameras is not None or choice.image is not None:
             return list(choice.cameras or ())
-        tree, known = self._content.tree, further_cameras(self._candidates, self._selection, choice)
-        return [
-            c.channel.topic
-            for c, left in known
-            if tree.between(body, c.frame) is not None and (left is None or self._are_apart(left.frame, c.frame))
-        ]
+        tree, used = self._content.tree, self._candidate(self._selection.image)
+        found, frames = list[str](), [used.frame] if used else []
+        for c, left in further_cameras(self._candidates, self._selection, choice):
+            apart = left is None or self._are_apart(left.frame, c.frame)
+            if apart and tree.between(body, c.frame) is not None and not self._is_same_view(frames, c.frame):
+                found.append(c.channel.topic)
+                frames.append(c.frame)
+        return found
+
+    def _is_same_view(self, frames: list[str], frame: str) -> bool:
+        """Whether a camera looks the way of one of the others from beside it, as KITTI's colour ones: it costs as much
+        and sees nothing else."""
+        between = (self._content.tree.between(other, frame) for other in frames)
+        return any(
+            found is not None and se3.angle(found) < _SAME_VIEW_RAD and np.linalg.norm(found[:3, 3]) < _SAME_VIEW_M
+            for found in between
+        )
 
     def _are_apart(self, left: str, right: str) -> bool:
         """Whether two cameras, a pair by their names, look to two sides."""
