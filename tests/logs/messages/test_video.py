@@ -217,6 +217,20 @@ def test_damage_ends_at_the_next_key_frame() -> None:
     assert lost == [*range(GROUP + 3, 2 * GROUP), *range(2 * GROUP + 5, 3 * GROUP)]
 
 
+def test_a_long_stretch_behind_damage_costs_no_more_for_each_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The one key frame of a stream is not looked for from each frame back to its start."""
+    count, looked = 1000, list[int]()
+    kind = VideoStream._kind
+    monkeypatch.setattr(VideoStream, "_kind", lambda self, number: looked.append(number) or kind(self, number))
+    payloads = [packets("h264")[0], b"", *packets("h264")[1 : GROUP - 1] * 100][:count]
+    video = stream("h264", payloads)
+    assert video.frame(0) is not None
+    for row in range(1, count):
+        with pytest.raises(BadMessageError):
+            video.frame(row)
+    assert len(looked) < 10 * count
+
+
 @pytest.mark.parametrize(
     ("codec", "b_frames"), [("h264", 0), ("h264", 3), ("hevc", 0), ("hevc", 3), ("vp9", 0), ("av1", 0)]
 )

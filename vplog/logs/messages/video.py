@@ -90,6 +90,8 @@ class VideoStream:
         self._damaged = -1
         """The last packet that did not decode: none decodes from there to the next key frame."""
         self._ready: dict[int, VideoFrame] = {}
+        self._before: dict[int, int] = {}
+        """By packet an earlier one, up to which no key frame was found."""
 
     def first_key(self) -> int | None:
         """The first packet from which decoding can start; None where there is none."""
@@ -185,7 +187,12 @@ class VideoStream:
 
     def _key_before(self, number: int, first: int) -> int | None:
         """The last key frame of the packets first..number."""
-        return next((n for n in range(number, first - 1, -1) if self._kind(n) >= _KEY), None)
+        at = number
+        while at >= first and self._kind(at) < _KEY:
+            at = self._before.get(at, at - 1)
+        if at < number:
+            self._before[number] = at
+        return at if at >= first else None
 
     def _kind(self, number: int) -> int:
         if self._kinds[number] == _UNREAD:
