@@ -396,6 +396,20 @@ def test_what_a_receiver_measures_has_no_heading(kind: str, gyro: bool, tmp_path
     assert opened(tmp_path, of_receiver(kind), *beside, odometry=name).odometry() is not None
 
 
+@pytest.mark.parametrize("kind", ["velocities", "positions"])
+def test_beside_a_receiver_the_imu_and_the_lidar_are_used(kind: str, tmp_path: Path) -> None:
+    """Which are not where the poses of a topic are the odometry."""
+    cloud = topic("/points", "sensor_msgs/msg/PointCloud2", stamped("lidar", [{}] * COUNT))
+    mount = transforms("base_link", "camera", np.tile(np.eye(4), (COUNT, 1, 1)))
+    poses = topic("/poses", "geometry_msgs/msg/PoseStamped", stamped("map", [{"pose": pose(one)} for one in POSES]))
+    for moving, headless in ((of_receiver(kind), True), (poses, False)):
+        log = opened(tmp_path, images(), mount, gyroscope(0.0), cloud, moving)
+        assert (log.odometry() is None) == headless
+        assert (log.imu() is not None) == headless
+        assert (log.lidar() is not None) == headless
+        assert ("moves every way without turning" in " ".join(log.warnings)) == headless
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_what_moves_sideways_keeps_its_odometry(seed: int, tmp_path: Path) -> None:
     """A platform that drives every way as it turns, a straight drive out and back, and one that hardly turns."""

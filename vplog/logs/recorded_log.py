@@ -37,7 +37,7 @@ from vplog.logs.rectification import (
 from vplog.logs.scans import ScanReader
 from vplog.logs.stamps import rows_of
 from vplog.logs.topic_candidates import read_candidates
-from vplog.logs.topic_selection import Candidate, TopicChoice, further_cameras, select, wheel_options
+from vplog.logs.topic_selection import Candidate, Selection, TopicChoice, further_cameras, select, wheel_options
 
 _SAME_VIEW_RAD, _SAME_VIEW_M = np.radians(5.0), 1.0
 """Turn and distance of two cameras below which they see the same: as far as those of a stereo head."""
@@ -290,9 +290,25 @@ class RecordedLog:
     @cached_property
     def _images(self) -> ImageReader:
         image, known = self._selection.image, self._candidate(self._selection.image)
-        found = read_content(self._container, self._contents, self._selection, self._notes)
+        found, notes = self._read(self._selection)
+        if found.odometry is None and (wider := self._without_poses()) != self._selection:
+            found, notes = self._read(wider)
+        self._notes.extend(notes)
         content = found.between(self._choice.start_s, self._choice.stop_s)
         return ImageReader(self._container, image, known.codec if known else "", content, self._notes)
+
+    def _read(self, selection: Selection) -> tuple[LogContent, Notes]:
+        notes = Notes()
+        return read_content(self._container, self._contents, selection, notes), notes
+
+    def _without_poses(self) -> Selection:
+        """The selection, with the IMU and the lidar where none is requested and no topic of poses or velocities proved
+        to be odometry: those of a receiver know no heading. They are not read before, as they are most of a log."""
+        posed = [c for c in self._candidates if c.role != "odometry"]
+        if self._choice.odometry is not None:
+            return self._selection
+        other = select(posed, self._choice, self._path.name)
+        return replace(self._selection, imu=other.imu, lidar=other.lidar)
 
     @property
     def _content(self) -> LogContent:
