@@ -14,7 +14,8 @@ from vplog.errors import LogError
 from vplog.execution.execution import Execution
 from vplog.graph.noise import NoiseSettings, broken_edges, edge_covariance
 from vplog.pipeline import load_pipeline, run
-from vplog.run.odometry import check_metric, source_of
+from vplog.run.keyframes import KeyframeSettings
+from vplog.run.odometry import check_metric, read, source_of
 from vplog.testing import pictures
 from vplog.verbs.demo import SMALL, make_drive
 from vplog.verbs.evaluate_run import evaluate
@@ -51,6 +52,14 @@ class Calibrated(pictures.PictureLog):
 
     def has_depth(self) -> bool:
         return self.depth
+
+
+@pytest.mark.parametrize("depth", [False, True])
+def test_fixes_that_a_log_does_not_have_are_not_used_in_silence(depth: bool) -> None:
+    """Before any image is looked at, also by the odometry of a single camera, which has no metres."""
+    log = Calibrated([np.zeros((9, 9), np.uint8)] * 2, depth=depth)
+    with pytest.raises(LogError, match="no GPS fixes to use"):
+        read(log, VISUAL, KeyframeSettings(), use_gps=True, steps=None)  # type: ignore[arg-type]
 
 
 def test_a_run_by_its_images(drive: Demo, tmp_path: Path) -> None:

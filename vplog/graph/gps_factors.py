@@ -22,6 +22,7 @@ from vplog.graph.robust_kernels import truncated_weights
 from vplog.graph.variance_components import most_likely_variance
 from vplog.settings import Settings
 
+NO_FIXES = "The log has no GPS fixes to use. `vplog info` lists the topics; run without --gps."
 _LEAST = 3
 """Fixes that fix where a graph is and how it is turned."""
 
@@ -104,7 +105,7 @@ def fixes_on(gps: Gps | None, odometry: Odometry, keyframes: Keyframes, settings
     """
     keys, warnings = keyframes.stamp_ns, []
     if gps is None:
-        raise GraphError("The log has no GPS fixes to use. `vplog info` lists the topics; run without --gps.")
+        raise GraphError(NO_FIXES)
     local = local_enu(gps)
     begin, end = odometry.stamp_ns[odometry.breaks], odometry.stamp_ns[odometry.breaks - 1]  # of what breaks part
     inside = (local.stamp_ns >= odometry.stamp_ns[0]) & (local.stamp_ns <= odometry.stamp_ns[-1])

@@ -14,6 +14,7 @@ from vplog.data import Camera, Frame, Imu, Keyframes, Odometry
 from vplog.errors import LogError, plural
 from vplog.execution.execution import Execution
 from vplog.geometry.masking import masked
+from vplog.graph.gps_factors import NO_FIXES
 from vplog.logs import TopicChoice
 from vplog.logs.image_folder import PERIOD_NS
 from vplog.loops import undistort
@@ -60,7 +61,9 @@ def read(
     log: Log, topics: TopicChoice, settings: KeyframeSettings, use_gps: bool = False, *, steps: Steps
 ) -> tuple[Odometry, Camera, Keyframes]:
     """Odometry, camera and selected keyframes of a drive; fixes give metres where `use_gps`, and nothing else does.
-    Raises LogError where there is no odometry."""
+    Raises LogError where there is no odometry, or, with `use_gps`, no fix."""
+    if use_gps and log.gps() is None:
+        raise LogError(NO_FIXES)
     odometry = odometry_of(log, topics, steps)
     camera = camera_of(log, topics)
     if source_of(log, topics) == "visual" and (imu := log.imu()) is not None and not _is_unknown(odometry):
