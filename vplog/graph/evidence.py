@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.linalg import lapack
+from scipy.linalg import get_lapack_funcs
 
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed, parts, subgraph
@@ -50,6 +50,7 @@ _TAIL_SHARES = np.array([0.0, 0.01, 0.02, 0.05, 0.1, 0.2])[:, None]
 """Shares of them among the true ones, as likely as each other."""
 _MULTIPLES = 2.0 ** np.arange(-5.0, 6.5, 0.5)
 """Noise of single closures as multiples of the sigma that they have on average."""
+_POTRF, _POTRS, _TRTRS = get_lapack_funcs(("potrf", "potrs", "trtrs"), dtype=np.float64)
 _LOG_2PI = math.log(2.0 * math.pi)
 _LEAST_SIDE = 0.1
 """Shortest side of the box of places as a share of its longest: a flat drive still has false closures off its plane."""
@@ -375,7 +376,8 @@ def _as_one(graph: PoseGraph, run: Ints, chain: OdometryChain) -> tuple[float, _
         return 0.0, None
     twist = np.zeros(6)
     twist[axes] = displaced
-    return inner, _Run(at, to, measured[middle] @ se3.exp(twist[None])[0], np.linalg.inv(information))
+    noise = np.asarray(np.linalg.inv(information), np.float64)
+    return inner, _Run(at, to, measured[middle] @ se3.exp(twist[None])[0], noise)
 
 
 def _log_common(error: Floats, covariance: Floats) -> tuple[float, Floats, Floats]:
@@ -385,16 +387,16 @@ def _log_common(error: Floats, covariance: Floats) -> tuple[float, Floats, Float
     side = np.zeros((size, d, d + 1))
     side[:, range(d), range(d)], side[:, :, d] = 1.0, error
     # LAPACK itself: there are tens of thousands, so small that numpy.linalg would take longer to call it
-    root, failed = lapack.dpotrf(covariance.reshape(size * d, size * d), lower=1)
+    root, failed = _POTRF(covariance.reshape(size * d, size * d), lower=1)
     if failed:
         raise np.linalg.LinAlgError
-    whitened = lapack.dtrtrs(root, side.reshape(size * d, d + 1), lower=1)[0]
+    whitened = _TRTRS(root, side.reshape(size * d, d + 1), lower=1)[0]
     moments = whitened.T @ whitened
     information, gradient = moments[:d, :d], moments[:d, d]
-    low, failed = lapack.dpotrf(information, lower=1)
+    low, failed = _POTRF(information, lower=1)
     if failed:
         raise np.linalg.LinAlgError
-    mean = lapack.dpotrs(low, gradient, lower=1)[0]
+    mean = _POTRS(low, gradient, lower=1)[0]
     volume = np.log(root.diagonal()).sum() + np.log(low.diagonal()).sum()
     density = -0.5 * (moments[d, d] - gradient @ mean) - volume - 0.5 * (size - 1) * d * _LOG_2PI
     return float(density), mean, information

@@ -202,7 +202,8 @@ def world_from_enu(poses: Floats, fixes: Fixes, weight: Floats) -> Floats:
         around = turned(x), se3.left_jacobian(-x[:3])  # R exp(w + d) = R exp(w) exp(J(-w) d)
         moved, tilted = (-around[0] @ se3.skew(v) @ around[1] for v in (seen, vertical))
         of_fixes = np.concatenate([root @ moved, root], axis=2).reshape(-1, 6)
-        return np.concatenate([of_fixes, np.column_stack([tilted, np.zeros((3, 3))]) / _VERTICAL_SIGMA])
+        of_tilt = np.column_stack([tilted, np.zeros((3, 3))]) / _VERTICAL_SIGMA
+        return np.asarray(np.concatenate([of_fixes, of_tilt]), np.float64)
 
     found = scipy.optimize.least_squares(
         error, np.zeros(6), jacobian, method="lm", x_scale="jac", max_nfev=_MOST_EVALUATIONS
