@@ -18,14 +18,14 @@ from tests.maps.joining.test_join import digests
 from tests.maps.runs import write_run
 from vplog.data import Boxes, Ranking
 from vplog.execution.execution import Execution
-from vplog.maps.condensation.own_queries import PASSES, OwnPlaces, later_passes
+from vplog.maps.condensation.own_queries import PASSES, OwnPlaces, later_passes, read_own_places
 from vplog.maps.condensation.redundancy import OwnQueries, RemovalCandidates, remove_cross_validated, remove_redundant
 from vplog.maps.condensation.references import removal_order
 from vplog.maps.joining import candidate_drives
 from vplog.maps.joining.candidate_drives import places_of
 from vplog.maps.joining.joint_record import read_joint
 from vplog.maps.search.query import open_map
-from vplog.maps.storage import map_store
+from vplog.maps.storage import layout, map_store
 from vplog.maps.storage.map_store import Store
 from vplog.places.bobb import NO_REFERENCE
 from vplog.places.code_search import build_lists
@@ -284,6 +284,22 @@ def test_drives_that_nothing_joins_are_condensed_each_for_itself(whole: Path, tm
     assert told["queries"]["by_other_drives"] == 0
     assert any("No drives are joined" in line for line in told["warnings"])
     assert all(one["places"]["after"] for one in told["drives"])
+
+
+def test_a_map_none_of_whose_places_finds_another_is_not_condensed(whole: Path, tmp_path: Path, verb: Verb) -> None:
+    assert "No place of" in verb("map", "condense", whole, "-o", tmp_path / "small", "--distance-m", "1e-9").error
+    assert not (tmp_path / "small").exists()
+
+
+def test_photos_say_nothing_of_the_spacing_of_keyframes(whole: Path) -> None:
+    """They have no poses; more of them than keyframes used to make it 0 m."""
+    with map_store.reading(whole) as store:
+        drives, _, state = open_map(store, Execution())
+        alone = read_own_places(store, {"after": drives["after"]}, state)
+        photos = {**drives, "before": {**drives["before"], layout.PICTURES: True}}
+        beside = read_own_places(store, photos, state)
+    assert beside.spacing_m == alone.spacing_m > 0
+    assert ((beside.frame < 0) == (beside.drive == beside.drives.index("before"))).all()
 
 
 def test_drives_that_came_since_the_whole_was_solved_are_in_its_frame(whole: Path, tmp_path: Path, verb: Verb) -> None:

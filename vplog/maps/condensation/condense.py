@@ -92,6 +92,11 @@ def condense_map(
             search, warnings = search_of(store, drives, places, state, execution)
             within = distance_m or _SPACINGS * places.spacing_m
             answers = query_own_places(places, search, state, within, execution)
+            if not len(answers.place):  # then no loss bounds what is removed
+                raise ResultError(
+                    f"No place of {root} finds another within {within:.3g} m, so what it can do without is not known. "
+                    "Add drives with odometry that pass places again, or give a larger --distance-m."
+                )
             return condense_places(places, answers, state, within, loss, execution), warnings
 
         found, warnings = skip_damaged(store, attempt)

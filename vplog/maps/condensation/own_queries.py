@@ -53,7 +53,7 @@ class OwnPlaces:
     pose: Floats
     """(N, 4, 4) world_from_body."""
     spacing_m: float = 0.0
-    """Median distance in m of consecutive keyframes."""
+    """Median distance in m of consecutive keyframes with a pose."""
 
     @property
     def first(self) -> Ints:
@@ -95,8 +95,10 @@ def read_own_places(store: Store, drives: Mapping[str, Mapping[str, Any]], state
         frame = [numbers.setdefault((where, one), len(numbers)) for one in camera.tolist()]
         keyframes.append(keyframe)
         poses.append(known[keyframe])
-        steps.append(np.linalg.norm(np.diff(known[:, :3, 3], axis=0), axis=1))
-        frames.append(np.where(bool(drives[drive].get(PICTURES)), -1, np.array(frame, np.int64)))
+        posed = not drives[drive].get(PICTURES)
+        frames.append(np.where(posed, np.array(frame, np.int64), -1))
+        if posed:
+            steps.append(np.linalg.norm(np.diff(known[:, :3, 3], axis=0), axis=1))
     number = np.repeat(np.arange(len(names)), list(map(len, columns)))
     keyframe, frame, pose = (np.concatenate(parts) for parts in (keyframes, frames, poses))
     step = np.concatenate(steps)
