@@ -209,7 +209,7 @@ def _ours(run: Path, query_log: Any) -> tuple[list[Answer], int, str]:
             seconds = time.process_time() - began
             if one.found.world_from_camera is not None:
                 found.append(Answer(frame.stamp_ns, one.found.world_from_camera, one.found.inliers, seconds))
-        known = places.drives[0].loaded
+        known = places.drives[0].load()
         return found, len(known.world_from_body), known.tables[0].scale
 
 

@@ -59,6 +59,7 @@ class KeyframeTable(Generic[T]):
 
     def close(self) -> None:
         self._file.close()
+        self._group.cache_clear()  # which refers to this object, and would stay until a collection of cycles
 
     def __getitem__(self, row: int) -> T:
         """Raises ResultError where the file is damaged."""

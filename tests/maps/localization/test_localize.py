@@ -18,8 +18,10 @@ from vplog.geometry import se3
 from vplog.geometry.geodesy import geodetic
 from vplog.geometry.tum import read_tum
 from vplog.maps.joining.joint_record import joint_components, read_joint, write_joint
-from vplog.maps.storage import map_store
+from vplog.maps.localization import places
+from vplog.maps.storage import layout, map_store
 from vplog.results import run_record, tables
+from vplog.results.landmark_table import LandmarkTable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -197,6 +199,42 @@ def test_a_map_localises_in_the_frame_of_its_joined_drives(halves: Path, picture
         for log in tmp_path.glob("*.mcap"):
             log.rename(root.parent / log.name)
     assert again["localized"] == 1
+
+
+def test_a_drive_without_landmarks_and_log_is_left_out(
+    halves: Path, pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And so are places that were imported. The other drives answer, of which few are open at once."""
+    calibration, image = pictures / "camera.yaml", min((pictures / "pictures").iterdir())
+    opened, closed = list[str](), list[int]()
+
+    class Counted(LandmarkTable):
+        def __init__(self, path: Path, made_from: str) -> None:
+            super().__init__(path, made_from)
+            opened.append(path.parent.name)
+
+        def close(self) -> None:
+            super().close()
+            closed.append(1)
+
+    monkeypatch.setattr(places, "_LOADED", 1)
+    monkeypatch.setattr(places, "LandmarkTable", Counted)
+    whole = vplog.open_map(halves)
+    found = whole.localize(image, calibration)
+    assert (found.localized, found.drive) == (True, "before")
+    assert whole.localize(max((pictures / "pictures").iterdir()), calibration).drive == "after"
+    assert set(opened) == {"drive=before", "drive=after"}
+    assert len(opened) - len(closed) == 1
+    for name, about in (("gone", {}), ("imported", {layout.PLACES_ONLY: "file"})):
+        root = shutil.copytree(halves, tmp_path / name)
+        for stored in ("joins", ".cache"):
+            shutil.rmtree(root / stored / "drive=before", ignore_errors=True)
+        record = root / "runs" / "drive=before" / "drive.json"
+        run_record.write_run_json(record, run_record.read_run_json(record) | about | {"log": "/none.mcap"})
+        part = api.localize(root, image, topics={"calibration_file": calibration})
+        assert {one["drive"] for one in part["answers"]} <= {"after", None}
+        warned = [text.partition(". ")[0] for text in part["warnings"]]
+        assert warned == ["before is left out"] * (name == "gone")
 
 
 def test_wrong_inputs_are_refused_in_a_line(verb: Callable[..., Said], drive: Demo, run: Path, tmp_path: Path) -> None:

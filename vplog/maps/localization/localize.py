@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -26,7 +26,7 @@ from vplog.stages import EncodedFrame, Extractor, FrameState, Log, PlaceState, S
 from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
-    from vplog.maps.localization.places import Places
+    from vplog.maps.localization.places import Landmarked, Places
 
 TOP = 10
 """Places that a picture is verified against."""
@@ -169,44 +169,45 @@ def _localized(
     places: Places, block: Sequence[Picture], execution: Execution, top: int, names: dict[int, str]
 ) -> Iterator[LocalizedPicture]:
     sound = [one for one in block if one.features is not None]
-    likely = dict(zip(map(id, sound), places.search([one.descriptor for one in sound], top), strict=True))
-    for drive in sorted({drive for found in likely.values() for drive, _ in found}):
-        _ = places.drives[drive].loaded  # before workers wait for it
+    found, loaded = places.search([one.descriptor for one in sound], top)
+    likely = dict(zip(map(id, sound), found, strict=True))
 
     def work(one: Picture) -> LocalizedPicture:
-        return _answer(places, one, likely.get(id(one), []), names.get(one.stamp_ns, str(one.stamp_ns)))
+        return _answer(places, one, likely.get(id(one), []), loaded, names.get(one.stamp_ns, str(one.stamp_ns)))
 
     return execution.map(work, block)
 
 
-def _answer(places: Places, one: Picture, likely: list[tuple[int, int]], name: str) -> LocalizedPicture:
+def _answer(
+    places: Places, one: Picture, likely: list[tuple[int, int]], loaded: Mapping[int, Landmarked], name: str
+) -> LocalizedPicture:
     if one.features is None or one.camera is None:
         return LocalizedPicture(name, one.stamp_ns, None, Localization(Verdict.TOO_FEW_MATCHES, -1, 0, 0), one.problem)
     verify = places.pipeline.verify
-    likely = _with_neighbours(places, likely)
+    likely = _with_neighbours(loaded, likely)
     # poses in frames of their own are not compared: the likeliest place's frame is
     frames = list(dict.fromkeys(places.drives[drive].frame for drive, _ in likely)) or [""]
     tried = []
     for frame in frames:
         own = [(drive, row) for drive, row in likely if places.drives[drive].frame == frame]
-        views = [places.drives[drive].loaded.landmarks(row, verify) for drive, row in own]
+        views = [loaded[drive].landmarks(row, verify) for drive, row in own]
         tried.append((localize(one.features, one.camera, views, verify), own))
     found, own = max(tried, key=lambda pair: (pair[0].world_from_camera is not None, pair[0].inliers))
     if found.place < 0:
         return LocalizedPicture(name, one.stamp_ns, one.camera, found, _sentence(found, "", 0))
     drive, row = own[found.place]
     known, pose, where = places.drives[drive], found.world_from_camera, None
-    if pose is not None and (earth := known.loaded.earth) is not None:
+    if pose is not None and (earth := loaded[drive].earth) is not None:
         where = tuple(on_earth(earth, pose[None])[0].tolist())
-    keyframe = int(known.loaded.keyframe[row])
+    keyframe = int(loaded[drive].keyframe[row])
     sentence = _sentence(found, known.name, keyframe)
     return LocalizedPicture(name, one.stamp_ns, one.camera, found, sentence, known.name, keyframe, known.frame, where)
 
 
-def _with_neighbours(places: Places, likely: list[tuple[int, int]]) -> list[tuple[int, int]]:
+def _with_neighbours(loaded: Mapping[int, Landmarked], likely: list[tuple[int, int]]) -> list[tuple[int, int]]:
     first, found = dict(reversed(likely)), list(likely)
     for drive, row in first.items():
-        found += [(drive, other) for other in places.drives[drive].loaded.around(row, _AROUND)]
+        found += [(drive, other) for other in loaded[drive].around(row, _AROUND)]
     return list(dict.fromkeys(found))
 
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import os
+import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from vplog.data import Floats, Int32s, Ints
-from vplog.errors import LibraryError, ResultError
+from vplog.errors import LibraryError, LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.loops.candidate import Drive
@@ -30,7 +31,7 @@ from vplog.maps.search.sequences import LineSearch, best_lines
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import reading_drive
-from vplog.maps.storage.layout import PICTURES
+from vplog.maps.storage.layout import PICTURES, PLACES_ONLY
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline, recorded_pipeline
 from vplog.results import run_record, tables
@@ -44,11 +45,15 @@ from vplog.storage.json_records import key_of, plain
 from vplog.storage.remote_path import RemotePath, original
 from vplog.storage.scratch import scratch
 
-Search = Callable[[Sequence[Any], int], list[list[tuple[int, int]]]]
-"""Drive and row in `Landmarked` of the likeliest places of each of some descriptors, best first."""
+Likely = list[list[tuple[int, int]]]
+"""Drive and row in `Landmarked` of the likeliest places of each of some pictures, best first."""
+
+_LOADED = 32
+"""Drives of a map whose landmarks stay open between pictures, each with up to 20 MB and a file for each camera."""
 
 
-class Landmarked(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Landmarked:
     """The pictures of one drive, with their landmarks: of the first camera at each of N keyframes, then of each further
     one those with a descriptor."""
 
@@ -81,7 +86,12 @@ class Landmarked(NamedTuple):
         return range(*map(int, ends))
 
 
-@dataclass(eq=False)
+Search = Callable[[Sequence[Any], int], tuple[Likely, dict[int, Landmarked]]]
+"""The likeliest places for each of some descriptors, so many at most, and the drives that these are in, by number.
+Raises VplogError."""
+
+
+@dataclass(frozen=True, eq=False)
 class PlacesOfDrive:
     """One drive, which is read when a picture may be in it: a map has thousands."""
 
@@ -89,11 +99,7 @@ class PlacesOfDrive:
     frame: str
     """Frame of its poses: the first of the drives that closures join with it."""
     load: Callable[[], Landmarked]
-
-    @cached_property
-    def loaded(self) -> Landmarked:
-        """Its keyframes, with landmarks that are made where they are not stored. Raises VplogError."""
-        return self.load()
+    """Its keyframes, with landmarks that are made where they are not stored. Raises VplogError."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,20 +135,24 @@ def _of_run(folder: Path, execution: Execution) -> Iterator[Places]:
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     row_of = _landmark_rows(pictures, len(world_from_body))
 
-    def search(descriptors: Sequence[Any], top: int) -> list[list[tuple[int, int]]]:
-        found = execution.map(lambda one: index.query(one, top).rows, descriptors)
-        return [[(0, row) for row in row_of[rows].tolist()] for rows in found]
-
     with ExitStack() as stack:
+        spare = _spare(stack)
 
         def table(camera: int) -> LandmarkTable:
             key = landmark_key(folder, record, pipeline, camera)
             drive = partial(run_drive, folder, record, pipeline, camera, execution)
-            return _stored_or_made(folder / landmarks_file(camera), key, drive, stack, execution)
+            return _stored_or_made(folder / landmarks_file(camera), key, drive, spare, execution)
 
+        @cache
         def load() -> Landmarked:
             return _landmarked(folder, world_from_body, earth_of_run(folder), pictures, table)
 
+        def search(descriptors: Sequence[Any], top: int) -> tuple[Likely, dict[int, Landmarked]]:
+            found = execution.map(lambda one: index.query(one, top).rows, descriptors)
+            likely = [[(0, row) for row in row_of[rows].tolist()] for rows in found]
+            return likely, {0: load()} if any(likely) else {}
+
+        stack.callback(load.cache_clear)
         own = PlacesOfDrive(keyframes.drive, keyframes.drive, load)
         yield Places(str(folder), state, pipeline, [own], search, [])
 
@@ -151,14 +161,16 @@ def _of_run(folder: Path, execution: Execution) -> Iterator[Places]:
 def _of_map(root: Path, execution: Execution) -> Iterator[Places]:
     with map_store.reading(root) as store, ExitStack() as stack:
         known, pipeline, state = open_map(store, execution)
-        joint = joint_components(store)
+        joint, spare = joint_components(store), _spare(stack)
 
+        @lru_cache(_LOADED)
         def load(name: str, first: str) -> Landmarked:
             earth, pictures = _map_earth(store, joint, first), pictures_of(store, name)
-            table = partial(_map_landmarks, store, known[name], pipeline, stack, execution)
+            table = partial(_map_landmarks, store, known[name], pipeline, spare, execution)
             with reading_drive(name):
                 return _landmarked(store.run(name), keyframe_poses(store, joint, name), earth, pictures, table)
 
+        stack.callback(load.cache_clear)
         first = {name: joint[name].drives[0] if name in joint else name for name in known}
         drives = [PlacesOfDrive(name, first[name], partial(load, name, first[name])) for name in known]
         warnings: list[str] = []
@@ -179,9 +191,10 @@ def _map_search(
     store: Store, known: Mapping[str, Mapping[str, Any]], drives: Sequence[PlacesOfDrive], state: PlaceState,
     warnings: list[str], execution: Execution,
 ) -> Search:  # fmt: skip
-    """The search for single views in all drives that have poses and are not damaged; `warnings` names those that are,
-    as they are found."""
-    parts, problems = list[SegmentView](), list[str]()
+    """The search for single views in all drives that have landmarks or the log to make them, and are not damaged;
+    `warnings` names those that have lost their log or are damaged, as they are found."""
+    parts, problems, lost = list[SegmentView](), list[str](), dict[str, str]()
+    poseless = [name for name, about in known.items() if about.get(PICTURES) or PLACES_ONLY in about]
     number = {name: at for at, name in enumerate(known)}
 
     def indexed(state: CodedState) -> tuple[list[SegmentView], list[str]]:
@@ -194,10 +207,11 @@ def _map_search(
         parts, problems = skip_damaged(store, lambda: indexed(state))
     warnings += [*problems, *damage_warnings(store)]
 
-    def search(descriptors: Sequence[Any], top: int) -> list[list[tuple[int, int]]]:
-        def attempt() -> list[list[tuple[int, int]]]:
-            poseless = {*store.damaged, *(name for name, about in known.items() if about.get(PICTURES))}
-            there = {at: name for name, at in number.items() if name not in poseless}
+    def search(descriptors: Sequence[Any], top: int) -> tuple[Likely, dict[int, Landmarked]]:
+        def attempt() -> tuple[Likely, dict[int, Landmarked]] | None:
+            """None where a drive has lost its log."""
+            without = {*poseless, *store.damaged, *lost}
+            there = {at: name for name, at in number.items() if name not in without}
             if isinstance(state, CodedState):
                 found = best_places([one.of(there) for one in parts], state, descriptors, top, execution)
             else:
@@ -209,13 +223,18 @@ def _map_search(
                 found.keyframe[own] = row_of[found.keyframe[own]]
             rows = zip(found.drive.tolist(), found.keyframe.tolist(), found.count.tolist(), strict=True)
             likely = [list(zip(drive[:count], row[:count], strict=True)) for drive, row, count in rows]
+            loaded = dict[int, Landmarked]()
             for at in sorted({drive for one in likely for drive, _ in one}):
-                _ = drives[at].loaded
-            return likely
+                try:
+                    loaded[at] = drives[at].load()
+                except LogError as error:  # its log is gone, and it has no landmarks
+                    lost[drives[at].name] = f"{drives[at].name} is left out. {error}"
+            return (likely, loaded) if lost.keys() <= without else None
 
-        likely = skip_damaged(store, attempt)
-        warnings[:] = [*problems, *damage_warnings(store)]
-        return likely
+        while (found := skip_damaged(store, attempt)) is None:
+            pass
+        warnings[:] = [*problems, *damage_warnings(store), *lost.values()]
+        return found
 
     return search
 
@@ -239,12 +258,17 @@ def _landmarked(
     poses = [world_from_body[row] @ se3.between(odometry[row], own.odom_from_body) for row, own in known]
     row = np.concatenate([own.row for own in known])
     camera = np.repeat(cameras, [len(own.row) for own in known])
-    return Landmarked(row, camera, np.concatenate(poses), earth, {camera: table(camera) for camera in cameras})
+    with ExitStack() as stack:
+        landmarks = {camera: stack.enter_context(closing(table(camera))) for camera in cameras}
+        found = Landmarked(row, camera, np.concatenate(poses), earth, landmarks)
+        weakref.finalize(found, stack.pop_all().close)  # when the last picture that is looked for in it is answered
+    return found
 
 
 def _map_landmarks(
-    store: Store, about: dict[str, Any], pipeline: Pipeline, stack: ExitStack, execution: Execution, camera: int
-) -> LandmarkTable:
+    store: Store, about: dict[str, Any], pipeline: Pipeline, spare: Callable[[], Path], execution: Execution,
+    camera: int,
+) -> LandmarkTable:  # fmt: skip
     """The landmarks of a camera of a drive of a map, beside its features for joins."""
     of_drive = member_of(store, about)
     member = of_drive.of_camera(camera)
@@ -261,18 +285,26 @@ def _map_landmarks(
             fetch(np.arange(len(found.keyframes.stamp_ns)))
             yield found
 
-    return _stored_or_made(member.features.with_name(landmarks_file(camera)), key, drive, stack, execution)
+    return _stored_or_made(member.features.with_name(landmarks_file(camera)), key, drive, spare, execution)
+
+
+def _spare(stack: ExitStack) -> Callable[[], Path]:
+    """The scratch folder for landmarks that cannot be stored, made when the first are, until the stack closes."""
+    return cache(lambda: stack.enter_context(scratch("landmarks")))
 
 
 def _stored_or_made(
-    path: Path, key: str, drive: Callable[[], AbstractContextManager[Drive]], stack: ExitStack, execution: Execution
-) -> LandmarkTable:
-    """The landmarks in a file; made there first unless it is of this key, or in a scratch file where it cannot be."""
+    path: Path, key: str, drive: Callable[[], AbstractContextManager[Drive]], spare: Callable[[], Path],
+    execution: Execution,
+) -> LandmarkTable:  # fmt: skip
+    """The landmarks in a file; made there first unless it is of this key, or in the spare folder where it cannot be."""
     with suppress(ResultError):
-        return stack.enter_context(closing(LandmarkTable(path, key)))
+        return LandmarkTable(path, key)
     above = next(folder for folder in path.parents if folder.is_dir())
     if not os.access(above, os.W_OK):
-        path = stack.enter_context(scratch("landmarks")) / path.name
+        path = spare() / path.parent.name / path.name
+        with suppress(ResultError):
+            return LandmarkTable(path, key)
     with drive() as found:
         write_drive_landmarks(path, found, key, execution)
-    return stack.enter_context(closing(LandmarkTable(path, key)))
+    return LandmarkTable(path, key)
