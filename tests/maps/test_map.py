@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import cv2
@@ -13,15 +14,18 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from tests.joined import copied
 from tests.maps.runs import map_of_run, put_rows
 from vplog import logs
+from vplog.data import Odometry
 from vplog.execution.execution import Execution
-from vplog.maps.search.query import MapQuery, search
+from vplog.maps.search.query import MapQuery, search, select_views
 from vplog.maps.search.sequences import LineSearch
 from vplog.maps.storage import map_store
 from vplog.maps.storage.layout import drive_names, folder_name, free_name
 from vplog.pipeline import load_pipeline
 from vplog.results import run_record, tables
+from vplog.run.keyframes import KeyframeSettings
 from vplog.storage.json_records import CHECKSUM
 
 if TYPE_CHECKING:
@@ -94,6 +98,26 @@ def test_the_best_of_the_drives_are_those_of_one_index(root: Path, library: str)
         assert np.array_equal(answers.score[at, :count], ranking.score)
         assert answers.drive[at, :count].tolist() == [owner[row] for row in ranking.rows]
         assert answers.keyframe[at, :count].tolist() == [rows[row] for row in ranking.rows]
+
+
+@pytest.mark.parametrize(("count", "shift_ns"), [(1, 0), (3, 10**12)])
+def test_without_two_frames_with_odometry_every_frame_is_a_query(count: int, shift_ns: int) -> None:
+    """As of one image beside odometry, or where the clocks differ, which a warning says."""
+    stamps = np.arange(count, dtype=np.int64) * 10**9
+    odometry = Odometry(np.arange(5, dtype=np.int64) * 10**9 + shift_ns, np.tile(np.eye(4), (5, 1, 1)), None)
+    log: Any = SimpleNamespace(name="log", odometry=lambda: odometry, stamps=lambda: stamps, file_names=lambda: None)
+    found, keyframes, warnings = select_views(log, KeyframeSettings())
+    assert (found.tolist(), keyframes) == (stamps.tolist(), None)
+    assert len(warnings) == (count > 1)
+
+
+def test_frames_without_odometry_are_searched_one_by_one(root: Path, drive: Demo, verb: Verb, tmp_path: Path) -> None:
+    """They are not spaced evenly along the path, as those in a window of views are."""
+    video = copied(drive.log, tmp_path / "video.mcap", lambda topic, _: topic not in ("/odom", "/gps/fix"))
+    told = verb("map", "query", root, video, "--json").json
+    assert told["sequence"] == 1
+    assert any("--sequence" in text for text in told["warnings"])
+    assert verb("map", "query", root, video, "--sequence", 5, "--json").json["sequence"] == 5
 
 
 def test_a_drive_is_found_where_it_is(root: Path, drive: Demo, verb: Verb, tmp_path: Path) -> None:

@@ -261,11 +261,23 @@ def test_a_library_of_thumbnails_describes_as_the_whole_one(references: list[Ref
     assert again.to_arrow([again.describe(seen)]) == state.to_arrow([state.describe(seen)])
 
 
-def test_images_that_claim_more_px_than_their_bytes_hold_are_refused_before_they_are_decoded(saved: Path) -> None:
+def test_thumbnails_claim_their_own_px_alone(references: list[Reference], tmp_path: Path) -> None:
+    """Those of a hundred images of 12 Mpx used to be refused."""
+    BobbSettings().learn(references, Execution()).save_small(tmp_path)
+    table = pq.read_table(tmp_path / "references.parquet")
+    rows = [{**one, "width": 32_000, "height": 24_000} for one in table.to_pylist()]
+    pq.write_table(pa.Table.from_pylist(rows, table.schema), tmp_path / "references.parquet")
+    assert {one.image.shape for one in library_files.load_references(tmp_path)} == {(96, 128)}
+
+
+def test_images_that_claim_more_px_than_their_bytes_hold_are_refused_before_they_are_decoded(
+    saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One PNG of 60 kB and 67 Mpx may stand in a thousand rows."""
+    monkeypatch.setattr(library_files, "_MOST_PX", 2**20)
     table = pq.read_table(saved / "references.parquet")
     black = cv2.imencode(".png", np.zeros((1024, 1024), np.uint8))[1].tobytes()
-    rows = [{**table.to_pylist()[0], "image": black, "width": 32_000, "height": 32_000}] * 2
+    rows = [{**table.to_pylist()[0], "image": black, "width": 1024, "height": 1024}] * 2
     pq.write_table(pa.Table.from_pylist(rows, table.schema), saved / "references.parquet")
     features = pq.read_table(saved / "features.parquet").slice(0, 0)
     pq.write_table(features, saved / "features.parquet")

@@ -195,7 +195,7 @@ def _write_pictures(task: Task, path: Path, log: Log, execution: Execution) -> d
     Poses are not known: all are the identity, and the drive is joined with no other.
     """
     state = task.pipeline.places.load(task.library, execution)
-    stamps, descriptors, warnings = describe_log(log, task.pipeline, state, execution, query=False)
+    stamps, descriptors, warnings = describe_log(log, log.stamps(), task.pipeline, state, execution, query=False)
     rows, names = np.searchsorted(log.stamps(), stamps).tolist(), log.file_names() or []
     account = {
         "log": task.record["log"],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -219,7 +220,7 @@ def load_references(folder: Path, execution: Execution = Execution()) -> list[Re
         if any(column.null_count for table in (features, references) for column in table.columns):
             raise LibraryError(f"{folder}: the tables have empty cells; build it again with `vplog library`.")
         entries = references.to_pylist()
-        claimed = sum(max(one["width"], 0) * max(one["height"], 0) for one in entries)
+        claimed = sum(math.prod(image_size(one["image"]) or [0]) for one in entries)  # of thumbnails their own
         if claimed > max(_MOST_PX, _PX_PER_BYTE * (folder / "references.parquet").stat().st_size):
             raise LibraryError(f"{folder}: the images of its references claim more px than their bytes hold.")
     owners = features["reference"].to_numpy()

@@ -13,6 +13,7 @@ import pytest
 
 import vplog
 from vplog import api
+from vplog.data import Keyframes
 from vplog.errors import LogError, ResultError, SettingsError, TruthError
 from vplog.geometry import se3
 from vplog.geometry.geodesy import geodetic
@@ -235,6 +236,18 @@ def test_a_drive_without_landmarks_and_log_is_left_out(
         assert {one["drive"] for one in part["answers"]} <= {"after", None}
         warned = [text.partition(". ")[0] for text in part["warnings"]]
         assert warned == ["before is left out"] * (name == "gone")
+
+
+def test_a_log_of_one_keyframe_is_localised_without_a_trajectory(
+    drive: Demo, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of a robot that stands still."""
+    stamps = vplog.open_log(drive.log).stamps()[1:2]
+    standing = stamps, Keyframes("drive", stamps, np.eye(4)[None]), list[str]()
+    monkeypatch.setattr("vplog.maps.localization.verb.select_views", lambda *_: standing)
+    record = api.localize(run, drive.log)
+    assert (record["localized"], record["joined_by_odometry"]) == (1, False)
+    assert any("Not joined by odometry" in text for text in record["warnings"])
 
 
 def test_wrong_inputs_are_refused_in_a_line(verb: Callable[..., Said], drive: Demo, run: Path, tmp_path: Path) -> None:

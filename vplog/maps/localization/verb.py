@@ -12,7 +12,7 @@ import numpy as np
 
 from vplog import logs
 from vplog.data import Keyframes, Trajectory, Verdict
-from vplog.errors import LogError, ResultError, plural
+from vplog.errors import GraphError, LogError, ResultError, plural
 from vplog.execution.execution import Execution
 from vplog.geometry import se3, tum
 from vplog.maps.localization.localize import TOP, LocalizedPicture, localize_log
@@ -42,7 +42,10 @@ def localize_paths(
         found = list(localize_log(places, log, stamps, execution, top))
         joined = None
         if keyframes is not None:
-            found, joined = _joined(log, keyframes, found, places)
+            try:
+                found, joined = _joined(log, keyframes, found, places)
+            except GraphError as error:  # as of a robot that stands still, which has one keyframe
+                warnings.append(f"Not joined by odometry: {error}")
         records = [one.record() for one in found]
         if out is not None:
             header = TableMetadata(places.pipeline.model_dump(mode="json"), places.state.hash)
@@ -72,7 +75,7 @@ def _joined(
     log: Log, keyframes: Keyframes, found: list[LocalizedPicture], places: Places
 ) -> tuple[list[LocalizedPicture], Trajectory | None]:
     """The pictures of a log, without those at odds with its odometry, and its trajectory in the frame of most; None
-    where none is localised, or no two agree with the odometry."""
+    where none is localised, or no two agree with the odometry. Raises GraphError."""
     odometry = log.odometry()
     frames = Counter(one.frame for one in found if one.localized)
     if odometry is None or not frames:

@@ -80,12 +80,18 @@ def query_map(
         if query.sequence is not None:
             settings = SequenceSettings.read({**settings.model_dump(), "length": query.sequence}, "--sequence")
         log = logs.open_images([path], topics) if logs.is_image_file(path) else logs.open(path, topics)
-        if query.sequence is None and log.file_names() is not None and log.odometry() is None:
-            settings = settings.model_copy(update={"length": 1})  # pictures are spaced as they come
         if query.near_fixes_m is not None:
             query = replace(query, box=box_of_fixes(log.gps(), query.near_fixes_m, log.name))
         DriveBounds(known).within(query.drives, query.box, str(store))  # before any work
-        stamps, descriptors, warnings = describe_log(log, pipeline, state, execution)
+        views, keyframes, unspaced = select_views(log, pipeline.keyframes)
+        if query.sequence is None and keyframes is None and settings.length > 1:  # spaced as they come
+            settings = settings.model_copy(update={"length": 1})
+            if log.file_names() is None:
+                unspaced.append(
+                    "Its views are not spaced evenly, so single ones are searched, unless --sequence is given."
+                )
+        stamps, descriptors, warnings = describe_log(log, views, pipeline, state, execution)
+        warnings = unspaced + warnings
 
         def attempt() -> tuple[list[str], RankedPlaces, list[str], pa.Table, list[dict[str, Any]]]:
             drives = map_store.common_library(store)[1]
@@ -165,25 +171,29 @@ def open_map(store: Store, execution: Execution) -> tuple[dict[str, dict[str, An
 
 
 def select_views(log: Log, settings: KeyframeSettings) -> tuple[Ints, Keyframes | None, list[str]]:
-    """Stamps (Q,) of the keyframes of a log, or of all its frames without odometry, and warnings."""
+    """Stamps (Q,) of the keyframes of a log, or of all its frames where no two have odometry, and warnings."""
     odometry, stamps = log.odometry(), log.stamps()
     if odometry is None or len(odometry.stamp_ns) < 2:
         without = [] if log.file_names() else [f"{log.name} has no odometry, so every frame is a query."]
         return stamps, None, without  # pictures never have any
-    keyframes, warnings = select_keyframes(log.name, stamps, odometry, settings)
+    if len(stamps) < 2:
+        return stamps, None, []
+    try:
+        keyframes, warnings = select_keyframes(log.name, stamps, odometry, settings)
+    except LogError as error:
+        return stamps, None, [f"{error} Every frame is a query."]
     return keyframes.stamp_ns, keyframes, warnings
 
 
 def describe_log(
-    log: Log, pipeline: Pipeline, state: PlaceState, execution: Execution, *, query: bool = True
+    log: Log, stamps: Ints, pipeline: Pipeline, state: PlaceState, execution: Execution, *, query: bool = True
 ) -> tuple[Ints, list[Any], list[str]]:
-    """Stamps (Q,) and descriptors of the keyframes of a log, and what was lost; of all frames without odometry.
+    """Stamps (Q,) and descriptors of the frames of a log with some stamps, and what was lost.
 
     `query` is False for a log that becomes a drive of the map. A descriptor takes some hundred bytes, and no image or
     feature is kept.
     """
-    stamps, _, warnings = select_views(log, pipeline.keyframes)
-    described, descriptors, lost = [], [], []
+    described, descriptors, lost, warnings = [], [], [], list[str]()
     found = _descriptors(log, stamps, pipeline, state, execution, query)
     for stamp_ns, descriptor, why in execution.counted("describe", found, len(stamps)):
         if descriptor is None:
