@@ -29,6 +29,7 @@ from vplog.places import PlaceSettings
 from vplog.places.sequence import SequenceSettings, sequence_rows
 from vplog.places.views import views_of
 from vplog.stages import EvidenceState, FrameState, PlaceIndex, PlaceState, ProbableIndex, StoredState
+from vplog.storage.mapped_table import mapped_scores
 
 ANSWERS = 10
 """Rows that a timed search returns: what `vplog run` requests by default, and the deepest recall reported."""
@@ -228,7 +229,7 @@ def score_table(queries: int, rows: int, scratch: Path | None, name: str) -> Flo
         )
     path = scratch / f"{name}.npy"
     path.unlink(missing_ok=True)  # not written over: an earlier table may still be in use
-    return np.lib.format.open_memmap(path, "w+", np.dtype("<f4"), (queries, rows))
+    return mapped_scores(path, (queries, rows))
 
 
 def stored_bytes(column: pa.Array) -> int:

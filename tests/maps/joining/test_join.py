@@ -7,7 +7,7 @@ import json
 import pickle
 import shutil
 from concurrent.futures import Executor, Future
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
@@ -29,6 +29,7 @@ from vplog.maps.joining.join import read_drives
 from vplog.maps.joining.join_states import read_states
 from vplog.maps.joining.joint_record import components_in
 from vplog.maps.merge import merge_maps
+from vplog.maps.search.index import update_index
 from vplog.maps.storage import map_store
 from vplog.pipeline import load_pipeline
 from vplog.results import run_record, tables
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 
     from conftest import Said
 
+    from vplog.stages import CodedState
     from vplog.verbs.demo.record import Demo
 
 PIPELINE = load_pipeline("default", QUICK)
@@ -359,6 +361,22 @@ def test_of_many_drives_those_most_alike_are_searched(copy: Path, monkeypatch: p
         for threads in (1, 3):
             found = candidates.candidates_of(store, members, [2], state, few, Execution(threads))[2]
             assert set(found.drive.tolist()) == {1}
+
+
+def test_the_index_of_drives_that_are_not_joined_stays(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of pictures, which a join searches for nothing."""
+    monkeypatch.setattr(candidates, "_CHOICE", 0)
+    monkeypatch.setattr("vplog.maps.search.index.CAPACITY", 1)  # a segment for each drive
+    few = PIPELINE.model_copy(update={"join": JoinSettings(most_drives=1)})
+    with map_store.reading(copy) as store:
+        drives = read_drives(store, {})
+        state = cast("CodedState", map_join.load_places(store.library(drives.library), few))
+        update_index(store, store.drives(), state)
+        before = {path.name for path in store.index.iterdir()}
+        members = {name: about for name, about in store.drives().items() if name != drives.names[0]}
+        later = {1: candidates.places_of(store, list(members)[1], state)}
+        candidates.drives_to_search(store, members, later, state, few)
+        assert {path.name for path in store.index.iterdir()} == before
 
 
 def test_drives_that_satellites_tell_apart_are_not_compared(copy: Path) -> None:

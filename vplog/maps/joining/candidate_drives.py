@@ -79,11 +79,14 @@ def drives_to_search(
     searched: dict[int, Collection[int]] = {number: rows.tolist() for number, rows in near.items()}
     if max(map(len, near.values())) <= most or not isinstance(state, CodedState):
         return searched
-    parts, _ = update_index(store, drives, state, execution)
+    # places that are found and not joined stay in the index
+    found = {drive: about for drive, about in store.drives().items() if about["library"] == state.hash}
+    every = {**drives, **found}
+    parts, _ = update_index(store, every, state, execution)
     for number, views in later.items():
         if len(near[number]) <= most:
             continue
-        numbers = np.full(len(drives) + 1, -1, np.int32)  # the last stands for drives that are in no part
+        numbers = np.full(len(every) + 1, -1, np.int32)  # the last stands for drives that are in no part
         numbers[near[number]] = near[number]
         before = [replace(part, numbers=numbers[part.numbers]) for part in parts]
         _, drive, votes = drive_votes(best_places(before, state, views, PLACES_A_VIEW, execution))

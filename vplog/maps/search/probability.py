@@ -17,6 +17,7 @@ from vplog.execution.execution import Execution
 from vplog.loops.match_probability import LookAlikes, probabilities
 from vplog.maps.search.sequences import drive_indexes
 from vplog.places.sequence import SequenceSettings
+from vplog.storage.mapped_table import mapped_scores
 from vplog.storage.scratch import scratch
 
 if TYPE_CHECKING:
@@ -41,8 +42,7 @@ def answer_probabilities(
             views = np.flatnonzero(answered & (answers.drive[:, 0] == number))
             [(_, index, _)] = drive_indexes(store, drives[number], state, SequenceSettings(length=1))
             with scratch("scores") as folder:
-                shape = len(views), len(index)
-                scores = np.lib.format.open_memmap(folder / "scores.npy", "w+", np.dtype("<f4"), shape)
+                scores = mapped_scores(folder / "scores.npy", (len(views), len(index)))
                 for at, row in enumerate(execution.map(lambda view: index.scores(descriptors[view]), views.tolist())):  # noqa: B023
                     scores[at] = row
                 look_alikes.take(scores, np.arange(len(views)), views)

@@ -24,6 +24,7 @@ from vplog.maps.storage.damage import reading_drive
 from vplog.places.dense import best_rows
 from vplog.places.sequence import SequenceSettings, rank_places
 from vplog.stages import PlaceIndex, PlaceState, index_of_part
+from vplog.storage.mapped_table import mapped_scores
 from vplog.storage.scratch import scratch
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ def best_lines(
             lines, shape = None, (len(descriptors), len(index))
             if look_alikes is not None:
                 file = stack.enter_context(scratch("scores")) / "scores.npy"
-                lines = np.lib.format.open_memmap(file, "w+", np.dtype("<f4"), shape)
+                lines = mapped_scores(file, shape)
             rankings = rank_places(index, descriptors, stops, most, settings, Execution(execution.threads), lines)
             for view, (ranking, support) in enumerate(rankings):
                 rows, first = ranking.rows, np.arange(len(ranking.rows))
