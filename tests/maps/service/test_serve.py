@@ -49,8 +49,10 @@ def served(root: Path, **limits: Any) -> Iterator[tuple[NewestState, Callable[..
     ).start()
     assert ready.wait(30)
 
-    def ask(path: str, body: bytes | None = None) -> tuple[int, dict[str, Any]]:
+    def ask(path: str, body: bytes | None = None, idle: list[HTTPConnection] | None = None) -> tuple[int, Any]:
         connection = HTTPConnection(where[0], timeout=60)
+        if idle is not None:
+            idle.append(connection)  # which stays open
         connection.request("GET" if body is None else "POST", path, body)
         answer = connection.getresponse()
         return answer.status, json.loads(answer.read())
@@ -178,7 +180,7 @@ def test_what_comes_while_the_queue_is_full_is_refused(
         first.start()
         assert begun.wait(30)
         statuses = []
-        threads = [threading.Thread(target=lambda: statuses.append(_status(ask))) for _ in range(3)]
+        threads = [threading.Thread(target=lambda: statuses.append(ask("/query", b"two")[0])) for _ in range(3)]
         for one in threads:
             one.start()
         time.sleep(0.5)
@@ -188,11 +190,36 @@ def test_what_comes_while_the_queue_is_full_is_refused(
         assert 503 in statuses
 
 
-def _status(ask: Callable[..., Any]) -> int:
-    try:
-        return int(ask("/query", b"two")[0])
-    except ValueError:  # the refusal is plain text
-        return 503
+def test_connections_that_are_idle_are_no_requests(root: Path) -> None:
+    """Clients with a pool of connections leave them open."""
+    with served(root, waiting=2) as (_, ask):
+        idle = list[HTTPConnection]()
+        assert [ask("/map", None, idle)[0] for _ in range(6)] == [200] * 6
+
+
+def test_localisations_that_wait_block_nothing_else(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+
+    def slow(*_: object) -> Any:
+        begun.set()
+        go_on.wait(30)
+        raise ResultError("It is over.")
+
+    monkeypatch.setattr(http, "localize_frame", slow)
+    monkeypatch.setattr(NewestState, "localized_in", lambda _: None)
+    image = cv2.imencode(".png", np.zeros((48, 64), np.uint8))[1].tobytes()
+    with served(root) as (_, ask):
+        threads = [threading.Thread(target=ask, args=("/localize", image)) for _ in range(3)]
+        for one in threads:
+            one.start()
+        assert begun.wait(30)
+        about = threading.Thread(target=ask, args=("/map",), daemon=True)
+        about.start()
+        about.join(5)
+        assert not about.is_alive()
+        go_on.set()
+        for one in threads:
+            one.join()
 
 
 def test_boxes_around_a_point_and_drives_within_them() -> None:

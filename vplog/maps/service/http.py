@@ -24,6 +24,7 @@ import numpy as np
 import uvicorn
 from fastapi import FastAPI, HTTPException, Query, Request
 from fastapi.responses import JSONResponse
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from vplog import logs
 from vplog.data import Camera, Frame
@@ -42,6 +43,8 @@ from vplog.storage.scratch import scratch
 from vplog.version import __version__
 
 _PARQUET = b"PAR1"
+_CONNECTIONS = 8
+"""Connections for each request that may be open: clients leave those that are idle open for later requests."""
 _OF_THE_MAP = (UnreadableMapError, DamagedDriveError, UnreachableError)
 """Errors that another query would meet, too: 503, and not 400."""
 
@@ -51,7 +54,7 @@ class Limits:
     """Limits of the service."""
 
     threads: int = 1
-    """Requests that are worked on at once."""
+    """Requests that are worked on at once, beside one localisation."""
     waiting: int = 64
     """Requests that are open at once, those that wait included."""
     megabytes: float = 16.0
@@ -71,7 +74,7 @@ def serve(
     """Answer until the process is interrupted. Raises OSError where the address is taken."""
     settings = uvicorn.Config(
         application(newest, limits, calibration), host, port, log_level="warning", access_log=False,
-        limit_concurrency=limits.waiting, timeout_keep_alive=int(limits.seconds), timeout_graceful_shutdown=10,
+        limit_concurrency=_CONNECTIONS * limits.waiting, timeout_graceful_shutdown=10,
     )  # fmt: skip
     with socket.create_server((host, port)) as listening:
         ready("http://{}:{}".format(*listening.getsockname()))
@@ -82,6 +85,7 @@ def application(newest: NewestState, limits: Limits, calibration: Path | None = 
     """The service as an ASGI application. `calibration` is the camera of pictures that tell none."""
     app = FastAPI(title="vplog map", version=__version__, lifespan=_lifespan(newest, limits), docs_url=None)
     app.router.redirect_slashes = False
+    app.add_middleware(_BoundedRequests, most=limits.waiting)
 
     @app.exception_handler(VplogError)
     async def refused(_: Request, error: VplogError) -> JSONResponse:
@@ -122,9 +126,31 @@ def application(newest: NewestState, limits: Limits, calibration: Path | None = 
     ) -> dict[str, Any]:  # fmt: skip
         """The pose of an image, by the intrinsics in px of its undistorted camera, or by the service's calibration."""
         body, intrinsics = await _body(request, limits), (fx, fy, cx, cy)
-        return await anyio.to_thread.run_sync(_localized, newest, body, intrinsics, calibration)
+        one_at_a_time = request.state.one_at_a_time  # those that wait hold none of the threads
+        return await anyio.to_thread.run_sync(_localized, newest, body, intrinsics, calibration, limiter=one_at_a_time)
 
     return app
+
+
+class _BoundedRequests:
+    """Middleware that refuses requests while `most` are open, those that wait included."""
+
+    def __init__(self, app: ASGIApp, most: int) -> None:
+        self._app, self._most, self._open = app, most, 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        if self._open >= self._most:
+            why = f"{self._open} requests are open already. Ask again later."
+            await JSONResponse({"detail": why}, 503, {"connection": "close"})(scope, receive, send)
+            return
+        self._open += 1
+        try:
+            await self._app(scope, receive, send)
+        finally:
+            self._open -= 1
 
 
 def _numbers(count: int) -> str:
@@ -141,11 +167,11 @@ def _lifespan(newest: NewestState, limits: Limits) -> Any:
             newest.refresh()
 
     @asynccontextmanager
-    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+    async def lifespan(_: FastAPI) -> AsyncIterator[dict[str, Any]]:
         anyio.to_thread.current_default_thread_limiter().total_tokens = limits.threads
         thread = threading.Thread(target=refresh, daemon=True)
         thread.start()
-        yield
+        yield {"one_at_a_time": anyio.CapacityLimiter(1)}
         ended.set()
 
     return lifespan
@@ -208,5 +234,4 @@ def _localized(
         frame = replace(frame, camera=Camera("camera", K, "none", np.zeros(0), width, height, np.eye(4)))
     elif own:
         raise HTTPException(400, "Intrinsics are fx, fy, cx and cy together.")
-    with newest.localizing:
-        return localize_frame(newest.localized_in(), frame, Execution()).record()
+    return localize_frame(newest.localized_in(), frame, Execution()).record()

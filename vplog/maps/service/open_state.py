@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import weakref
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -123,7 +122,6 @@ class NewestState:
         self.now = self._opened(execution)
         self.problem = ""
         """Why the newest state cannot be read, and that before it is answered from; empty where it can."""
-        self.localizing = threading.Lock()
         self._localized: tuple[OpenState, Places] | None = None
 
     def refresh(self) -> bool:
@@ -138,7 +136,7 @@ class NewestState:
         return self._mark != before
 
     def localized_in(self) -> Places:
-        """The newest state's places with poses and landmarks; `localizing` is held meanwhile. Raises VplogError."""
+        """The newest state's places with poses and landmarks, for one thread at a time. Raises VplogError."""
         now = self.now
         if self._localized is None or self._localized[0] is not now:
             with ExitStack() as stack:
