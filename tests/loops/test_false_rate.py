@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from tests.loops import scene
+from tests.results.example import make_run
 from vplog.data import Closures, Verdict
 from vplog.execution.execution import Execution
 from vplog.features.sift import SiftSettings, mirrored
@@ -26,6 +28,7 @@ from vplog.loops.false_rate import (
 )
 from vplog.loops.propose import Proposals
 from vplog.loops.verify import drive_of, verify_between
+from vplog.run import false_rate as run_false_rate
 
 
 @pytest.mark.parametrize("rate", [0.1, 0.05, 0.01])
@@ -148,3 +151,15 @@ def road() -> tuple[Closures, Drive]:
     seen = [scene.view(place, pose, lens, rng, depth=True) for pose in poses]
     drive = drive_of(scene.keyframes(poses), lens, seen.__getitem__, VerifySettings())
     return verify_between(scene.proposals([(12 + i, i) for i in range(1, 12)]), drive, drive, Execution(), 0.0), drive
+
+
+@pytest.mark.parametrize("null", [0, 200])
+def test_a_rate_out_of_reach_names_a_remedy_that_works(null: int, caplog: pytest.LogCaptureFixture) -> None:
+    """More mirrored pairs are none where none can be mirrored, as with the features of a network."""
+    verified = make_run(0).closures
+    verified = replace(
+        verified, verdict=[Verdict.ACCEPTED] * len(verified), p_false=np.full(len(verified), 0.4, np.float32)
+    )
+    found = run_false_rate._admitted(verified, FalseRateSettings(rate=0.1, null_pairs=null), 3, 0)
+    assert set(found.verdict) == {Verdict.NOT_SIGNIFICANT}
+    assert ("false_rate.null_pairs" in caplog.text) == (null > 0)

@@ -56,6 +56,17 @@ class FalseRateSettings(Settings):
     """Pairs of neighbouring keyframes, most, whose verified poses are held against the odometry between them: how many
     are wrong at so many inliers, with depth or stereo; 0 takes every pose of a right place for right."""
 
+    def warnings_between(self) -> list[str]:
+        """Why no closure between two drives is used, where it is so: odometry rules nothing out between them, so that
+        mirrored candidates are all there is to count by."""
+        if self.rate is None or self.null_pairs:
+            return []
+        return [
+            f"--false-rate {self.rate:g}: no closure between drives is used, since no pairs are known that are no "
+            "closures: with false_rate.null_pairs=0, or features other than sift, no candidate is mirrored. Leave the "
+            "rate out."
+        ]
+
 
 def conformal_p(found: Floats | Ints, null: Floats | Ints) -> Floats:
     """(N,) share of the null sample (K,) that does as well, itself counted (Vovk et al. 2005, section 2.2)."""

@@ -77,7 +77,7 @@ def rate_closures(
     certain = [_certain_pairs(view, odometry, rating.propose, most, execution) for view in views]
     known = [_by_odometry(one, view, noise, settings) for one, view in zip(certain, views, strict=True)]
     closures = with_p_false(closures, ruled_out, mirror, *map(np.concatenate, zip(*known, strict=True)))
-    return closures if settings.rate is None else _admitted(closures, settings.rate, int(ruled_out.sum()), count)
+    return _admitted(closures, settings, int(ruled_out.sum()), count)
 
 
 def _mirrored(closures: Closures, drives: Sequence[Drive], rows: Sequence[Ints], execution: Execution) -> Ints:
@@ -138,15 +138,17 @@ def beyond_drift(
     return np.linalg.norm(apart, axis=1) - sigmas * sigma_m > reach_m
 
 
-def _admitted(closures: Closures, rate: float, ruled_out: int, mirrored: int) -> Closures:
-    """The ledger without what is likelier to be false than `rate`, with a warning where that is all."""
+def _admitted(closures: Closures, settings: FalseRateSettings, ruled_out: int, mirrored: int) -> Closures:
+    """The ledger without what is likelier to be false than the rate, if any, with a warning where that is all."""
+    if (rate := settings.rate) is None:
+        return closures
     verified = closures.of(Verdict.ACCEPTED)
     least = closures.p_false[verified].min(initial=1.0)
     if verified.any() and least > rate:
         _log.warning(
             "--false-rate %g: no closure is that certain. Of the %d verified the best have a false rate of %.2g, by "
-            "%d pairs that odometry rules out and %d mirrored ones. Allow more than that, or raise --set "
-            "false_rate.null_pairs.",
+            "%d pairs that odometry rules out and %d mirrored ones. Allow more than that%s.",
             rate, verified.sum(), least, ruled_out, mirrored,
+            ", or raise --set false_rate.null_pairs" if settings.null_pairs else "",  # 0 where none can be mirrored
         )  # fmt: skip
     return at_rate(closures, rate)

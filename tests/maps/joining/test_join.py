@@ -19,6 +19,7 @@ from vplog.evaluate.truth import read_truth
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.graph.joint import JoinSettings
+from vplog.loops.false_rate import FalseRateSettings
 from vplog.loops.propose import ProposeSettings, propose
 from vplog.maps.joining import candidate_drives as candidates
 from vplog.maps.joining import components as component_folders
@@ -377,6 +378,16 @@ def test_the_index_of_drives_that_are_not_joined_stays(copy: Path, monkeypatch: 
         later = {1: candidates.places_of(store, list(members)[1], state)}
         candidates.drives_to_search(store, members, later, state, few)
         assert {path.name for path in store.index.iterdir()} == before
+
+
+def test_a_rate_that_leaves_no_closure_between_drives_says_so(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As with the features of a network, of which no candidate is mirrored."""
+    monkeypatch.setattr(map_join, "_out_of_date", lambda *_: [])
+    held = FalseRateSettings(rate=0.1, null_pairs=0)
+    for rate, said in ((held, True), (FalseRateSettings(rate=0.1), False), (FalseRateSettings(null_pairs=0), False)):
+        with map_store.writing(copy) as store:
+            record = map_join.join(store, PIPELINE.model_copy(update={"false_rate": rate}))
+        assert any("--false-rate 0.1: no closure between drives" in text for text in record["warnings"]) == said
 
 
 def test_drives_that_satellites_tell_apart_are_not_compared(copy: Path) -> None:

@@ -140,6 +140,7 @@ def _join(work: _Work, places: Callable[[], PlaceState] | None) -> dict[str, Any
             f"Closures of {one['query_drive']} to {one['match_drive']} were not enough to join them. {one['reason']}"
             for one in group["apart"]
         ]
+    unjoined += pipeline.rating.false_rate.warnings_between()
     searched = [drives.names[at] for at in work.new]
     cameras = [(drives.names[at], drive_pairs.known_camera(store, drives.member(at), pipeline)) for at in work.new]
     if uncalibrated := [drive for drive, known in cameras if known is not None and known.camera["matrix"] is None]:

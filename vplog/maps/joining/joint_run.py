@@ -111,7 +111,7 @@ def run_joint(
             **head,
             "finished": True,
             "library": {"hash": state.hash, "from": provenance.library_of(library)},
-            **_joint_record(drives, ledgers, joined),
+            **_joint_record(drives, ledgers, joined, pipeline),
             "stages": watch.stages,
             "totals": watch.totals(),
         }
@@ -169,7 +169,9 @@ def _write_maps(out: Path, drives: Sequence[DriveRun], joined: Joined, header: t
             tum.write_tum(folder / "joint_trajectory.tum", trajectory)
 
 
-def _joint_record(drives: Sequence[DriveRun], ledgers: Ledgers, joined: Joined) -> dict[str, Any]:
+def _joint_record(
+    drives: Sequence[DriveRun], ledgers: Ledgers, joined: Joined, pipeline: Pipeline
+) -> dict[str, Any]:  # fmt: skip
     names = [drive_run.name for drive_run in drives]
     maps = [
         {
@@ -178,7 +180,7 @@ def _joint_record(drives: Sequence[DriveRun], ledgers: Ledgers, joined: Joined) 
         }
         for members in joined.maps
     ]
-    pairs, warnings = list(ledgers), []
+    pairs, warnings = list(ledgers), pipeline.rating.false_rate.warnings_between()
     for at, reason in joined.apart.items():
         later, earlier = (names[drive] for drive in pairs[at])
         warnings.append(f"Closures of {later} to {earlier} were not enough to join them. {reason.strip()}")
