@@ -620,6 +620,20 @@ def test_a_dry_run_writes_nothing_and_reckons_by_the_drives_of_the_map(
     assert "have topics of their own" in verb("evaluate", whole, "--truth", "gps", "--gps-topic", "/rtk").error
 
 
+def test_a_dry_run_is_refused_as_its_batch(
+    halves: Path, finished: Path, tmp_path: Path, verb: Callable[..., Said]
+) -> None:
+    (tmp_path / "decisions.csv").write_text("query,match,decision\n")
+    for refused, why in (
+        (("--library", finished / "library"), "they cannot be compared"),
+        (("--set", f"decisions.file={tmp_path / 'decisions.csv'}"), "Decisions are for one drive at a time"),
+        (("--set", "places.references=2"), "was made with places"),
+    ):
+        command = ("batch", halves.parent / "before.mcap", "-o", halves, "--set", "library.size=12", *refused)
+        assert why in verb(*command, "--dry-run").error
+        assert verb(*command).error == verb(*command, "--dry-run").error
+
+
 def test_logs_that_are_refused_leave_no_map(whole: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:
     [library] = (whole / "libraries").iterdir()
     for more in ([], ["--library", library]):

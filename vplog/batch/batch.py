@@ -15,7 +15,7 @@ from typing import Any
 from vplog.batch.drive_inputs import drive_inputs
 from vplog.batch.engine import BatchOptions, Engine, LocalEngine, as_completed, open_engine
 from vplog.batch.log_hashes import BESIDE, NAME, known_hashes
-from vplog.batch.map_library import map_library
+from vplog.batch.map_library import check_plan, map_library
 from vplog.batch.plan import DriveInput, PlannedDrive, common_record, plan_drives, with_topics
 from vplog.batch.worker import DriveState, Outcome, Task, made_by
 from vplog.errors import ResultError, SettingsError, VplogError
@@ -29,7 +29,6 @@ from vplog.maps.storage.contents import damage_warnings
 from vplog.maps.storage.layout import folder_name
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline, load_pipeline, pipeline_from
-from vplog.places.vectors import check_drives
 from vplog.storage.input_hashes import bytes_of
 from vplog.storage.remote_path import RemotePath, located
 
@@ -74,7 +73,6 @@ def run_batch(
         ThreadPoolExecutor(1) as background,
         open_engine(options, execution.threads, store.staging) as workers,
     ):
-        check_drives(pipeline.places, len(given))
         versions = background.submit(made_by)
         digest = map_library(store, given, library, pipeline, execution)
         store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
@@ -82,7 +80,7 @@ def run_batch(
         hashes = known_hashes(given, store.root / NAME, execution)
         common = common_record(pipeline, digest) | versions.result()
         plan = plan_drives(store, given, common, hashes)
-        check_drives(pipeline.places, len(_drives_of_file(pipeline, known, common) | {one.drive for one in plan}))
+        check_plan(plan, known, pipeline, common)
         done = dict[str, DriveState]()
         for one in plan:
             if one.state != "compute":
@@ -142,12 +140,6 @@ def run_batch(
             *_other_versions([record for drive, record in known.items() if drive not in done], common),
         ],
     }
-
-
-def _drives_of_file(pipeline: Pipeline, known: Mapping[str, Any], common: Mapping[str, Any]) -> set[str]:
-    """The drives of the map whose vectors, where places are these, are of the same file as the batch's."""
-    several = getattr(pipeline.places, "model", "")  # its drives have files of their own
-    return {drive for drive, one in known.items() if not several or one.get("settings") == common["settings"]}
 
 
 def write_failures(store: Store, done: Mapping[str, DriveState]) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 from vplog import logs
 from vplog.batch.log_hashes import BESIDE, hashes_beside
+from vplog.batch.map_library import check_plan, known_library
 from vplog.batch.plan import DriveInput, PlannedDrive, common_record, plan_drives, with_topics
 from vplog.batch.worker import made_by
 from vplog.errors import ResultError, VplogError
@@ -18,7 +19,6 @@ from vplog.execution.execution import Execution
 from vplog.maps.storage import map_store
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline
-from vplog.places.library_files import read_library_record
 from vplog.results import run_record
 from vplog.run.provenance import stat_of
 from vplog.storage.input_hashes import bytes_of, files_of, hash_inputs
@@ -36,26 +36,27 @@ def dry_run(
     """The drives of a batch, which of them it would compute, and bytes, images, CPU hours and cost of these.
 
     A log whose place, length and times are those of a drive of the map is not read; files beside it are. CPU hours are
-    those of the map's drives for as many images; `cpu_seconds_from` is how many drives say so. Raises VplogError.
+    those of the map's drives for as many images; `cpu_seconds_from` is how many drives say so. Raises VplogError as the
+    batch does before it begins.
     """
     given = with_topics(inputs, topics)
     with map_store.reading(root) as store, ThreadPoolExecutor(execution.threads) as pool:
-        digest = store.recovered_head().library if store.exists else None
-        digest = digest or (None if library is None else read_library_record(library)["hash"])
-        known = {one["log"]: drive for drive, one in store.drives().items()}
-        hashes = list(pool.map(partial(_hashes, store, known), given))
-        plan = plan_drives(store, given, common_record(pipeline, digest) | made_by(), hashes)
+        digest, drives = known_library(store, len(given), library, pipeline), store.drives()
+        hashes = list(pool.map(partial(_hashes, store, {one["log"]: drive for drive, one in drives.items()}), given))
+        common = common_record(pipeline, digest) | made_by()
+        plan = plan_drives(store, given, common, hashes)
+        check_plan(plan, drives, pipeline, common)
         each, measured = _cpu_s_per_image(store)
-        drives = []
+        found = []
         for one in pool.map(_sizes, plan):
-            drives.append(one)
-            execution.progress("look", len(drives), len(plan))
-    to_compute = [one for one in drives if one["state"] == "compute"]
+            found.append(one)
+            execution.progress("look", len(found), len(plan))
+    to_compute = [one for one in found if one["state"] == "compute"]
     images, seconds, size = (sum(one[name] for one in to_compute) for name in ("images", "seconds", "bytes"))
     hours = each * images / 3600
     return {
         "map": str(root),
-        "drives": drives,
+        "drives": found,
         "compute": len(to_compute),
         "bytes": size,
         "images": images,

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vplog import logs
-from vplog.batch.plan import DriveInput
+from vplog.batch.plan import DriveInput, PlannedDrive
 from vplog.errors import LibraryError, LogError, VplogError
 from vplog.execution.execution import Execution
 from vplog.maps.storage import map_store
 from vplog.maps.storage.map_store import Store
 from vplog.places.library_files import read_library_record
 from vplog.places.reference_choice import PAPER_SIZE, evenly
+from vplog.places.vectors import check_drives
 from vplog.run.reference_library import check_library, library_of_logs
 from vplog.stages import Log
 from vplog.storage.scratch import copy_folder
@@ -25,44 +26,61 @@ _TRIED = 8
 """Frames of a log, over the whole drive, that are decoded before it is relied on: one that does is enough."""
 
 
-def map_library(
-    store: Store, drives: Sequence[DriveInput], given: Path | None, pipeline: Pipeline, execution: Execution
-) -> str:
-    """The hash of the map's library, which is put into the map where it has none yet. Where none of the logs can be
-    read, nothing is made.
+def known_library(store: Store, drives: int, given: Path | None, pipeline: Pipeline) -> str | None:
+    """The hash of the map's library, or of the one given for a map that has none yet; None where one is to be made.
+    Nothing is written.
 
-    Raises LibraryError where another one is given, or where the settings describe places otherwise, and SettingsError
-    where they have decisions.
+    Raises LibraryError where another one is given, or where the settings describe places otherwise or cannot describe
+    so many drives, and SettingsError where they have decisions.
     """
+    check_drives(pipeline.places, drives)
     pipeline.decisions.check_single_drive()
-    begun = store.exists
-    known = store.recovered_head().library if begun else None
+    known = store.recovered_head().library if store.exists else None
     if known is not None and not store.library(known).is_dir():
         raise LibraryError(
             f"{store} lacks its library {known[:12]}. Copy it back, or make another map with `vplog batch`."
         )
-    made = store.staging / "library"
+    if given is None:
+        check_library(None if known is None else store.library(known), pipeline)
+        return known
+    check_library(given, pipeline)
+    digest = str(read_library_record(given)["hash"])
+    if known is not None and known != digest:
+        raise LibraryError(
+            f"{given} has hash {digest[:12]}, and the places of {store} are described with library "
+            f"{known[:12]}: they cannot be compared. Leave --library out, or make another map."
+        )
+    return digest
+
+
+def check_plan(
+    plan: Sequence[PlannedDrive], known: Mapping[str, Any], pipeline: Pipeline, common: Mapping[str, Any]
+) -> None:
+    """Raises LibraryError where the places of a map's drives (`known`) and of those planned are vectors of a file that
+    does not say which drive they are of."""
+    several = getattr(pipeline.places, "model", "")  # its drives have files of their own
+    of_file = {drive for drive, one in known.items() if not several or one.get("settings") == common["settings"]}
+    check_drives(pipeline.places, len(of_file | {one.drive for one in plan}))
+
+
+def map_library(
+    store: Store, drives: Sequence[DriveInput], given: Path | None, pipeline: Pipeline, execution: Execution
+) -> str:
+    """`known_library`, which is put into the map where it has none yet. Where none of the logs can be read, nothing is
+    made."""
+    digest = known_library(store, len(drives), given, pipeline)
+    begun, made = store.exists, store.staging / "library"
+    if begun and digest is not None and store.recovered_head().library == digest:
+        return digest
     if given is not None:
-        check_library(given, pipeline)
-        digest = str(read_library_record(given)["hash"])
-        if known is not None and known != digest:
-            raise LibraryError(
-                f"{given} has hash {digest[:12]}, and the places of {store} are described with library "
-                f"{known[:12]}: they cannot be compared. Leave --library out, or make another map."
-            )
-        if known is None:
-            _decodable(drives, 1)
-            digest = pipeline.places.load(given, Execution(execution.threads)).hash  # checked against its record
-            copy_folder(given, made, f"the library {given} into {store}")
-    elif known is None:
-        digest = library_of_logs(_decodable(drives, PAPER_SIZE), made, pipeline, execution).hash
+        _decodable(drives, 1)
+        digest = pipeline.places.load(given, Execution(execution.threads)).hash  # checked against its record
+        copy_folder(given, made, f"the library {given} into {store}")
     else:
-        check_library(store.library(known), pipeline)
-        digest = known
-    if known is None:
-        if not begun:  # a folder that holds a library alone is known as a map
-            store.write_head(map_store.Head(None, pipeline.model_dump(mode="json")))
-        map_store.add_library(store, made, digest)
+        digest = library_of_logs(_decodable(drives, PAPER_SIZE), made, pipeline, execution).hash
+    if not begun:  # a folder that holds a library alone is known as a map
+        store.write_head(map_store.Head(None, pipeline.model_dump(mode="json")))
+    map_store.add_library(store, made, digest)
     return digest
 
 
