@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 import vplog
+from vplog.errors import SettingsError
 from vplog.maps.storage import map_store
+from vplog.verbs.evaluate_run import FIGURES, broken_limits
+from vplog.verbs.limits import read_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -53,3 +56,11 @@ def test_drives_are_evaluated_each_and_by_tag(
     assert "The run has ate_m" in verb("evaluate", *run, limit).err
     assert "Did you mean ate_m?" in verb("evaluate", *run, "ate_n<0").error
     assert "is no limit" in verb("evaluate", *run, "ate_m<5%").error
+
+
+def test_a_limit_of_what_a_truth_without_orientations_leaves_open_says_so() -> None:
+    """A TUM file was given, of positions alone."""
+    found = {"ate_after": {"rmse_m": 1.0}, "rpe_after": None, "drift_after": None, "closures": None}
+    for name in ("rpe_m", "drift_m"):
+        with pytest.raises(SettingsError, match=f"{name} is not known.* one with orientations"):
+            broken_limits(found, read_limits([f"{name}>1"], FIGURES, "a run"))

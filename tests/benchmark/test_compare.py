@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 import shutil
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
@@ -706,11 +707,14 @@ def test_answers_that_do_not_fit_are_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_another_comparison_is_not_replaced(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
-    """A mistyped -o costs nothing; the same drives are compared again in the same folder."""
+def test_another_comparison_is_not_replaced(
+    verb: Verb, traversals: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A mistyped -o costs nothing; the same drives are compared again in the same folder, from wherever."""
     options = ("--truth", "index", "--methods", "thumbnail", "-o", tmp_path / "out", *QUICK)
-    for _ in range(2):
-        assert verb("compare", *traversals, *options).code == 0
+    for folder in (traversals[0].parent, tmp_path):
+        monkeypatch.chdir(folder)
+        assert verb("compare", *(os.path.relpath(one) for one in traversals), *options).code == 0
     before = (tmp_path / "out" / "compare.json").read_bytes()
     said = verb("compare", *reversed(traversals), *options)
     assert f"holds a comparison of {traversals[0]} in {traversals[1]}" in said.error

@@ -292,6 +292,18 @@ def test_what_lies_between_two_drives_of_a_map_is_not_compared() -> None:
     assert found.max_m < 1e-9
 
 
+def test_an_estimate_of_a_third_of_a_hz_is_interpolated() -> None:
+    """As of odometry that comes at each keyframe; 30 s without it are a gap all the same."""
+    whole = along_x(100.0)
+    rows = np.r_[0:900:60, 1500:2001:60]
+    estimate = Trajectory(whole.stamp_ns[rows], whole.world_from_body[rows])
+    at_ns = whole.stamp_ns[20:1900:100] + 23_000_000
+    truth = Trajectory(at_ns, se3.interpolate_at(whole.stamp_ns, whole.world_from_body, at_ns))
+    compared, interpolated = at_truth(estimate, truth)
+    assert interpolated
+    assert len(compared.stamp_ns) == ((at_ns < estimate.stamp_ns[14]) | (at_ns > estimate.stamp_ns[15])).sum()
+
+
 def test_a_truth_of_1_hz_may_be_longer_than_the_drive() -> None:
     whole = along_x(100.0)
     at_ns = whole.stamp_ns[::20] + 23_000_000

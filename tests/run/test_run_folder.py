@@ -512,3 +512,16 @@ def test_the_command_of_a_run_has_all_that_it_was_given(tmp_path: Path) -> None:
     assert (given.logs, given.one_drive) == ([tmp_path / "1.bag", tmp_path / "2.bag"], True)
     assert given.library == tmp_path / "library"
     assert parser.pipeline_of(given) == load_pipeline("default", changed)
+
+
+@pytest.mark.parametrize("references", [None, 4, 10, 3])
+def test_the_command_has_settings_of_another_kind_that_are_defaults_of_the_usual_one(
+    references: int | None, tmp_path: Path
+) -> None:
+    """They are none of its own."""
+    changed = ["places.kind=bobb_paper", *([] if references is None else [f"places.references={references}"])]
+    pipeline = load_pipeline("default", changed)
+    words = provenance.arguments([tmp_path / "1.bag"], TopicChoice(), pipeline)
+    given = main._parser().parse_args(["run", *words, "-o", "out"])
+    assert parser.pipeline_of(given) == pipeline
+    assert words.count("--set") == (1 if pipeline == load_pipeline("default", changed[:1]) else 2)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import threading
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -93,6 +94,30 @@ def put(source: Path, url: str) -> None:
     with local_output(located(url)) as folder:
         folder.mkdir()
         (folder / source.name).write_bytes(source.read_bytes())
+
+
+def test_a_key_that_may_only_write_writes(bucket: str, drive: Demo, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To it nothing is there, neither by name nor by content."""
+
+    def refused(*_: object) -> bool:
+        raise PermissionError("answers 403")
+
+    with monkeypatch.context() as patch:
+        for name in ("is_file", "stat", "open"):
+            patch.setattr(RemotePath, name, refused)
+        put(drive.truth, f"{bucket}/only-written")
+    assert located(f"{bucket}/only-written/{drive.truth.name}").read_bytes() == drive.truth.read_bytes()
+
+
+def test_a_small_disk_takes_what_leaves_a_tenth_of_it_free(
+    bucket: str, drive: Demo, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put(drive.truth, f"{bucket}/small")
+    there, size = located(f"{bucket}/small/{drive.truth.name}"), drive.truth.stat().st_size
+    for free, fits in ((2 * size, True), (size + size // 20, False)):
+        monkeypatch.setattr("shutil.disk_usage", lambda _, free=free: SimpleNamespace(free=free))
+        with nullcontext() if fits else pytest.raises(LogError, match="no room"), local_copy(there) as here:
+            assert here.read_bytes() == drive.truth.read_bytes()
 
 
 def test_a_log_on_s3_reads_as_the_file_does(drive: Demo, bucket: str) -> None:

@@ -213,8 +213,8 @@ class _Drives:
         options, pairs = self.options, inputs.truth
         return {
             "vplog": __version__,
-            "query": str(self.query),
-            "map": str(self.other),
+            "query": str(self.query.resolve()),
+            "map": str(self.other.resolve()),
             "min_gap": options.min_gap,
             "library": {
                 "from": str(self.library or self.other),

@@ -11,7 +11,7 @@ import scipy
 from vplog.data import Bools, Floats, Int32s, Ints, Trajectory
 from vplog.geometry import se3
 
-_MAX_GAP_S = 2.0
+MAX_GAP_S = 2.0
 """s; truth further apart than this is not interpolated: at 10 m/s a curve in between costs metres."""
 _UPRIGHT = 0.9
 """Length of the mean of unit vectors: they are within some 25 degrees of each other."""
@@ -155,8 +155,9 @@ def positions_at(stamp_ns: Ints, positions: Floats, at_ns: Ints) -> tuple[Floats
     return result, known
 
 
-def bracketing(stamp_ns: Ints, at_ns: Ints) -> tuple[Ints, Ints, Bools]:
-    """Rows of the samples before and after each stamp, one and the same where it is hit, and where that is known."""
+def bracketing(stamp_ns: Ints, at_ns: Ints, max_gap_s: float = MAX_GAP_S) -> tuple[Ints, Ints, Bools]:
+    """Rows of the samples before and after each stamp, one and the same where it is hit, and where that is known: by
+    samples that are no further apart than the gap."""
     if not len(stamp_ns):
         nothing = np.zeros(len(at_ns), np.int64)
         return nothing, nothing, np.zeros(len(at_ns), bool)
@@ -164,7 +165,7 @@ def bracketing(stamp_ns: Ints, at_ns: Ints) -> tuple[Ints, Ints, Bools]:
     hit = stamp_ns[right] == at_ns
     left = np.where(hit, right, np.maximum(right - 1, 0))
     inside = (stamp_ns[left] < at_ns) & (at_ns < stamp_ns[right])
-    return left, right, hit | (inside & (stamp_ns[right] - stamp_ns[left] <= _MAX_GAP_S * 1e9))
+    return left, right, hit | (inside & (stamp_ns[right] - stamp_ns[left] <= max_gap_s * 1e9))
 
 
 def _near(query: Floats | Ints, match: Floats | Ints, distance_m: float) -> Iterable[Int32s]:

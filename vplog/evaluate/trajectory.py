@@ -13,7 +13,7 @@ import numpy as np
 
 from vplog.data import Floats, Ints, Trajectory
 from vplog.errors import TruthError, plural
-from vplog.evaluate.pairs import bracketing
+from vplog.evaluate.pairs import MAX_GAP_S, bracketing
 from vplog.geometry import se3
 
 MAX_DIFFERENCE_S = 0.01
@@ -103,9 +103,10 @@ def at_truth(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, bool]
     """The estimate as it is compared with the truth, and whether it was interpolated at the truth's stamps.
 
     It is where most of the truth's poses within it have none of its stamps near: a truth of 1 Hz in a clock of its own.
-    Those in a gap of it, as between the drives of a map, are left out.
+    Those in a gap of it, as between the drives of a map, are left out: thrice its usual step, and 2 s at least.
     """
-    at_ns = truth.stamp_ns[bracketing(estimate.stamp_ns, truth.stamp_ns)[2]]
+    step_s = 1e-9 * float(np.median(np.diff(estimate.stamp_ns))) if len(estimate.stamp_ns) > 1 else 0.0
+    at_ns = truth.stamp_ns[bracketing(estimate.stamp_ns, truth.stamp_ns, max(MAX_GAP_S, 3.0 * step_s))[2]]
     near, _ = _nearest(_seconds(at_ns), _seconds(estimate.stamp_ns))
     if len(at_ns) >= len(estimate.stamp_ns) or 2 * len(near) >= len(at_ns):
         return estimate, False

@@ -108,6 +108,12 @@ def read_single_run(folder: Path) -> dict[str, Any]:
     return record
 
 
+def check_own_folder(folder: Path, what: str) -> None:
+    """Raises ResultError where a run folder is that of a drive of a map, for `what` is to be written into it."""
+    if (folder / "drive.json").is_file():
+        raise ResultError(f"{folder} is a drive of a map, whose files stay as they are. Name another {what} with -o.")
+
+
 def has_metres(record: dict[str, Any]) -> bool:
     """Whether the lengths of a run are metres, by its run.json."""
     return record.get("scale") != "unknown"

@@ -115,13 +115,23 @@ def arguments(
     chosen += [("mask-topic", f"{name}={masks}") for name, masks in topics.mask_topics.items()]
     chosen += [("library", None if library is None else library_of(library))]
     if pipeline is not None:
-        default, given = (_leaves(one.model_dump(mode="json")) for one in (type(pipeline)(), pipeline))
+        default, given = _leaves(_defaults(pipeline)), _leaves(pipeline.model_dump(mode="json"))
         changed = {name: value for name, value in given.items() if value != default.get(name)}
         chosen += [("set", f"{one}={json.dumps(value)}") for one, value in changed.items() if one != "decisions.file"]
     # a URL with its query is shown nowhere
     logs_ = ["LOG" if address(path) != str(path) else str(path) for path in paths]
     options = [text for name, value in chosen if value is not None for text in (f"--{name}", str(value))]
     return [*logs_, *(["--one-drive"] if len(paths) > 1 else []), *options]
+
+
+def _defaults(pipeline: Settings) -> dict[str, Any]:
+    """The settings where nothing but the kinds of methods is changed, each kind as it is unchanged."""
+    plain = type(pipeline)()
+    found = plain.model_dump(mode="json")
+    for name, part in pipeline:
+        if isinstance(part, Settings) and type(part) is not type(getattr(plain, name)):
+            found[name] = {**type(part).model_construct().model_dump(mode="json"), "kind": found[name].get("kind")}
+    return found
 
 
 def _leaves(tree: dict[str, Any], above: str = "") -> dict[str, Any]:

@@ -30,7 +30,9 @@ def ask(folder: Path, count: int = 10, output: Path | None = None) -> dict[str, 
     answers so far, which stay, and open lines for these questions. Raises VplogError with one line.
     """
     record = run_record.read_single_run(folder)
-    output = output or folder / "questions"
+    if output is None:
+        run_record.check_own_folder(folder, "folder")
+        output = folder / "questions"
     keyframes, poses = tables.read_keyframes(folder / "keyframes.parquet")
     closures = tables.read_closures(folder / "closures.parquet")
     graph, weight, _ = tables.read_edges(folder / "edges.parquet", poses)

@@ -99,7 +99,10 @@ def broken_limits(found: dict[str, Any], limits: Sequence[Limit]) -> list[str]:
     for limit in limits:
         known = [(one.get("drive", "The run"), one[limit.name]) for one in rows if one[limit.name] is not None]
         if not known:
-            raise SettingsError(f"--fail-on {limit.text!r}: {limit.name} is not known. Give a TUM file with --truth.")
+            raise SettingsError(
+                f"--fail-on {limit.text!r}: {limit.name} is not known. It needs a TUM file with --truth, and rpe_m and "
+                "drift_m one with orientations."
+            )
         failed = [(who, value) for who, value in known if limit.fails(value)]
         sentences += [f"{who} has {limit.name} {value:.6g} ({limit.text})." for who, value in failed]
     return sentences

@@ -40,6 +40,8 @@ def explain(
     or `log` where that has moved. Raises VplogError with one line.
     """
     record = run_record.read_single_run(folder)
+    if picture is None and not words_only:
+        run_record.check_own_folder(folder, "picture")
     if picture is not None and picture.suffix not in (".png", ".svg"):
         raise ResultError(f"{picture} is neither a .png nor a .svg. Name one with -o.")
     run_record.recorded(record, folder / "run.json", dict, "settings")

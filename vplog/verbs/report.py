@@ -47,8 +47,8 @@ def report(
     Raises VplogError with one line.
     """
     record = run_record.read_single_run(folder)
-    if path is None and (folder / "drive.json").is_file():
-        raise ResultError(f"{folder} is a drive of a map, whose files stay as they are. Name another page with -o.")
+    if path is None:
+        run_record.check_own_folder(folder, "page")
     options = options or TruthOptions()
     if truth is None and options != TruthOptions():
         raise TruthError("--distance-m, --heading-deg, --align and --truth-offset-s need a truth: give --truth.")
