@@ -616,8 +616,8 @@ def test_a_dry_run_writes_nothing_and_reckons_by_the_drives_of_the_map(
     assert (said.code, "3 of 4 drives to compute" in said.out, (tmp_path / "map").exists()) == (1, True, False)
     for option in (("--dry-run", "--metrics", tmp_path / "a.prom"), ("--cost-per-cpu-hour", 1)):
         assert "--dry-run" in verb("batch", *logs, "-o", whole, *option).error
-    for name in ("report", "explain", "ask"):
-        assert "whose files stay as they are" in verb(name, whole / "runs" / "drive=drive").error
+    for name, more in (("report", ()), ("explain", ("--closure", 0)), ("ask", ())):
+        assert "whose files stay as they are" in verb(name, whole / "runs" / "drive=drive", *more).error
     assert files(whole) == before
     assert "have topics of their own" in verb("evaluate", whole, "--truth", "gps", "--gps-topic", "/rtk").error
 

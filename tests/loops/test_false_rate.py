@@ -157,9 +157,7 @@ def road() -> tuple[Closures, Drive]:
 def test_a_rate_out_of_reach_names_a_remedy_that_works(null: int, caplog: pytest.LogCaptureFixture) -> None:
     """More mirrored pairs are none where none can be mirrored, as with the features of a network."""
     verified = make_run(0).closures
-    verified = replace(
-        verified, verdict=[Verdict.ACCEPTED] * len(verified), p_false=np.full(len(verified), 0.4, np.float32)
-    )
+    verified = replace(verified, verdict=[Verdict.ACCEPTED] * len(verified), p_false=np.full(len(verified), 0.4))
     found = run_false_rate._admitted(verified, FalseRateSettings(rate=0.1, null_pairs=null), 3, 0)
     assert set(found.verdict) == {Verdict.NOT_SIGNIFICANT}
     assert ("false_rate.null_pairs" in caplog.text) == (null > 0)
