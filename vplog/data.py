@@ -93,6 +93,8 @@ class Odometry:
     """Where `covariance` is known to be that of the motion since the row before; in a log its values tell."""
 
 
+UNKNOWN_VARIANCE = 1e3
+"""m^2, rad^2 or those of velocities; drivers write 1e3, 99999, 1e6 or more on an axis that they do not measure."""
 RECEIVER_SIGMA_M = 3.0
 """m; horizontal noise of a fix whose covariance is unknown: an open sky without corrections."""
 SCALE_WANDER = 0.01

@@ -81,7 +81,7 @@ def test_a_file_of_one_camera_is_of_that_in_use_and_of_those_it_names(name: str,
     assert np.array_equal(np.asarray(used.camera().matrix), K)
     assert np.array_equal(np.asarray(further.camera().matrix), K) == (name == "cam")
     assert further.camera().matrix is not None
-    assert ("whose own calibration is used" in " ".join(further.warnings)) == (name == "front")
+    assert ("that of the log is used" in " ".join(further.warnings)) == (name == "front")
 
 
 def test_a_calibration_of_another_topic_is_said(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,9 @@ from vplog.graph.noise import NoiseSettings, edge_covariance
 from vplog.logs.continuity import without_jumps
 from vplog.logs.dead_reckoning import dead_reckoned, gyro_agrees, turned_by_gyro
 from vplog.logs.formats.container import Notes
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 START_NS = 1_600_000_000_000_000_000
 UNKNOWN = np.nan
@@ -121,3 +126,31 @@ def test_a_robot_that_comes_back_to_its_dock_does_not_start_again() -> None:
     found = without_jumps(Odometry(stamps(at_s), poses, None), "/odom", notes := Notes())
     assert not len(found.breaks)
     assert notes.lines == []
+
+
+def test_axes_that_are_not_measured_take_the_drift_model() -> None:
+    """As diff_drive_controller marks z, roll and pitch: such marks are no noise, whatever the period is."""
+    at_s = np.arange(0, 30, 0.02)
+    variances = np.tile([1e-3, 1e-3, 1e6, 1e6, 1e6, 0.03], (len(at_s), 1))
+    found = dead_reckoned(stamps(at_s), ahead(len(at_s), 1.0), variances)
+    edges, warnings, _ = edge_covariance(found, stamps(np.arange(0.0, 29.0)), NoiseSettings())
+    model, _, _ = edge_covariance(found, stamps(np.arange(0.0, 29.0)), NoiseSettings(source="model"))
+    np.testing.assert_allclose(edges[:, [0, 1, 5], [0, 1, 5]], model[:, [0, 1, 5], [0, 1, 5]])
+    assert "leaves roll, pitch, z unknown" in warnings[0]
+
+
+def test_slow_velocities_beside_a_gyroscope_that_starts_late_are_no_gaps(tmp_path: Path) -> None:
+    from tests.logs.test_odometry_kinds import header, message, opened, topic, velocities
+
+    at_s = np.arange(0, 60, 1.0) + np.random.default_rng(2).uniform(-0.005, 0.005, 60)
+    gyro_s = np.arange(30, 60, 0.01)
+    wheels = [{"header": header(int(one), "base_link"), "twist": velocities(2.0, 0.1)} for one in stamps(at_s)]
+    rates = [{"header": header(int(one), "base_link"), "angular_velocity": {"z": 0.1}} for one in stamps(gyro_s)]
+    assert message("geometry_msgs/msg/Twist", **velocities(2.0, 0.1)).linear.x == 2.0
+    log = opened(
+        tmp_path, topic("/twist", "geometry_msgs/msg/TwistStamped", wheels, stamps(at_s)),
+        topic("/imu", "sensor_msgs/msg/Imu", rates, stamps(gyro_s)),
+    )  # fmt: skip
+    odometry = log.odometry()
+    assert odometry is not None and not len(odometry.breaks)
+    assert way_m(odometry) == pytest.approx(118, abs=0.5)

@@ -322,3 +322,18 @@ def test_standing_first_is_no_gap(tmp_path: Path) -> None:
     odometry = log.odometry()
     assert odometry is not None and np.diff(odometry.stamp_ns).max() <= 10**9
     assert not any("standing" in line or "covers" in line for line in log.warnings)
+
+
+def test_a_node_that_was_restarted_is_a_break(tmp_path: Path) -> None:
+    """In the log, after a gap in which any jump might be a motion."""
+    found = []
+    for row in [*range(400), *range(500, 800)]:
+        stamp, x = int(START_NS + 50_000_000 * row), 0.05 * (row if row < 400 else row - 500)
+        pose = matrix(np.array([x, 0.0, 0.0]), Rotation.identity())
+        found += [tf(2, "/tf", stamp, ("odom", "base_link", pose)), image(2, stamp)]
+    log = logs.open(write_ros2(tmp_path / "drive", found))
+    odometry = log.odometry()
+    assert odometry is not None
+    assert odometry.breaks.tolist() == [400]
+    assert any("starts again from its first pose" in line for line in log.warnings)
+    assert odometry.odom_from_body[400, 0, 3] == pytest.approx(0.05 * 399)

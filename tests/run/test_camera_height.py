@@ -9,7 +9,9 @@ import pytest
 
 from vplog.data import Camera, Floats, Frame, Odometry
 from vplog.geometry import se3
+from vplog.graph.noise import NoiseSettings, edge_covariance
 from vplog.run.visual_odometry.ground import Below, below, by_height
+from vplog.run.visual_odometry.metres import without_scale
 from vplog.run.visual_odometry.visual import visual_odometry
 from vplog.verbs.demo.scene import make_scene, take_picture
 from vplog.verbs.demo.settings import DemoSettings
@@ -90,3 +92,19 @@ def test_a_piece_without_a_ground_does_not_take_the_unit_of_its_neighbours_for_i
     assert np.sqrt((sigma_m[piece] ** 2).sum()) > 0.9 * steps[piece - 1].sum()
     assert sigma_m[5] < 2 * sigma_m[: VIEWS // 3].min()
     assert steps[[*range(38), *range(81, 118)]] == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("count", [300, 1000])
+def test_a_long_piece_without_a_scale_is_no_surer_than_a_short_one(count: int) -> None:
+    poses = np.tile(np.eye(4), (count + 100, 1, 1))
+    poses[:, 0, 3] = 1.4 * np.arange(count + 100)
+    noise = np.random.default_rng(1).uniform(1e-4, 2e-4, count + 100)
+    odometry = Odometry(
+        np.arange(count + 100, dtype=np.int64) * 10**8, poses, noise[:, None, None] * np.eye(6),
+        breaks=np.array([count]), of_images=True, increments=True,
+    )  # fmt: skip
+    found = without_scale(odometry, [(0, count)], "satellite fixes")
+    keys = np.arange(5, count - 5, 5, dtype=np.int64) * 10**8
+    edges, warnings, _ = edge_covariance(found, keys, NoiseSettings())
+    assert np.sqrt(edges[:, 3, 3]).min() > 0.9 * 1.4 * np.sqrt(5 * count)
+    assert not any("unusable" in line for line in warnings)

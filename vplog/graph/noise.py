@@ -7,13 +7,11 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from vplog.data import Bools, Floats, Ints, Odometry
+from vplog.data import UNKNOWN_VARIANCE, Bools, Floats, Ints, Odometry
 from vplog.errors import GraphError, plural
 from vplog.geometry import se3
 from vplog.settings import Settings
 
-_UNKNOWN_VARIANCE = 1e3
-"""m^2 or rad^2; drivers write 1e3, 99999, 1e6 or more on an axis that they do not measure."""
 _MOST_CONSTANTS = 4
 """Covariances that a driver chooses from: for motion and rest, or for straight ways and turns."""
 _CHUNK = 1 << 15
@@ -118,17 +116,19 @@ def covariance_without_breaks(
         what = "all zero" if (finite & (logged == 0).all((1, 2))).mean() > 0.5 else "unusable"
         return modelled, [_unknown(f"The odometry's covariance is {what}", settings)], "model"
     variance = variance[sound]
-    known: Bools = np.asarray(((variance > 0) & (variance < _UNKNOWN_VARIANCE)).mean(0) > 0.5)
+    unknown = np.inf if odometry.of_images else UNKNOWN_VARIANCE  # visual odometry has no such marks
+    known: Bools = np.asarray(((variance > 0) & (variance < unknown)).mean(0) > 0.5)
     if not known.any():
         return modelled, [_unknown("The odometry's covariance marks every axis as unknown", settings)], "model"
 
     warnings = []
     usable = sound.copy()
-    usable[sound] = (variance[:, known] < _UNKNOWN_VARIANCE).all(1)
+    usable[sound] = (variance[:, known] < unknown).all(1)
     # an unknown axis must not leak into known ones through the adjoint: the model fills it in at the end
     logged = np.where((known[:, None] & known) & usable[:, None, None], logged, 0.0)
     logged = (logged + np.swapaxes(logged, 1, 2)) / 2
-    accumulated = not odometry.increments and _is_accumulated(variance, known)
+    constants = _constants(variance[usable[sound]][:, known])
+    accumulated = not (constants or odometry.increments) and _is_accumulated(variance, known)
     source = "accumulated" if accumulated else "increments"
     difference = _accumulated_growth if source == "accumulated" else _summed_increments
     covariance = difference(odometry, keys, logged)
@@ -150,11 +150,8 @@ def covariance_without_breaks(
             f"The odometry's covariance is unusable at {int((~usable).sum())} of {len(usable)} samples, "
             f"so {int(broken.sum())} edges take the drift model."
         )
-    most, likes = np.inf, np.round(variance / np.where(variance.any(0), variance.max(0), 1.0), 8)
-    constants = len(np.unique(likes, axis=0))
-    if constants <= max(min(_MOST_CONSTANTS, len(variance) // 10), 1):
-        most = settings.worst_share
-    within, share = _bounded(covariance, modelled, settings.best_share, most)
+    most = settings.worst_share if constants else np.inf
+    within, share = _bounded(covariance, modelled, settings.best_share, most if constants == 1 else np.inf)
     # judged by the surest and the least sure direction of an edge: a sound heading must not hide a vain position
     least, largest = np.median(share[:, 0]), np.median(share[:, -1])
     if least < settings.best_share / 2.0:  # what is raised by less than that was as good as believed
@@ -164,6 +161,8 @@ def covariance_without_breaks(
             f"no odometry reaches, so it is raised to {settings.best_share:.0%} of it."
         )
     if largest > most:
+        if constants > 1:  # which of them it is tells how sure the odometry is
+            within = _bounded(covariance * (most / largest) ** 2, modelled, settings.best_share, np.inf)[0]
         warnings.append(
             f"The odometry's covariance is implausible: it is {plural(constants, 'constant')}, {largest:.1f} times the "
             f"drift model in sigma, so it is lowered to {most:g} times."
@@ -197,6 +196,12 @@ def _travelled(stamps: Ints, step: Floats, keys: Ints) -> Floats:
     """(N-1,) sums between the keyframes of the steps (T-1,) between the samples."""
     since_start = stamps - stamps[0]
     return np.diff(np.interp(keys - stamps[0], since_start, np.concatenate([[0.0], np.cumsum(step)])))
+
+
+def _constants(variance: Floats) -> int:
+    """The number of different rows of (S, A) where a driver chooses from a few; 0 where they are estimates."""
+    count = len(np.unique(np.round(np.log(np.maximum(variance, 1e-300)), 8), axis=0))
+    return count if count <= max(min(_MOST_CONSTANTS, len(variance) // 10), 1) else 0
 
 
 def _is_accumulated(variance: Floats, known: Bools) -> bool:

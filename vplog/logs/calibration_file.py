@@ -69,7 +69,9 @@ class SidecarFiles:
             notes.add(f"{choice.odometry_file.name} carries no covariance; its noise is that of the drift model.")
         self._cameras = [] if choice.calibration_file is None else read_calibrations(choice.calibration_file)
         if self._cameras and choice.of_further_camera and not named_for(self._cameras, choice.image or ""):
-            notes.add(f"{choice.calibration_file} names no camera {choice.image}, whose own calibration is used.")
+            notes.add(
+                f"{choice.calibration_file} names no camera {choice.image}; that of the log is used, if it has one."
+            )
             choice = choice.model_copy(update={"calibration_file": None})
         self.choice, self._path = choice, choice.calibration_file
         """Choice of topics, without a calibration file that is of another camera."""

@@ -108,7 +108,7 @@ def _model(name: str, coefficients: Floats) -> tuple[str, Floats] | None:
     if not np.isfinite(coefficients).all():
         return None
     if not coefficients.any():
-        return "equidistant" if lens_of(name) == "equidistant" else "none", np.zeros(0)
+        return ("equidistant", np.zeros(4)) if lens_of(name) == "equidistant" else ("none", np.zeros(0))
     given, used = len(coefficients), int(np.flatnonzero(coefficients)[-1]) + 1
     counts = _COUNTS.get(lens_of(name) or "", {})
     count = given if given in counts else min((n for n in counts if used <= n < given), default=0)

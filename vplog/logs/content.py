@@ -137,8 +137,7 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     if chosen.odometry is not None:
         odometry, frames = found[chosen.odometry].odometry, found[chosen.odometry].frames
         notes.extend(found[chosen.odometry].notes)
-        jumps = next((one.jumps for one, source in sources if source == chosen.odometry), 0)
-        if odometry is not None and odometry.drifts and jumps:
+        if odometry is not None and odometry.drifts:
             odometry = without_jumps(odometry, chosen.odometry.topic, notes)
     body = frames[-1] if frames else ""
     notes.extend(gps_notes)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from vplog.data import RECEIVER_SIGMA_M, Floats, Gps, Ints, Odometry
+from vplog.data import RECEIVER_SIGMA_M, UNKNOWN_VARIANCE, Floats, Gps, Ints, Odometry
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
 from vplog.logs.stamps import longest_gap_ns
@@ -40,14 +40,15 @@ _LEVEL_RAD = 0.1
 """rad; sigma of roll and pitch, which positions leave unknown: roads are steep to 10 %."""
 
 
-def dead_reckoned(stamp_ns: Ints, twists: Floats, variances: Floats) -> Odometry:
+def dead_reckoned(stamp_ns: Ints, twists: Floats, variances: Floats, longest_ns: int | None = None) -> Odometry:
     """Velocities (T, 6), linear (m/s) then angular (rad/s) in the body's axes, added up by trapezoids; it breaks where
-    there are none for long, as of a recorder that was paused.
+    there are none for longer than `longest_ns`, by their own stamps unless given, as of a recorder that was paused.
 
-    `variances` (T, 6) of these, NaN or zero where unknown, become those of the increments.
+    `variances` (T, 6) of these, NaN or zero where unknown, become those of the increments, but for marks of axes that
+    are not measured.
     """
     seconds = (np.diff(stamp_ns) / 1e9)[:, None]
-    gap = np.diff(stamp_ns) > longest_gap_ns(stamp_ns)
+    gap = np.diff(stamp_ns) > (longest_ns or longest_gap_ns(stamp_ns))
     moved = (twists[1:] + twists[:-1]) / 2 * np.where(gap[:, None], 0.0, seconds)
     step = se3.exp(moved[:, [3, 4, 5, 0, 1, 2]])
     poses = np.tile(np.eye(4), (len(stamp_ns), 1, 1))
@@ -59,7 +60,8 @@ def dead_reckoned(stamp_ns: Ints, twists: Floats, variances: Floats) -> Odometry
     if not known.all():
         return Odometry(stamp_ns, poses, None, breaks=breaks)
     covariance = np.zeros((len(stamp_ns), 6, 6))
-    covariance[1:, range(6), range(6)] = variances[1:, [3, 4, 5, 0, 1, 2]] * seconds**2
+    each = variances[1:, [3, 4, 5, 0, 1, 2]]
+    covariance[1:, range(6), range(6)] = np.where(each < UNKNOWN_VARIANCE, each * seconds**2, each)
     covariance[0] = covariance[1] if len(covariance) > 1 else 0.0
     return Odometry(stamp_ns, poses, covariance, breaks=breaks, increments=True)
 

@@ -161,7 +161,7 @@ def _by_twists(
     inside = np.asarray((gyro_ns >= stamp_ns[0]) & (gyro_ns <= stamp_ns[-1]))
     if inside.sum() < len(rows):
         notes.add(f"{text}.")
-        return _dead_reckoned(stamp_ns, moving, variances, track.topic, notes)
+        return _dead_reckoned(stamp_ns, moving, variances, longest_gap_ns(stamp_ns), track.topic, notes)
     if placed is None and frame_name(read.imu.frame) not in ("", track.child, "base_link"):
         notes.add(f"{read.imu.topic}: its frame has no static transform; it is taken to be mounted as the body is.")
     body_from_imu = np.eye(4) if placed is None else placed
@@ -171,16 +171,19 @@ def _by_twists(
             f"{text}; the gyroscope of {read.imu.topic} is not used, as its turns are not those of the velocities: "
             "its mount (static transform), its unit or its clock is another's."
         )
-        return _dead_reckoned(stamp_ns, moving, variances, track.topic, notes)
+        return _dead_reckoned(stamp_ns, moving, variances, longest_gap_ns(stamp_ns), track.topic, notes)
+    longest_ns = longest_gap_ns(stamp_ns)
     stamp_ns, turned, off = turned_by_gyro(stamp_ns, moving, gyro_ns, gyro)
     bias = "its bias unknown, as the body never stands still for a second"
     bias = bias if off is None else f"less a bias of {np.degrees(off):.3f} deg/s at rest"
     notes.add(f"{text}; it turns by the gyroscope of {read.imu.topic}, {bias}.")
-    return _dead_reckoned(stamp_ns, turned, np.full_like(turned, np.nan), track.topic, notes)
+    return _dead_reckoned(stamp_ns, turned, np.full_like(turned, np.nan), longest_ns, track.topic, notes)
 
 
-def _dead_reckoned(stamp_ns: Ints, twists: Floats, variances: Floats, topic: str, notes: Notes) -> Odometry:
-    odometry = dead_reckoned(stamp_ns, twists, variances)
+def _dead_reckoned(
+    stamp_ns: Ints, twists: Floats, variances: Floats, longest_ns: int, topic: str, notes: Notes
+) -> Odometry:
+    odometry = dead_reckoned(stamp_ns, twists, variances, longest_ns)
     if len(odometry.breaks):
         longest_s = np.diff(odometry.stamp_ns)[odometry.breaks - 1].max() / 1e9
         notes.add(

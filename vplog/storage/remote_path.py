@@ -366,10 +366,12 @@ def local_output(path: Path | RemotePath) -> Iterator[Path]:
     _check_bucket(path)
     with scratch("url") as folder:
         target = folder / (path.name or "out")
-        with suppress(PermissionError):  # of a key that may only write, to which nothing is there
+        try:
             names = next((names for names in _RECORDS if (path / names[0]).is_file()), ())
             for name in names:
                 _download(path / name, target / name)
+        except PermissionError:  # of a key that may only write, to which nothing is there
+            _check_written(path)
         with stands_for(target, path):
             yield target
         files = [target] if target.is_file() else sorted(file for file in target.rglob("*") if file.is_file())
@@ -379,6 +381,17 @@ def local_output(path: Path | RemotePath) -> Iterator[Path]:
                 send(path if file == target else path / file.relative_to(target).as_posix(), file)
         except OSError as error:
             raise ResultError(f"Cannot write {path}: {reason(error)}.") from None
+
+
+def _check_written(path: RemotePath) -> None:
+    """Raises ResultError where no object can be written below; that of the trial is removed where that may be."""
+    probe = path / ".vplog"
+    try:
+        probe.ask("put", b"", upload=True)
+    except OSError as error:
+        raise ResultError(f"Cannot write {path}: {reason(error)}.") from None
+    with suppress(OSError):
+        probe.ask("delete", upload=True)
 
 
 def check_writable(path: RemotePath) -> None:

@@ -25,7 +25,8 @@ def read(path: Path, depth_per_m: float | None = None) -> DataSet:
     calibration = path / "calibration.yaml"
     cameras = {one.name: one for one in read_calibrations(calibration)} if calibration.is_file() else {}
     if (path / "rgb.csv").is_file():
-        streams, remarks = _columns(path, cameras, depth_per_m), []
+        remarks: list[str] = []
+        streams = _columns(path, cameras, depth_per_m, remarks)
     else:  # before 2025: one camera, in the lists of TUM RGB-D
         streams, remarks = tum_rgbd.listed_streams(path, next(iter(cameras.values()), None), depth_per_m)
     if (imu := path / "imu_0.csv").is_file():
@@ -40,7 +41,9 @@ def read(path: Path, depth_per_m: float | None = None) -> DataSet:
     return DataSet("vslam-lab", streams, truth, remarks)
 
 
-def _columns(path: Path, cameras: dict[str, CalibratedCamera], depth_per_m: float | None) -> list[Stream]:
+def _columns(
+    path: Path, cameras: dict[str, CalibratedCamera], depth_per_m: float | None, remarks: list[str]
+) -> list[Stream]:
     """The streams of rgb.csv, whose columns are `ts_NAME (ns)`, or `(s)`, and `path_NAME` for each."""
     table = path / "rgb.csv"
     names = header_of(table)
@@ -59,4 +62,6 @@ def _columns(path: Path, cameras: dict[str, CalibratedCamera], depth_per_m: floa
             streams += camera_streams(topic, *listed, camera)
         elif per_m := depth_per_m or (camera and camera.depth_per_m):
             streams.append(depth_stream(topic, *listed, per_m, image))
+        else:
+            remarks.append(f"{topic} is left out: no calibration has its counts a metre. Give one with --calibration.")
     return streams

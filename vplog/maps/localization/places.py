@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
@@ -48,6 +49,8 @@ from vplog.storage.scratch import scratch
 Likely = list[list[tuple[int, int]]]
 """Drive and row in `Landmarked` of the likeliest places of each of some pictures, best first."""
 
+_AWAY_S = 300.0
+"""s after which a drive is looked for again whose log was not there."""
 _LOADED = 32
 """Drives of a map whose landmarks stay open between pictures, each with up to 20 MB and a file for each camera."""
 
@@ -193,7 +196,7 @@ def _map_search(
 ) -> Search:  # fmt: skip
     """The search for single views in all drives that have landmarks or the log to make them, and are not damaged;
     `warnings` names those that have lost their log or are damaged, as they are found."""
-    parts, problems, lost = list[SegmentView](), list[str](), dict[str, str]()
+    parts, problems, lost, lost_at = list[SegmentView](), list[str](), dict[str, str](), dict[str, float]()
     poseless = [name for name, about in known.items() if about.get(PICTURES) or PLACES_ONLY in about]
     number = {name: at for at, name in enumerate(known)}
 
@@ -229,8 +232,11 @@ def _map_search(
                     loaded[at] = drives[at].load()
                 except LogError as error:  # its log is gone, and it has no landmarks
                     lost[drives[at].name] = f"{drives[at].name} is left out. {error}"
+                    lost_at[drives[at].name] = time.monotonic()
             return (likely, loaded) if lost.keys() <= without else None
 
+        for name in [name for name in lost if time.monotonic() - lost_at[name] > _AWAY_S]:
+            del lost[name]  # a disk or a server may be there again
         while (found := skip_damaged(store, attempt)) is None:
             pass
         warnings[:] = [*problems, *damage_warnings(store), *lost.values()]

@@ -63,8 +63,9 @@ class StoredFile:
         if cache is None:
             raise ResultError("A worker has no cache for the index of the map. Set VPLOG_CACHE to a folder there.")
         target = cache.root / "objects" / self.sha256
-        with suppress(FileNotFoundError):
-            os.utime(target)
+        if target.exists():
+            with suppress(OSError):  # of another user, in a cache that they share
+                os.utime(target)
             return target
         part, place = target.with_name(f".{secrets.token_hex(16)}.part"), cast("RemotePath", located(self.url))
         cache.trim()  # not afterwards: the file may be longer than its bound
