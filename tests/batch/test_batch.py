@@ -528,7 +528,7 @@ def test_a_recording_at_the_place_of_another_is_said_to_replace_it(
     assert batch_of(folder) == []
     shutil.copy2(logs[1], log)
     [warning] = batch_of(log)
-    assert warning.startswith(f"today is replaced: {log} holds another recording")
+    assert warning.startswith(f"today is replaced: {log} is another file than before")
 
 
 def test_a_join_that_fails_takes_no_fates_along(
