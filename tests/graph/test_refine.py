@@ -9,7 +9,7 @@ import pytest
 from tests.benchmarks import back_ends
 from tests.benchmarks.worlds import world
 from tests.graph.drive import CLOSURE_SIGMA, Drive, position_error, ring, without_loops
-from vplog.data import EdgeKind, Gps, Keyframes, Odometry, PoseGraph
+from vplog.data import EdgeKind, Floats, Gps, Ints, Keyframes, Odometry, PoseGraph
 from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.geometry.geodesy import geodetic, local_enu
@@ -340,6 +340,17 @@ CAMERA = se3.pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
 """A camera that looks ahead: x right, y down, z forward."""
 
 
+def road(
+    true: Floats, stamps: Ints, sigma: Floats, random: np.random.Generator
+) -> tuple[Keyframes, Odometry, PoseGraph]:
+    """A drive without closures whose odometry errs by `sigma` (6,) at each step."""
+    n, poses = len(true), np.tile(np.eye(4), (len(true), 1, 1))
+    for k, step in enumerate(se3.between(true[:-1], true[1:]) @ se3.exp(random.normal(size=(n - 1, 6)) * sigma)):
+        poses[k + 1] = poses[k] @ step
+    keyframes, odometry = Keyframes("road", stamps, poses), Odometry(stamps, poses, None)
+    return keyframes, odometry, build_graph(keyframes, np.tile(np.diag(sigma**2), (n - 1, 1, 1)), None)[0]
+
+
 @pytest.mark.parametrize("bend_deg", [0.0, 5.0])
 @pytest.mark.parametrize("mount", [np.eye(4), CAMERA, CAMERA @ se3.exp(np.array([-0.35, 0, 0, 0, 0, 0]))], ids=str)
 def test_fixes_along_a_straight_road_do_not_turn_it_about_itself(bend_deg: float, mount: np.ndarray) -> None:
@@ -349,12 +360,8 @@ def test_fixes_along_a_straight_road_do_not_turn_it_about_itself(bend_deg: float
     place = np.cumsum(np.stack([np.cos(yaw), np.sin(yaw), 0.0 * yaw], axis=1) * 2.0, axis=0)
     true = se3.pose(se3.so3_exp(np.stack([0.0 * yaw, 0.0 * yaw, yaw], axis=1)), place) @ mount
     sigma = np.repeat([0.002, 0.02], 3)
-    poses = np.tile(np.eye(4), (n, 1, 1))
-    for k, step in enumerate(se3.between(true[:-1], true[1:]) @ se3.exp(random.normal(size=(n - 1, 6)) * sigma)):
-        poses[k + 1] = poses[k] @ step
     stamps = np.arange(n, dtype=np.int64) * 500_000_000
-    keyframes, odometry = Keyframes("road", stamps, poses), Odometry(stamps, poses, None)
-    graph, _, _ = build_graph(keyframes, np.tile(np.diag(sigma**2), (n - 1, 1, 1)), None)
+    keyframes, odometry, graph = road(true, stamps, sigma, random)
     noisy = place + random.normal(size=(n, 3)) * [1.5, 1.5, 3.0]
     gps = Gps(
         stamps, 48.0 + noisy[:, 1] / DEGREE_M, 8.0 + noisy[:, 0] / (DEGREE_M * np.cos(np.radians(48.0))),
@@ -387,12 +394,8 @@ def test_fixes_without_altitude_do_not_lay_a_climbing_road_flat() -> None:
     rotation = se3.so3_exp(heading) @ se3.so3_exp(np.tile(climb, (n, 1)))
     true = se3.pose(rotation, np.cumsum(20.0 * rotation[:, :, 0], axis=0))
     sigma = np.repeat([0.0005, 0.1], 3)
-    poses = np.tile(np.eye(4), (n, 1, 1))
-    for k, step in enumerate(se3.between(true[:-1], true[1:]) @ se3.exp(random.normal(size=(n - 1, 6)) * sigma)):
-        poses[k + 1] = poses[k] @ step
     stamps = np.arange(n, dtype=np.int64) * 1_000_000_000
-    keyframes, odometry = Keyframes("road", stamps, poses), Odometry(stamps, poses, None)
-    graph, _, _ = build_graph(keyframes, np.tile(np.diag(sigma**2), (n - 1, 1, 1)), None)
+    keyframes, odometry, graph = road(true, stamps, sigma, random)
     noisy = true[:, :3, 3] * [1.0, 1.0, 0.0] + random.normal(size=(n, 3)) * [1.0, 1.0, 0.0]
     latitude, longitude, _ = geodetic(noisy, (48.0, 8.0, 0.0)).T
     gps = Gps(stamps, latitude, longitude, np.zeros(n), np.tile(np.diag([1.0, 1.0, 1e10]), (n, 1, 1)), None)

@@ -32,7 +32,7 @@ _VERTICAL_SIGMA = 0.1
 held or mounted askew within some 10. It tells the turn about a straight road, which fixes leave open, and little beside
 what they tell of a road that bends."""
 _MOST_EVALUATIONS = 100
-"""Of the errors of fixes moved as one; 3 are usual, and many where hardly anything tells the slope of the ground."""
+"""Evaluations of the errors for one frame; 3 are usual, many where hardly anything tells the slope of the ground."""
 _FORWARD = 0.7
 """Share of the way along the body's z from which it is a camera's optical axis, with y down: within 45 degrees."""
 _JUMP = 2

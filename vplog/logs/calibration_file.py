@@ -99,7 +99,7 @@ def camera_for(cameras: list[CalibratedCamera], topic: str, path: Path) -> Calib
 
 
 def named_for(cameras: list[CalibratedCamera], topic: str) -> list[CalibratedCamera]:
-    """Those that have the topic of images, or else a name in it; of ORB-SLAM's two by words for left and right."""
+    """Cameras with the topic of the images, or else a name in it; of ORB-SLAM's two by words for left and right."""
     named = [c for c in cameras if c.topic and (topic == c.topic or topic.startswith(f"{c.topic.rstrip('/')}/"))]
     named = named or [c for c in cameras if c.name in topic.strip("/").split("/")]
     sides = {number for pair in PAIRS for number, word in enumerate(pair) if word in topic}
