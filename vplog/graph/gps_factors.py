@@ -187,20 +187,20 @@ def world_from_enu(poses: Floats, fixes: Fixes, weight: Floats) -> Floats:
     rotation = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
     root = np.sqrt(weight)[:, None, None] * np.linalg.cholesky(np.linalg.inv(fixes.covariance), upper=True)
 
-    seen, measured = target - target_middle, fixes.enu_m - middle
+    antenna, measured = target - target_middle, fixes.enu_m - middle
 
     def turned(x: Floats) -> Floats:
         return rotation.T @ se3.so3_exp(x[:3])
 
     def error(x: Floats) -> Floats:
         R = turned(x)
-        off = seen @ R.T + x[3:] - measured
+        off = antenna @ R.T + x[3:] - measured
         tilt = (R @ vertical - [0.0, 0.0, 1.0]) / _VERTICAL_SIGMA
         return np.concatenate([(root @ off[:, :, None]).ravel(), tilt])
 
     def jacobian(x: Floats) -> Floats:
         around = turned(x), se3.left_jacobian(-x[:3])  # R exp(w + d) = R exp(w) exp(J(-w) d)
-        moved, tilted = (-around[0] @ se3.skew(v) @ around[1] for v in (seen, vertical))
+        moved, tilted = (-around[0] @ se3.skew(v) @ around[1] for v in (antenna, vertical))
         of_fixes = np.concatenate([root @ moved, root], axis=2).reshape(-1, 6)
         of_tilt = np.column_stack([tilted, np.zeros((3, 3))]) / _VERTICAL_SIGMA
         return np.asarray(np.concatenate([of_fixes, of_tilt]), np.float64)
