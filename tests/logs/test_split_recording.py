@@ -77,6 +77,26 @@ def test_a_folder_of_a_packed_ros1_bag_is_the_bag(tmp_path: Path) -> None:
     np.testing.assert_array_equal(logs.open(tmp_path).stamps(), DRIVE.stamp_ns)
 
 
+@pytest.mark.parametrize("kind", ["mcap", "db3"])
+def test_numbered_files_of_two_days_are_not_one_drive(kind: str, tmp_path: Path) -> None:
+    """Without metadata.yaml the names alone say so."""
+    day = tmp_path / "day"
+    day.mkdir()
+    for i, part in enumerate((FIRST, SECOND)):
+        file = KINDS[kind](tmp_path, i, part)
+        file.rename(day / f"run_{i}{file.suffix}")
+    log = logs.open(day)
+    assert (log.name, "2 storage files found by content" in log.warnings[0]) == ("day", True)
+    np.testing.assert_array_equal(log.stamps(), DRIVE.stamp_ns)
+    later = Drive()
+    later.stamp_ns = later.stamp_ns + 86_400 * 10**9
+    storage = "mcap" if kind == "mcap" else "sqlite3"
+    file = write_ros2(tmp_path / "later", ros_messages(later, 2)[1:], storage) / f"later.{kind}"
+    file.rename(day / f"run_2.{kind}")
+    with pytest.raises(LogError, match=r"24.0 hours lie between .*run_1.*run_2.*two drives"):
+        logs.open(day)
+
+
 def test_one_account_of_losses(tmp_path: Path) -> None:
     a, b = (KINDS["protobuf"](tmp_path, i, part) for i, part in enumerate((FIRST, SECOND)))
     (tmp_path / "none.mcap").touch()

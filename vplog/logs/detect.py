@@ -181,13 +181,16 @@ class _Part(NamedTuple):
     contents: Contents
 
 
-def open_drive(paths: Sequence[Path], topics: TopicChoice | None = None, folder: Path | None = None) -> RecordedLog:
-    """One drive recorded in several files, in any order, which has the name of the first, or of their `folder`. Raises
-    LogError where they overlap in time, lie far apart, differ in kind or have no topic in common."""
+def open_drive(
+    paths: Sequence[Path], topics: TopicChoice | None = None, folder: Path | None = None, notes: Notes | None = None
+) -> RecordedLog:
+    """One drive recorded in several files, in any order, which has the name of the first, or of their `folder`; `notes`
+    are remarks on that. Raises LogError where they overlap in time, lie far apart, differ in kind or have no topic in
+    common."""
     if len(paths) == 1:
         return open(paths[0], topics)
     paths = [located(path) for path in paths]
-    notes, parts = Notes(), []
+    notes, parts = notes or Notes(), []
     for path in paths:
         with _reading(path):
             _check_there(path)
@@ -355,9 +358,10 @@ def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice,
     if parts is None:
         names = ", ".join(file.name for file in logs[:_LISTED])
         raise LogError(f"{problem.rstrip('.')}, and the folder holds {len(logs)} logs. Give one of them: {names}.")
-    if all(_magic(part) == "ros1" for part in parts):
-        return open_drive(parts, choice, path)
-    notes.add(f"{problem.rstrip('.')}; {plural(len(parts), 'storage file')} found by content.")
+    if not all(_magic(part) == "ros1" for part in parts):
+        notes.add(f"{problem.rstrip('.')}; {plural(len(parts), 'storage file')} found by content.")
+    if len(parts) > 1:  # several drives may be numbered, too
+        return open_drive(parts, choice, path, notes)
     return _open_bag(path, Metadata(parts, [], {}, 0, 0), choice, notes)
 
 
