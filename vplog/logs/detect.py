@@ -6,7 +6,7 @@ import os
 import re
 import weakref
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -45,6 +45,8 @@ _READERS = {"mcap": McapFile, "ros1": Ros1Bag, "ros2-db3": SqliteBag}
 _DATA_SETS = (kitti, euroc, vslam_lab, tum_rgbd, colmap, utm_images)
 _LOG_NAME = re.compile(r"\.(mcap|bag|db3)(\.zstd?)?$", re.IGNORECASE)
 """Names of logs among other files: to look into each of a bucket costs a request."""
+_NO_LOG = re.compile(r"\.|lost\+found$")
+"""Names of hidden files, and of ext4's folder for root alone."""
 _UNREAD = {".heic", ".heif", ".avif", ".jxl", ".jp2"}
 """Endings of other pictures than those of `image_folder.is_image`."""
 _LISTED = 5
@@ -91,18 +93,22 @@ def logs_below(path: Path) -> list[Path]:
     where it is one drive, or nothing is found there or can be read, as opening it says."""
     path = located(path)
     try:
-        if _LOG_NAME.search(path.name) or not path.is_dir() or len(_data_sets(path)) == 1:
+        if _LOG_NAME.search(path.name) or not path.is_dir():
             return [path]
+        with suppress(OSError):  # of a folder in it, which is a log of its own
+            if len(_data_sets(path)) == 1:
+                return [path]
         found = _logs_below(path, _DEEPEST)
     except OSError:
         return [path]
-    return found if found and found != [path / found[0].name] else [path]
+    alone = found and found == [path / found[0].name] and _LOG_NAME.search(found[0].name)  # its folder is opened
+    return found if found and not alone else [path]
 
 
 def _logs_below(folder: Path, levels: int) -> list[Path]:
     remote = isinstance(folder, RemotePath)
     inside = names_below(folder) if remote else {one.name: one.is_dir() for one in folder.iterdir()}
-    names = sorted((name for name in inside if not name.startswith(".")), key=image_folder.natural_order)
+    names = sorted((name for name in inside if not _NO_LOG.match(name)), key=image_folder.natural_order)
     if "metadata.yaml" in names:
         return [folder]
     if _RESULTS.keys() & names:  # of vplog's own
@@ -112,8 +118,12 @@ def _logs_below(folder: Path, levels: int) -> list[Path]:
     logs = [folder / name for name in names if not inside[name] and _LOG_NAME.search(name)]
     if len(logs) > 1 and split_parts(logs) is not None:
         return [folder]
-    below = [folder / name for name in names if inside[name]] if levels else []
-    return [*logs, *(log for one in below for log in _logs_below(one, levels - 1))]
+    for one in [folder / name for name in names if inside[name]] if levels else []:
+        try:
+            logs += _logs_below(one, levels - 1)
+        except OSError:  # as opening it says
+            logs.append(one)
+    return logs
 
 
 @contextmanager
