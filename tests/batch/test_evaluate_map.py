@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 import vplog
-from vplog.errors import SettingsError
+from vplog.batch.evaluate_map import _means
+from vplog.errors import SettingsError, TruthError
 from vplog.maps.storage import map_store
 from vplog.verbs.evaluate_run import FIGURES, broken_limits
 from vplog.verbs.limits import read_limits
@@ -56,6 +57,23 @@ def test_drives_are_evaluated_each_and_by_tag(
     assert "The run has ate_m" in verb("evaluate", *run, limit).err
     assert "Did you mean ate_m?" in verb("evaluate", *run, "ate_n<0").error
     assert "is no limit" in verb("evaluate", *run, "ate_m<5%").error
+
+
+def test_a_moved_log_is_followed_and_a_damaged_drive_is_named(halves: Path, drive: Demo, tmp_path: Path) -> None:
+    root, moved, manifest = Path(shutil.copytree(halves, tmp_path / "map")), tmp_path / "moved.mcap", tmp_path / "d.csv"
+    with map_store.writing(root) as store:
+        map_store.annotate(store, "after", {"log": str(moved)})
+    manifest.write_text(f"log,name,truth\n{moved},x,gps\ny.mcap,after,{drive.truth}\n")
+    with pytest.raises(TruthError, match=f"Of after: The log of the run {moved} no longer exists"):
+        vplog.evaluate(root, manifest)
+    (root / "runs/drive=before/keyframes.parquet").unlink()
+    manifest.write_text(f"log,truth\n{moved},{drive.truth}\n")
+    rows = vplog.evaluate(root, manifest)["drives"]
+    assert [(one["drive"], bool(one["error"])) for one in rows] == [("before", True), ("after", False)]
+
+
+def test_where_no_closure_was_judged_none_is_known_to_be_false() -> None:
+    assert _means([dict.fromkeys(FIGURES, None)])["false_closures"] is None
 
 
 def test_a_limit_of_what_a_truth_without_orientations_leaves_open_says_so() -> None:

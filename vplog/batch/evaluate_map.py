@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from vplog import logs
 from vplog.batch.drive_inputs import MANIFESTS, manifest
 from vplog.batch.plan import absolute_log
 from vplog.errors import TruthError, VplogError
@@ -27,20 +26,20 @@ def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None =
     that its manifest named when it was computed, else the one that comes with its log. Raises VplogError.
     """
     named = _named_truths(located(truth)) if located(truth).suffix.lower() in MANIFESTS else None
-    drives = []
     with map_store.reading(root) as store:
-        for drive, about in store.drives().items():
-            own = truth if named is None else named.get(drive) or named.get(about["log"]) or ""
+        known, nothing = store.drives(), {"tags": {}, "vplog": None, "truth": "", **figures_of({})}
+        drives = [{"drive": drive, **nothing, "error": why} for drive, why in sorted(store.damaged.items())]
+        for drive, about in known.items():
+            own = truth if named is None else named.get(about["log"]) or named.get(drive) or ""
             own = about.get("truth", "auto") if own == "auto" else own
             row = {"drive": drive, "tags": about.get("tags", {}), "vplog": None, "truth": shown(own)}
             try:
                 folder = store.run(drive, [*map_store.RUN_TABLES, "result.mcap"])
                 record = run_record.read_run_json(folder / "run.json")
                 row["vplog"] = record.get("vplog")
-                topics = logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json")
                 if not own:
                     raise TruthError(f"{truth} names no truth of it.")
-                found = evaluate(folder, own, topics, options)
+                found = evaluate(folder, own, None, options, about["log"])
             except VplogError as error:
                 found = {"error": str(error)}
             drives.append({**row, **figures_of(found), "error": found.get("error", "")})
@@ -70,4 +69,8 @@ def _groups(drives: Iterable[dict[str, Any]]) -> dict[str, dict[str, Any]]:
 def _means(drives: list[dict[str, Any]]) -> dict[str, Any]:
     known = {name: [one[name] for one in drives if one[name] is not None] for name in (*_MEANS, "false_closures")}
     means = {name: sum(known[name]) / len(known[name]) if known[name] else None for name in _MEANS}
-    return {"drives": len(drives), **means, "false_closures": sum(known["false_closures"])}
+    return {
+        "drives": len(drives),
+        **means,
+        "false_closures": sum(known["false_closures"]) if known["false_closures"] else None,
+    }

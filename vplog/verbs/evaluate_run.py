@@ -66,16 +66,16 @@ class RunEvaluation:
 
 
 def evaluate(
-    folder: Path, truth: str, topics: logs.TopicChoice | None = None, options: TruthOptions | None = None
+    folder: Path, truth: str, topics: logs.TopicChoice | None = None, options: TruthOptions | None = None, log: str = ""
 ) -> dict[str, Any]:
     """ATE, RPE and drift of odometry and result, and which closures are right. `truth` is a TUM file, `gps`, or `auto`:
-    the ground truth that comes with the log, else its GPS.
+    the ground truth that comes with the log, else its GPS. `log` is its path or URL where run.json's is not.
 
     Of a joint run each drive by itself, each map as one trajectory, and the closures between drives.
 
     Raises TruthError or ResultError with one line.
     """
-    record = run_record.read_finished_run(folder)
+    record = run_record.read_finished_run(folder) | ({"log": log} if log else {})
     options = (options or TruthOptions()).of(record)
     if "maps" in record:
         return _joint(folder, record, truth, options)
