@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -15,6 +15,9 @@ from vplog.batch.plan import with_topics
 from vplog.errors import LogError, ResultError, SettingsError
 from vplog.logs import TopicChoice
 from vplog.storage.remote_path import RemotePath, located, send
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 NAMES = (
     "a/one.mcap", "a/two.bag", "a/.hidden.mcap", "b/bag/metadata.yaml", "b/bag/bag_0.mcap", "b/run/run.json",
@@ -64,6 +67,31 @@ def test_a_prefix_of_a_bucket(fleet: Path) -> None:
         assert found(located("s3://bucket/fleet/drives.csv")) == ["s3://bucket/fleet/a/one.mcap", "s3://other/x.mcap"]
         with pytest.raises(LogError, match=r"No log matches s3://bucket/fleet/\*.bag"):
             found(located("s3://bucket/fleet/*.bag"))
+        send(RemotePath("s3://bucket/fleet") / "50%20.mcap", fleet / "notes.txt")
+        assert found(located("s3://bucket/fleet/*.mcap")) == ["s3://bucket/fleet/50%2520.mcap"]
+        files = [f"s3://bucket/fleet/{name}" for name in ("50%2520.mcap", "drives.csv", "notes.txt")]
+        assert set(found(located("s3://bucket/fleet/*"))) == {*files, *(f"s3://bucket/fleet/{name}" for name in LOGS)}
+
+
+@pytest.mark.parametrize("name", ["b", "lost+found"])
+def test_a_folder_that_cannot_be_read_fails_alone(name: str, fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    iterdir, closed = Path.iterdir, fleet / name
+
+    def refused(path: Path) -> Iterator[Path]:
+        if path == closed:
+            raise PermissionError(13, "Permission denied", str(path))
+        return iterdir(path)
+
+    closed.mkdir(exist_ok=True)
+    monkeypatch.setattr(Path, "iterdir", refused)
+    logs = [*LOGS[:2], "b", *LOGS[3:]] if name == "b" else LOGS
+    assert found(fleet) == [str(fleet / name) for name in logs]
+
+
+def test_the_image_topic_of_a_row_stands_without_other_cameras(tmp_path: Path) -> None:
+    (tmp_path / "drives.csv").write_text("log,image_topic\na.mcap,/front\nb.mcap,\n")
+    drives = with_topics(drive_inputs([tmp_path / "drives.csv"]), TopicChoice(image="/left", cameras=("/right",)))
+    assert [(one.topics.image, one.topics.cameras) for one in drives] == [("/front", None), ("/left", ("/right",))]
 
 
 def test_a_manifest_has_topics_truth_and_tags_of_each_drive(tmp_path: Path) -> None:

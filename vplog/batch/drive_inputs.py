@@ -63,6 +63,7 @@ def manifest(path: Path) -> list[DriveInput]:
         if names[name := row.get("name", "")] > 1:
             raise SettingsError(f"{where}, column name: {name!r} is that of another drive, too. Choose another.")
         topics = {_COLUMNS[one]: _topic(path, where, one, row[one]) for one in _COLUMNS if row.get(one)}
+        topics |= {"cameras": None} if "image" in topics else {}  # those of the command are beside its own image topic
         about = dict[str, Any]()
         if tags := row.keys() - {"log", "name", "truth", *_COLUMNS}:
             about["tags"] = {one: row[one] for one in sorted(tags) if row[one]}
@@ -78,7 +79,9 @@ def _topic(path: Path, where: str, column: str, text: str) -> Any:
     if name in _FILES:
         file = _beside(path, text)
         if isinstance(file, RemotePath):
-            raise SettingsError(f"{where}, column {column}: {file} is not on this machine. Name a local file.")
+            raise SettingsError(
+                f"{where}, column {column}: {file} is not on this machine. Name a local file, in a local manifest."
+            )
         return {"": file.resolve()} if name == "masks" else file.resolve()
     return getattr(TopicChoice.read({name: text}, f"{where}, column {column}"), name)
 
@@ -146,5 +149,6 @@ def _matching(pattern: str) -> list[Path]:
     parts, words = re.split(r"(\*\*/|\*)", f"{begins}*{below}"), {"**/": "(?:.*/)?", "*": "[^/]*"}
     fits = re.compile("".join(words.get(part) or re.escape(part) for part in parts))
     root = cast("RemotePath", located(folder))
-    names = dict.fromkeys(name for one in objects_below(root) for name in (one, *map(str, PurePosixPath(one).parents)))
-    return [located(f"{folder}/{name}") for name in names if fits.fullmatch(name)]
+    places = map(PurePosixPath, objects_below(root))
+    names = dict.fromkeys(str(place) for one in places for place in (one, *list(one.parents)[:-1]))
+    return [located(root / name) for name in names if fits.fullmatch(name)]
