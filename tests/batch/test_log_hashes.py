@@ -68,7 +68,7 @@ def test_what_has_not_changed_is_not_read_again(logs: dict[str, Path], tmp_path:
     record, odometry = tmp_path / ".inputs.json", tmp_path / "odometry.tum"
     odometry.write_text("0 0 0 0 0 0 0 1")
     first = asked(logs, record, odometry_file=odometry)
-    beside = {"beside odometry.tum": hashlib.sha256(b"0 0 0 0 0 0 0 1").hexdigest()}
+    beside = {"beside odometry_file odometry.tum": hashlib.sha256(b"0 0 0 0 0 0 0 1").hexdigest()}
     assert first == (
         [
             {"one.mcap": sha256("one.mcap"), **beside},
@@ -199,6 +199,18 @@ def test_reading_tells_how_far_it_is_and_ends_at_once(tmp_path: Path, monkeypatc
         known_hashes(given({"large": large}, TopicChoice()), tmp_path / ".inputs.json", Execution(2, interrupt))
     assert told[-1][0] == "check (MB)"
     assert 0 < told[-1][1] < told[-1][2] == 10**7
+
+
+def test_files_beside_a_log_of_one_name_are_told_apart(tmp_path: Path, logs: dict[str, Path]) -> None:
+    """As where each drive has a number."""
+    beside = {f"{what}_file": tmp_path / what / "0042.txt" for what in ("odometry", "calibration")}
+    for what, file in beside.items():
+        file.parent.mkdir()
+        file.write_text(what)
+    first, *_ = known_hashes(given(logs, TopicChoice.model_validate(beside)), tmp_path / "record", Execution(1))
+    beside["odometry_file"].write_text("another")
+    second, *_ = known_hashes(given(logs, TopicChoice.model_validate(beside)), tmp_path / "record", Execution(1))
+    assert first != second
 
 
 def test_masks_of_one_name_are_told_apart(tmp_path: Path, logs: dict[str, Path]) -> None:

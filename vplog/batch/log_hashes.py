@@ -105,9 +105,9 @@ def known_hashes(logs: Sequence[DriveInput], record: Path, execution: Execution)
 
 
 def hashes_beside(topics: TopicChoice, hashes_of: Callable[[Path], Hashes]) -> Hashes:
-    """sha256 of the files that topics name beside a log, by BESIDE and their names."""
+    """sha256 of the files that topics name beside a log, by BESIDE, what they are, and their names."""
     return {
-        f"{BESIDE}{f'{what} ' if what.startswith('mask') else ''}{name}": text  # several masks may be called alike
+        f"{BESIDE}{what} {name}": text  # a drive's may all be called alike
         for what, file in topics.files.items()
         for name, text in hashes_of(file).items()
     }
