@@ -28,7 +28,7 @@ from tests.features.small_networks import corners
 from tests.forked import VPLOG, Forked
 from tests.joined import rewritten
 from tests.maps.bucket import serving
-from vplog.batch import batch
+from vplog.batch import batch, dry_run
 from vplog.batch.batch import run_batch
 from vplog.batch.engine import BatchOptions, LocalEngine, as_completed, open_engine
 from vplog.batch.plan import DriveInput, PlannedDrive, absolute_log, name_of
@@ -41,7 +41,7 @@ from vplog.maps.storage.layout import drive_names
 from vplog.pipeline import load_pipeline
 from vplog.results.run_record import read_run_json, write_run_json
 from vplog.run.reference_library import build_library
-from vplog.storage.remote_path import located
+from vplog.storage.remote_path import RemotePath, located, send
 from vplog.verbs.demo.record import IMAGE
 
 if TYPE_CHECKING:
@@ -529,6 +529,38 @@ def test_a_recording_at_the_place_of_another_is_said_to_replace_it(
     shutil.copy2(logs[1], log)
     [warning] = batch_of(log)
     assert warning.startswith(f"today is replaced: {log} is another file than before")
+
+
+def test_a_replaced_object_is_said() -> None:
+    """As latest.mcap of a bucket, which is written over every night."""
+    name = "s3://bucket/latest.mcap"
+    before, now = ({"latest.mcap": f"length {size}, time 1"} for size in (1, 2))
+    told = [DriveState("latest", name, "computed")]
+    assert name in batch._replaced_recordings(told, [now], {"latest": {"inputs": before}})[0]
+    assert not batch._replaced_recordings(told, [now], {"latest": {"inputs": now}})
+
+
+def test_cpu_hours_are_those_of_drives_that_were_computed_from_the_log() -> None:
+    def of(*results: str) -> dict[str, Any]:
+        stages = {f"stage {number}": {"result": result} for number, result in enumerate(results)}
+        return {"totals": {"cpu_seconds": 10.0 * len(results)}, "counts": {"frames": 10}, "stages": stages}
+
+    runs = {"whole": of("computed", "computed"), "resumed": of("reused", "computed")}
+    store = Mock(drives=lambda: runs, figures=runs.__getitem__)
+    assert dry_run._cpu_s_per_image(store) == (2.0, 1)
+
+
+def test_bytes_of_a_bag_in_a_bucket_are_those_of_its_files(tmp_path: Path) -> None:
+    (tmp_path / "part").write_bytes(bytes(10))
+    with serving():
+        for name in ("bag_0.mcap", "bag_1.mcap"):
+            send(RemotePath(f"s3://bucket/bag/{name}"), tmp_path / "part")
+        assert [dry_run._bytes(located(f"s3://bucket/bag{name}")) for name in ("", "/bag_0.mcap")] == [20, 10]
+
+
+def test_a_file_of_metrics_that_cannot_be_written_is_said_first(tmp_path: Path, verb: Callable[..., Said]) -> None:
+    said = verb("batch", tmp_path / "a.mcap", "-o", tmp_path / "map", "--metrics", tmp_path / "no" / "a.prom")
+    assert "there is no folder" in said.error
 
 
 def test_a_join_that_fails_takes_no_fates_along(

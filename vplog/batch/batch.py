@@ -188,7 +188,7 @@ def _replaced_recordings(
     for one, new in zip(outcomes, inputs, strict=True):
         before = known.get(one.drive, {}).get("inputs", {})
         old = {text for name, text in before.items() if not name.startswith(BESIDE)}
-        if one.state == "computed" and old and old.isdisjoint(new.values()) and "://" not in one.log:
+        if one.state == "computed" and old and old.isdisjoint(new.values()):
             result.append(
                 f"{one.drive} is replaced: {one.log} is another file than before. If it holds another drive, give each "
                 "a path of its own, or a name in a manifest, to have both in the map."

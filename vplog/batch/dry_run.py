@@ -103,15 +103,18 @@ def _sizes(one: PlannedDrive) -> dict[str, Any]:
 
 
 def _bytes(path: Path) -> int:
-    return path.stat().st_size if isinstance(path, RemotePath) else bytes_of(path)
+    if not isinstance(path, RemotePath):
+        return bytes_of(path)
+    return sum(file.stat().st_size for file in ([path] if path.is_file() else path.rglob()))
 
 
 def _cpu_s_per_image(store: Store) -> tuple[float, int]:
     """s of a core for an image, by the drives of a map, and how many drives say so."""
     seconds, images, drives = 0.0, 0, 0
     for drive in store.drives():
-        with suppress(ResultError, KeyError, TypeError):
+        with suppress(ResultError, AttributeError, KeyError, TypeError):
             record = store.figures(drive)
             more, count = record["totals"]["cpu_seconds"], record["counts"]["frames"]
-            seconds, images, drives = seconds + more, images + count, drives + 1
+            if all(one["result"] == "computed" for one in record.get("stages", {}).values()):
+                seconds, images, drives = seconds + more, images + count, drives + 1
     return (seconds / images, drives) if seconds and images else (_CPU_S_PER_IMAGE, 0)

@@ -122,6 +122,10 @@ def batch(arguments: argparse.Namespace) -> None:
         raise SettingsError("--dry-run computes nothing that --metrics could count. Leave out one of them.")
     if arguments.cost_per_cpu_hour is not None and not arguments.dry_run:
         raise SettingsError("--cost-per-cpu-hour is for --dry-run. Leave it out, or add that.")
+    if arguments.metrics is not None:
+        from vplog.storage.scratch import check_file_output
+
+        check_file_output(arguments.metrics)
     with Progress(arguments) as progress:
         found = call(api.batch, arguments, progress=progress, on_drive=progress.print_drive)
     if arguments.dry_run:

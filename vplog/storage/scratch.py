@@ -103,9 +103,9 @@ def copy_folder(folder: Path, target: Path, what: str, **how: Any) -> None:
 def check_file_output(path: Path) -> None:
     """Raises ResultError, before any work, where a file to write has no folder or is one."""
     if not path.parent.is_dir():
-        raise ResultError(f"Cannot write {path}: there is no folder {path.parent}. Make it, or choose another with -o.")
+        raise ResultError(f"Cannot write {path}: there is no folder {path.parent}. Make it, or choose another.")
     if path.is_dir():
-        raise ResultError(f"Cannot write {path}: it is a folder. Name a file with -o.")
+        raise ResultError(f"Cannot write {path}: it is a folder. Name a file.")
 
 
 @contextmanager
