@@ -38,6 +38,7 @@ from vplog.execution.process_pool import OwnProcesses, ProcessExpired
 from vplog.logs import TopicChoice
 from vplog.maps.storage import map_store, objects
 from vplog.maps.storage.layout import drive_names
+from vplog.maps.storage.upload import send_run
 from vplog.pipeline import load_pipeline
 from vplog.results.run_record import read_run_json, write_run_json
 from vplog.run.reference_library import build_library
@@ -380,6 +381,34 @@ def test_workers_send_their_drives_to_a_store(
                 assert tables(store.run(drive)) == tables(whole / "runs" / f"drive={drive}")
     assert sent
     assert not [name for name in sent if "/runs/" in name]
+
+
+@pytest.mark.parametrize("retries", [0, 1])
+def test_a_finished_drive_is_committed_again(
+    retries: int, halves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The store takes the first commit, and its answer is lost."""
+    made, put_if, lost = tmp_path / "made", objects.put_if, [OSError("reset")]
+    shutil.copytree(halves / "runs/drive=before", made)
+
+    def losing(path: RemotePath, data: bytes, version: Any) -> Any:
+        found = put_if(path, data, version)
+        if path.name == "map.json" and lost:
+            raise lost.pop()
+        return found
+
+    monkeypatch.setattr(batch, "_PAUSE_S", 0.0)
+    with serving():
+        root = located("s3://bucket/map")
+        with map_store.writing(root) as store:
+            monkeypatch.setattr(objects, "put_if", losing)
+            task = Task("before", "a.mcap", made, tmp_path, load_pipeline("default"), TopicChoice(), 1, {})
+            sent = send_run(RemotePath("s3://bucket/map"), made, time.time())
+            state = batch._publish(store, task, Outcome(sent=sent), 1, retries)
+        assert (state.state, state.fault) == (("computed", "") if retries else ("failed", "network"))
+        with map_store.reading(root) as store:
+            assert list(store.drives()) == ["before"]
+            assert not store.damaged_files("before")
 
 
 def test_a_process_that_dies_takes_no_other_along(monkeypatch: pytest.MonkeyPatch, own_processes: None) -> None:

@@ -13,10 +13,13 @@ import pytest
 from vplog.batch import log_hashes
 from vplog.batch.log_hashes import known_hashes
 from vplog.batch.plan import DriveInput
+from vplog.batch.worker import fault_of
+from vplog.errors import LogError, VplogError
 from vplog.execution.execution import Execution
 from vplog.logs import TopicChoice
 from vplog.logs.formats.mcap_layout import MAGIC
 from vplog.results.run_record import read_run_json
+from vplog.storage.remote_path import RemotePath, located
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,8 +50,8 @@ def logs(tmp_path: Path) -> dict[str, Path]:
 
 def asked(logs: dict[str, Path], record: Path, **beside: Path) -> tuple[list[dict[str, str]], dict[str, str]]:
     answers = known_hashes(given(logs, TopicChoice.model_validate(beside)), record, Execution(2))
-    errors = {name: answer for name, answer in zip(logs, answers, strict=True) if isinstance(answer, str)}
-    return [{} if isinstance(answer, str) else answer for answer in answers], errors
+    errors = {name: str(answer) for name, answer in zip(logs, answers, strict=True) if isinstance(answer, VplogError)}
+    return [{} if isinstance(answer, VplogError) else answer for answer in answers], errors
 
 
 def given(logs: dict[str, Path], topics: TopicChoice) -> list[DriveInput]:
@@ -211,6 +214,23 @@ def test_files_beside_a_log_of_one_name_are_told_apart(tmp_path: Path, logs: dic
     beside["odometry_file"].write_text("another")
     second, *_ = known_hashes(given(logs, TopicChoice.model_validate(beside)), tmp_path / "record", Execution(1))
     assert first != second
+
+
+@pytest.mark.parametrize(("retries", "fault"), [(1, "network"), (2, "")])
+def test_a_server_is_asked_again(retries: int, fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It answers at the third attempt."""
+    failures = [OSError("reset"), OSError("reset")]
+
+    def version(_: RemotePath) -> str:
+        if failures:
+            raise failures.pop()
+        return "length 1"
+
+    monkeypatch.setattr(RemotePath, "is_dir", lambda _: False)
+    monkeypatch.setattr(RemotePath, "version", version)
+    log = DriveInput(located("s3://bucket/a.mcap"))
+    [found] = known_hashes([log], tmp_path / "record", Execution(1), retries)
+    assert (fault_of(log.url, found) if isinstance(found, LogError) else "") == fault
 
 
 def test_masks_of_one_name_are_told_apart(tmp_path: Path, logs: dict[str, Path]) -> None:

@@ -26,6 +26,7 @@ from vplog.maps.joining.join import join as join_drives
 from vplog.maps.joining.join import load_places
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings
+from vplog.maps.storage.damage import UnreachableError
 from vplog.maps.storage.layout import folder_name
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline, load_pipeline, pipeline_from
@@ -35,6 +36,8 @@ from vplog.storage.remote_path import RemotePath, located
 _FREE_BYTES = 10**10
 """Free space of the map's disk below which stage caches are removed: what a drive of several hours needs while it is
 computed, at 0.3 MB a keyframe."""
+_PAUSE_S = 20.0
+"""Time after which a finished drive is committed again to a store that could not be reached."""
 _CODE = ("code", "versions")
 """Fields of drive.json that name the program that made it."""
 
@@ -77,7 +80,7 @@ def run_batch(
         digest = map_library(store, given, library, pipeline, execution)
         store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
         known = store.drives()
-        hashes = known_hashes(given, store.root / NAME, execution)
+        hashes = known_hashes(given, store.root / NAME, execution, options.retries)
         common = common_record(pipeline, digest) | versions.result()
         plan = plan_drives(store, given, common, hashes)
         check_plan(plan, known, pipeline, common)
@@ -85,7 +88,7 @@ def run_batch(
         for one in plan:
             if one.state != "compute":
                 done[one.drive] = DriveState(
-                    one.drive, one.record["log"], one.state, error=one.error, fault="input" if one.error else ""
+                    one.drive, one.record["log"], one.state, error=one.error, fault=one.fault
                 )  # fmt: skip
             if one.state == "failed":
                 options.on_drive(done[one.drive])
@@ -105,7 +108,7 @@ def run_batch(
             places = background.submit(load_places, template.library, pipeline, execution)
         try:
             for ended in as_completed(workers, tasks, options):
-                found = done[ended[0].drive] = _publish(store, *ended)
+                found = done[ended[0].drive] = _publish(store, *ended, options.retries)
                 if found.state == "computed" and not (keep and shutil.disk_usage(store.root).free > _FREE_BYTES):
                     # else it stays for another attempt or the join
                     shutil.rmtree(_cache(store, found.drive), ignore_errors=True)
@@ -268,13 +271,18 @@ def _divide_cores(workers: Engine, jobs: int | None, drives: int) -> tuple[int, 
     return each, jobs or workers.concurrency(each)
 
 
-def _publish(store: Store, task: Task, outcome: Outcome, attempts: int) -> DriveState:
-    drive = task.drive
-    if not outcome.error:
+def _publish(store: Store, task: Task, outcome: Outcome, attempts: int, retries: int) -> DriveState:
+    drive, done = task.drive, False
+    while not (done or outcome.error):
         try:
-            drive = map_store.publish(store, drive, task.folder, outcome.sent)
+            drive, done = map_store.publish(store, task.drive, task.folder, outcome.sent), True
         except ResultError as problem:
-            outcome = replace(outcome, error=str(problem), fault="io")
+            fault = "network" if isinstance(problem, UnreachableError) else "io"
+            if fault == "io" or not retries:
+                outcome = replace(outcome, error=str(problem), fault=fault)
+            else:
+                retries -= 1
+                time.sleep(_PAUSE_S)
     if outcome.error:
         shutil.rmtree(task.folder, ignore_errors=True)
     state = "failed" if outcome.error else "computed"

@@ -12,9 +12,9 @@ from typing import Any
 from vplog import logs
 from vplog.batch.log_hashes import BESIDE, hashes_beside
 from vplog.batch.map_library import check_plan, known_library
-from vplog.batch.plan import DriveInput, PlannedDrive, common_record, plan_drives, with_topics
+from vplog.batch.plan import DriveInput, Hashes, PlannedDrive, common_record, plan_drives, with_topics
 from vplog.batch.worker import made_by
-from vplog.errors import ResultError, VplogError
+from vplog.errors import LogError, ResultError, VplogError
 from vplog.execution.execution import Execution
 from vplog.maps.storage import map_store
 from vplog.maps.storage.map_store import Store
@@ -68,9 +68,9 @@ def dry_run(
     }
 
 
-def _hashes(store: Store, drives: dict[str, str], given: DriveInput) -> dict[str, str] | str:
-    """Hashes of the files of a log and of those beside it, where the log is as it was when its drive was computed; why
-    it is no log."""
+def _hashes(store: Store, drives: dict[str, str], given: DriveInput) -> Hashes | VplogError:
+    """Hashes of the files of a log and of those beside it, where the log is as it was when its drive was computed; the
+    error where it is no log."""
     try:
         logs.check(given.log)
         if drive := drives.get(shown(given.url)):
@@ -83,9 +83,9 @@ def _hashes(store: Store, drives: dict[str, str], given: DriveInput) -> dict[str
     except ResultError:  # it is damaged, and computed again
         pass
     except VplogError as error:
-        return str(error)
+        return error
     except OSError as error:
-        return f"Cannot read {given.log}: {error.strerror or error}."
+        return LogError(f"Cannot read {given.log}: {error.strerror or error}.")
     return {}
 
 

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 from pydantic import TypeAdapter
 
 from vplog import logs as all_logs
-from vplog.batch.plan import DriveInput
-from vplog.errors import LogError, ResultError
+from vplog.batch.plan import DriveInput, Hashes
+from vplog.batch.worker import fault_of
+from vplog.errors import LogError, ResultError, VplogError
 from vplog.results.run_record import read_run_json, write_run_json
 from vplog.storage.input_hashes import bytes_of, changed_s, hash_inputs, stat_signature
 from vplog.storage.remote_path import RemotePath
@@ -37,15 +38,16 @@ _MOST_BYTES = 10**9
 _PROGRESS_EVERY_S = 0.2
 """Interval of progress."""
 
-Hashes = dict[str, str]
 _Entry = dict[str, dict[str, str]]
 """`stat`, the `stat_signature` of a log when it was read, and its `hashes`."""
 _ENTRIES = TypeAdapter(dict[str, _Entry])
 
 
-def known_hashes(logs: Sequence[DriveInput], record: Path, execution: Execution) -> list[Hashes | str]:
-    """sha256 of the files of each log and of those that its topics name beside it, by name, in order; one line where
-    they cannot be read, or are no log.
+def known_hashes(
+    logs: Sequence[DriveInput], record: Path, execution: Execution, retries: int = 0
+) -> list[Hashes | VplogError]:
+    """sha256 of the files of each log and of those that its topics name beside it, by name, in order; the error where
+    they cannot be read, even after `retries` of a server, or are no log.
 
     A file whose length and times are those of the record, a file that is made and updated here, is not read. A record
     that cannot be read is made again, one that cannot be written is done without. Ctrl-C ends it within a block;
@@ -76,14 +78,18 @@ def known_hashes(logs: Sequence[DriveInput], record: Path, execution: Execution)
             current[name] = {"stat": stat, "hashes": hashes}
         return hashes
 
-    def of_log(given: DriveInput, number: int) -> Hashes | str:
+    def of_log(given: DriveInput, number: int, left: int = retries) -> Hashes | VplogError:
         try:
             log = one(given.log, number, True)
             return log | hashes_beside(given.topics, lambda file: one(file, number, False))
         except LogError as error:
-            return str(error)
+            return error
         except OSError as error:
-            return f"Cannot read {error.filename or given.log}: {error.strerror or error}."
+            if left and fault_of(given.url, error) == "network":
+                return of_log(given, number, left - 1)
+            problem = LogError(f"Cannot read {error.filename or given.log}: {error.strerror or error}.")
+            problem.__cause__ = error
+            return problem
 
     with ThreadPoolExecutor(execution.threads) as pool:
         waiting = [pool.submit(of_log, log, number) for number, log in enumerate(logs)]

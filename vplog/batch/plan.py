@@ -9,7 +9,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vplog.errors import ResultError, SettingsError
+from vplog.batch.worker import fault_of
+from vplog.errors import ResultError, SettingsError, VplogError
 from vplog.logs import TopicChoice
 from vplog.maps.storage import layout
 from vplog.places.plugin import PluginSettings
@@ -21,6 +22,9 @@ from vplog.storage.urls import shown
 if TYPE_CHECKING:
     from vplog.maps.storage.map_store import Store
     from vplog.pipeline import Pipeline
+
+Hashes = dict[str, str]
+"""sha256 of files, by name."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,8 @@ class PlannedDrive:
     state: str
     """`compute`, `unchanged` or `failed`."""
     error: str = ""
+    fault: str = ""
+    """Kind of the error, as in Outcome."""
 
     @property
     def drive(self) -> str:
@@ -78,11 +84,11 @@ def common_record(pipeline: Pipeline, library: str | None) -> dict[str, Any]:
 
 
 def plan_drives(
-    store: Store, inputs: Sequence[DriveInput], common: Mapping[str, Any], hashes: Sequence[dict[str, str] | str]
+    store: Store, inputs: Sequence[DriveInput], common: Mapping[str, Any], hashes: Sequence[Hashes | VplogError]
 ) -> list[PlannedDrive]:
     """The drives of these inputs, in order. `hashes` are those of their files, or why there are none."""
     known, plan = store.drives(), list[PlannedDrive]()
-    contents, urls = [{} if isinstance(one, str) else one for one in hashes], [shown(one.url) for one in inputs]
+    contents, urls = [{} if isinstance(one, VplogError) else one for one in hashes], [shown(one.url) for one in inputs]
     given_names = [one.name or name_of(one.log) for one in inputs]
     names = layout.drive_names(given_names, urls, {**_failed(store), **known}, contents)
     for given, drive, url, content, found in zip(inputs, names, urls, contents, hashes, strict=True):
@@ -90,14 +96,14 @@ def plan_drives(
         record = {"drive": drive, "inputs": content, "topics": topics, **common}
         about = {name: value for name, value in known.get(drive, {}).items() if name in layout.ABOUT}
         record |= {**about, "key": key_of(record), "log": url, **given.about}
-        error = found if isinstance(found, str) else ""
-        if error:
-            state = "failed"
-        elif drive in known and layout.made_alike(known[drive], record) and not _is_damaged(store, drive):
+        if isinstance(found, VplogError):
+            plan.append(PlannedDrive(given, record, "failed", str(found), fault_of(given.url, found)))
+            continue
+        if drive in known and layout.made_alike(known[drive], record) and not _is_damaged(store, drive):
             state = "unchanged"
         else:
             state = "compute"
-        plan.append(PlannedDrive(given, record, state, error))
+        plan.append(PlannedDrive(given, record, state))
     return plan
 
 

@@ -150,8 +150,7 @@ def compute_drive(task: Task) -> Outcome:
     except UnreachableError as problem:
         error, fault = str(problem), "network"
     except VplogError as problem:
-        fault = "network" if _is_of_network(task.log, problem) else "io" if is_of_disk(problem) else "input"
-        error = str(problem)
+        error, fault = str(problem), fault_of(task.log, problem)
     except MemoryError:
         error, fault = "Out of memory. Use fewer --jobs, or a machine with more.", "memory"
     except OSError as problem:
@@ -165,10 +164,13 @@ def compute_drive(task: Task) -> Outcome:
     return Outcome(error, fault, seconds, worker, max(peak, round(peak_memory_mb(), 1)), **found)
 
 
-def _is_of_network(url: str, error: VplogError) -> bool:
-    """Whether an error of reading a remote log is that of its server, and not that it has no such file."""
+def fault_of(url: str, error: Exception) -> str:
+    """`Outcome.fault` of an error of reading a log: `network` where it is that of the server of a remote one, and not
+    that it has no such file."""
     kinds = [type(one) for one in causes(error) if isinstance(one, OSError)] if "://" in url else []
-    return any(not issubclass(kind, FileNotFoundError | PermissionError) for kind in kinds)
+    if any(not issubclass(kind, FileNotFoundError | PermissionError) for kind in kinds):
+        return "network"
+    return "io" if is_of_disk(error) else "input"
 
 
 def _compute(task: Task, path: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:

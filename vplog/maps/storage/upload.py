@@ -133,6 +133,8 @@ def publish(mirror: Mirror, drive: str, sent: SentRun, made: Path) -> str:
 
     def change(snapshot: Snapshot) -> None:
         check_recent(sent.began)
+        if snapshot["drives"].get(drive, {}).get("generation") == entry["generation"]:
+            return  # an attempt whose answer was lost
         found[:] = _same_drive(mirror, snapshot["drives"], entry["record"])
         if not found:
             _check_untouched(mirror, snapshot, drive)
