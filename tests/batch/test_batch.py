@@ -411,6 +411,16 @@ def test_a_finished_drive_is_committed_again(
             assert not store.damaged_files("before")
 
 
+def test_the_hashes_of_logs_outlast_the_scratch_folder_of_a_map_in_a_bucket() -> None:
+    with serving():
+        places = []
+        for name in "aab":
+            with map_store.writing(located(f"s3://bucket/{name}")) as store:
+                places.append(batch._hashes_record(store))
+        assert places[0] == places[1] != places[2]
+        assert places[0].parent == Path(os.environ["VPLOG_CACHE"], "hashes")
+
+
 def test_a_process_that_dies_takes_no_other_along(monkeypatch: pytest.MonkeyPatch, own_processes: None) -> None:
     with OwnProcesses(2) as processes:
         dying, living = processes.submit(signal.raise_signal, signal.SIGKILL), processes.submit(os.getpid)

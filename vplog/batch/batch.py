@@ -31,7 +31,9 @@ from vplog.maps.storage.layout import folder_name
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import Pipeline, load_pipeline, pipeline_from
 from vplog.storage.input_hashes import bytes_of
+from vplog.storage.json_records import key_of
 from vplog.storage.remote_path import RemotePath, located
+from vplog.storage.user_cache import cache_folder
 
 _FREE_BYTES = 10**10
 """Free space of the map's disk below which stage caches are removed: what a drive of several hours needs while it is
@@ -80,7 +82,7 @@ def run_batch(
         digest = map_library(store, given, library, pipeline, execution)
         store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
         known = store.drives()
-        hashes = known_hashes(given, store.root / NAME, execution, options.retries)
+        hashes = known_hashes(given, _hashes_record(store), execution, options.retries)
         common = common_record(pipeline, digest) | versions.result()
         plan = plan_drives(store, given, common, hashes)
         check_plan(plan, known, pipeline, common)
@@ -211,6 +213,12 @@ def _other_versions(others: Sequence[dict[str, Any]], common: dict[str, Any]) ->
                 f"them again; the first is {other[0]}."
             )
     return warnings
+
+
+def _hashes_record(store: Store) -> Path:
+    """Path of the record of `known_hashes`: in the map's folder, or in the user's cache of a map on an object store."""
+    folder = None if store.mirror is None else cache_folder(None, "hashes")
+    return folder / f"{key_of(str(store))}.json" if folder is not None else store.root / NAME
 
 
 def _cache(store: Store, drive: str) -> Path:
