@@ -91,6 +91,15 @@ def test_compare_names_it_as_its_own(tiny: Demo, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("installed")
+def test_it_learns_from_whole_images_in_a_comparison(tiny: Demo, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings, seen = type(read_method(NAME, Pipeline())), list[Any]()
+    monkeypatch.setattr(settings, "learn", lambda _, references, __: seen.extend(references) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        compare(tiny.log, None, [NAME], None, Pipeline(), CompareOptions(library_size=2, min_gap=5))
+    assert [one.image.shape for one in seen] == [(one.features.height, one.features.width) for one in seen]
+
+
+@pytest.mark.usefixtures("installed")
 def test_a_run_with_a_library_of_a_plugin(tiny: Demo, tmp_path: Path) -> None:
     pipeline = pipeline_from({**SMALL, "places": {"kind": NAME, "blocks": 2}}, "mine.yaml")
     build_library([tiny.log], tmp_path / "library", pipeline)

@@ -21,6 +21,7 @@ from vplog.benchmark.answers import answers_table, file_stem, write_answers
 from vplog.benchmark.compare_figures import FIGURES, Figures
 from vplog.benchmark.feature_cache import CacheChoice, FeatureFolder
 from vplog.benchmark.method_scores import MethodInputs, evaluate_method
+from vplog.benchmark.published_answers import AnswersSettings
 from vplog.benchmark.recogniser_specs import read_methods
 from vplog.benchmark.sequence_fit import sequence_warning
 from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal, references_of
@@ -32,9 +33,9 @@ from vplog.evaluate.retrieval import Ranks
 from vplog.execution.execution import Execution, logged_warnings
 from vplog.logs import EVERY_IMAGE
 from vplog.pipeline import Pipeline
+from vplog.places import KINDS
 from vplog.places.library_files import check_descriptors, load_references, references_hash
 from vplog.places.network_vector import OnnxSettings
-from vplog.places.plugin import PluginSettings
 from vplog.places.reference_choice import FRAMES_A_REFERENCE, PAPER_SIZE, LibrarySettings, choose
 from vplog.places.self_recognition import MOST, NO_IMAGE, add_until_enough
 from vplog.places.sequence import SequenceSettings
@@ -107,7 +108,8 @@ def compare(
         cached = stack.enter_context(options.cache.opened(scratch))
         drives = _open(query, other, truth, pipeline, options, cached, execution)
         warnings += check_truth(drives.known, drives.query_log, drives.map_log, options.min_gap)  # before the long part
-        images = any(isinstance(one, OnnxSettings | PluginSettings) for one in recognisers.values())
+        without = {*KINDS.values(), AnswersSettings} - {OnnxSettings}  # those of vplog that learn from features alone
+        images = any(type(one) not in without for one in recognisers.values())
         map_traversal, query_traversal, references, notes = drives.extract_all(images)
         warnings += notes
         check_descriptors(references, map_traversal.store[0])
