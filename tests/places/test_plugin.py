@@ -13,6 +13,8 @@ import pytest
 from vplog import logs
 from vplog.benchmark.compare import CompareOptions, compare
 from vplog.benchmark.recogniser_specs import read_method
+from vplog.benchmark.study.experiments import StudyOptions
+from vplog.benchmark.study.study import study
 from vplog.errors import LibraryError, SettingsError
 from vplog.evaluate.place_truth import TruthChoice
 from vplog.execution.execution import Execution
@@ -97,6 +99,14 @@ def test_it_learns_from_whole_images_in_a_comparison(tiny: Demo, monkeypatch: py
     with pytest.raises(ZeroDivisionError):
         compare(tiny.log, None, [NAME], None, Pipeline(), CompareOptions(library_size=2, min_gap=5))
     assert [one.image.shape for one in seen] == [(one.features.height, one.features.width) for one in seen]
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_study_depends_on_its_code(tiny: Demo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vplog.benchmark.study.study.code_of", lambda *modules: 1 / (NAME not in modules))
+    options = StudyOptions(methods=[NAME], min_gap=5, only=["pairs"])
+    with pytest.raises(ZeroDivisionError):
+        study([tiny.log], TruthChoice("poses"), Pipeline(), tmp_path / "out", options)
 
 
 @pytest.mark.usefixtures("installed")

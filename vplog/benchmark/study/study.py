@@ -29,7 +29,6 @@ from vplog.errors import ResultError, SettingsError, TruthError, nearest
 from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, open_truth
 from vplog.execution.execution import Execution, logged_warnings
 from vplog.pipeline import Pipeline
-from vplog.places.plugin import PluginSettings
 from vplog.places.vectors import VectorsSettings, vectors_files
 from vplog.results.run_record import is_ours, read_run_json, write_run_json
 from vplog.results.staging import check_contents, staged
@@ -103,8 +102,7 @@ def study(
             FeatureFolder.of(*cached, path, topics, log, pipeline.features)
             for path, log in zip(drives, opened, strict=True)
         ]
-        plugins = [name for one in recognisers.values() if isinstance(one, PluginSettings) for name in one.modules]
-        scoring = code_of(*_SCORES, *plugins)
+        scoring = code_of(*_SCORES, *{type(one).__module__ for one in recognisers.values()})  # also of plug-ins
         bench = Bench(
             names, opened, hashes, recognisers, known, _covered(known, opened), pipeline, min_gap,
             {**common, "code": scoring}, out / "trials.json", scratch, folders, execution,
