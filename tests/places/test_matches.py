@@ -73,3 +73,11 @@ def test_places_are_compared_without_an_index_of_the_library(
     monkeypatch.undo()
     again = [loaded.describe(reference.features) for reference in references[:6]]
     assert loaded.to_arrow(again).equals(column)
+
+
+def test_a_library_of_patches_alone_is_known_by_its_images(references: list[Reference], tmp_path: Path) -> None:
+    settings = BobbSettings(references=4, features=0)
+    one, other = (settings.prepare(references[rows], Execution()) for rows in (slice(6), slice(6, 12)))
+    assert one.hash != other.hash
+    one.save(tmp_path / "library")
+    assert settings.load(tmp_path / "library", Execution()).hash == one.hash

@@ -101,7 +101,7 @@ def keep_references(references: Iterable[Reference], features: int | None = None
 
 
 def references_hash(references: Sequence[Reference], settings: Settings) -> str:
-    """sha256 over the settings, every feature: what descriptors depend on."""
+    """sha256 over the settings and every feature, or the thumbnails where there is none: what descriptors depend on."""
     digest = hashlib.sha256(json.dumps(settings.identity(), sort_keys=True).encode())
     features = [reference.features for reference in references]
     start = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype("<i4")
@@ -110,6 +110,8 @@ def references_hash(references: Sequence[Reference], settings: Settings) -> str:
     for f in features:
         digest.update(np.ascontiguousarray(f.points, "<f4").tobytes())
         digest.update(np.ascontiguousarray(f.descriptors).tobytes())
+        if not start[-1] and f.thumbnail is not None:  # patches are then all that there is
+            digest.update(f.thumbnail.tobytes())
     return digest.hexdigest()
 
 
