@@ -35,6 +35,7 @@ from vplog.pipeline import Pipeline, load_pipeline
 from vplog.places import KINDS
 from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
+from vplog.places.library_files import name_extractor
 from vplog.places.sequence import SequenceSettings
 from vplog.results.run_record import read_run_json
 
@@ -549,6 +550,9 @@ def test_libraries_of_every_origin(
     few = verb(*arguments, "--library-size", 50).json
     assert few["library"]["size"] == FRAMES
     assert any("16 images instead of 50" in warning for warning in few["warnings"])
+    name_extractor(saved, {"kind": "onnx", "sha256": "0"})
+    assert "was made with features.kind=onnx" in verb(*arguments[:-2], "--library", saved).error
+    name_extractor(saved, SIFT.identity())
     (saved / "features.parquet").write_bytes(b"damaged")
     monkeypatch.setattr(compare, "extract_traversal", None)  # which takes minutes, so a library is read before
     assert str(saved) in verb(*arguments, "--library", saved).error

@@ -41,6 +41,7 @@ from vplog.places.self_recognition import MOST, NO_IMAGE, add_until_enough
 from vplog.places.sequence import SequenceSettings
 from vplog.results import run_record
 from vplog.results.staging import check_contents, staged
+from vplog.run.reference_library import check_extractor
 from vplog.stages import Log
 from vplog.storage.remote_path import located
 from vplog.storage.scratch import replacing
@@ -247,8 +248,11 @@ def _open(
     library, source = options.library, None
     if library is not None and same_drive(library, other):
         library = None
-    if library is not None:
-        source = load_references(library, execution) if _is_saved(library) else logs.open(library, topics)
+    if library is not None and _is_saved(library):
+        check_extractor(library, pipeline.features)
+        source = load_references(library, execution)
+    elif library is not None:
+        source = logs.open(library, topics)
     return _Drives(query, other, query_log, map_log, known, library, source, options, pipeline, cached, execution)
 
 

@@ -77,10 +77,15 @@ def check_library(folder: Path | None, pipeline: Describing) -> None:
                 f"{folder} was made with places.{name}={getattr(made, name)}, and this run has {value}. "
                 f"Build another with `vplog library`, or run with --set places.{name}={getattr(made, name)}."
             )
-    own, extractor = pipeline.features.identity(), record.get("extractor")
+    check_extractor(folder, pipeline.features)
+
+
+def check_extractor(folder: Path, features: FeatureSettings) -> None:
+    """Raises LibraryError where the library's local features are none that compare with these."""
+    own, extractor = features.identity(), read_library_record(folder).get("extractor")
     if not isinstance(extractor, dict):  # of an earlier version
         references = load_references(folder)
-        check_descriptors(references, pipeline.features(references[0].image))
+        check_descriptors(references, features(references[0].image))
         return
     for name in ("kind", "sha256"):  # other settings find more or fewer features, which compare
         if extractor.get(name) != own.get(name):
