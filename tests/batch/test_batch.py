@@ -31,7 +31,7 @@ from tests.maps.bucket import serving
 from vplog.batch import batch, dry_run
 from vplog.batch.batch import run_batch
 from vplog.batch.engine import BatchOptions, LocalEngine, as_completed, open_engine
-from vplog.batch.plan import DriveInput, PlannedDrive, absolute_log, name_of
+from vplog.batch.plan import DriveInput, PlannedDrive, absolute_log, common_record, name_of
 from vplog.batch.worker import DriveState, Outcome, Task, compute_drive
 from vplog.errors import LibraryError, LogError, ResultError, SettingsError
 from vplog.execution.process_pool import OwnProcesses, ProcessExpired
@@ -39,7 +39,8 @@ from vplog.logs import TopicChoice
 from vplog.maps.storage import map_store, objects
 from vplog.maps.storage.layout import drive_names
 from vplog.maps.storage.upload import send_run
-from vplog.pipeline import load_pipeline
+from vplog.pipeline import Pipeline, load_pipeline
+from vplog.places.vectors import VectorsSettings
 from vplog.results.run_record import read_run_json, write_run_json
 from vplog.run.reference_library import build_library
 from vplog.storage.remote_path import RemotePath, located, send
@@ -215,6 +216,13 @@ def test_the_folder_a_batch_is_called_in_is_not_read(
     (tmp_path / "\udcff").touch()
     monkeypatch.chdir(tmp_path)
     assert run_batch(logs, whole, load_pipeline("default", QUICK))["failed"] == 0
+
+
+def test_new_vectors_in_the_same_file_are_another_input(tmp_path: Path) -> None:
+    file = tmp_path / "vectors.npy"
+    pipeline = Pipeline(places=VectorsSettings(file=str(file), model="salad"))
+    records = [common_record(pipeline, None) for content in (b"1", b"2", b"1") if file.write_bytes(content)]
+    assert records[0] == records[2] != records[1]
 
 
 def test_another_library_or_writer_is_refused(whole: Path, logs: list[Path], tmp_path: Path) -> None:

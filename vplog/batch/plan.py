@@ -14,7 +14,9 @@ from vplog.errors import ResultError, SettingsError, VplogError
 from vplog.logs import TopicChoice
 from vplog.maps.storage import layout
 from vplog.places.plugin import PluginSettings
+from vplog.places.vectors import VectorsSettings, vectors_files
 from vplog.run.cache.code_hash import code_of
+from vplog.storage.input_hashes import hash_inputs
 from vplog.storage.json_records import key_of
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.urls import shown
@@ -78,8 +80,10 @@ def with_topics(inputs: Sequence[DriveInput], topics: TopicChoice | None) -> lis
 
 def common_record(pipeline: Pipeline, library: str | None) -> dict[str, Any]:
     """Fields of drive.json that are the same for each drive of a batch. Every setting counts, as every table names them
-    all, and the code of a plug-in; the place of a log does not: a map may move with its logs."""
+    all, the code of a plug-in, and files of vectors; the place of a log does not: a map may move with its logs."""
     about, places = {"settings": key_of(pipeline.model_dump(mode="json")), "library": library}, pipeline.places
+    if isinstance(places, VectorsSettings):
+        about["vectors"] = key_of([hash_inputs(file) for file in vectors_files(places.file)])
     return about | ({"plugin": code_of(*places.modules)["code"]} if isinstance(places, PluginSettings) else {})
 
 
