@@ -162,6 +162,15 @@ def test_pixels_as_the_yaml_has_them(yaml: str, expected: tuple[int, ...], tmp_p
     np.testing.assert_allclose(grown, (image / 255 - network.mean) / network.std, atol=1e-6)
 
 
+def test_a_setting_beside_the_yaml_leaves_the_others(tmp_path: Path) -> None:
+    path = block_means(tmp_path, yaml=f"{YAML}colour: bgr\ninterpolation: cubic\n")
+    found = read_method(f"onnx:{path}:network.interpolation=linear", Pipeline())
+    whole = read_method(f"onnx:{path}", Pipeline()).network
+    assert found.network == whole.model_copy(update={"interpolation": "linear"})
+    path.with_suffix(".yaml").write_text("colour: rgb\n")  # what a run has recorded stays as it was
+    assert OnnxSettings.read(found.model_dump(mode="json"), "run.json") == found
+
+
 def test_channels_come_in_their_order(tmp_path: Path) -> None:
     swapped = OnnxSettings(model=str(block_means(tmp_path, yaml=f"{YAML}colour: bgr\n")))
     plain = OnnxSettings(model=str(block_means(tmp_path)))

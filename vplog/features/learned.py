@@ -47,7 +47,7 @@ class OnnxFeatureSettings(NetworkSettings):
     kind: Literal["onnx"] = "onnx"
     """Name of the extractor."""
     network: LocalNetwork = LocalNetwork()
-    """Its input and outputs; left out, they are read from the YAML."""
+    """Its input and outputs; those left out are read from the YAML."""
     max_features: int = Field(default=2000, ge=1)
     """Features kept of an image."""
 

@@ -108,7 +108,7 @@ class NetworkSettings(Settings):
     sha256: str = ""
     """Digest of the file; empty to take it as it is."""
     network: NetworkInput = NetworkInput()
-    """Its input and outputs; left out, they are read from the YAML."""
+    """Its input and outputs; those left out are read from the YAML."""
 
     @model_validator(mode="before")
     @classmethod
@@ -120,8 +120,11 @@ class NetworkSettings(Settings):
         try:
             if not tree.get("sha256"):
                 found["sha256"] = hashlib.sha256(_content(path)).hexdigest()
+            yaml, given = path.with_suffix(".yaml"), tree.get("network")
             if "network" not in tree:
-                found["network"] = cls._network(path.with_suffix(".yaml"))
+                found["network"] = cls._network(yaml)
+            elif isinstance(given, dict) and not tree.get("sha256") and yaml.exists():  # a run's record has them all
+                found["network"] = {**load_yaml(yaml), **given}
         except SettingsError as error:
             raise ValueError(str(error).rstrip(".")) from None
         return found
