@@ -547,6 +547,11 @@ def test_libraries_of_every_origin(
     assert other["hash"] != default["hash"]
     assert (stored["size"], stored["seed"], stored["hash"]) == (6, None, default["hash"])
     assert without_times(found[0])["methods"] == without_times(found[3])["methods"]
+    assert not any("strongest features" in warning for warning in found[3]["warnings"])
+    cut = tmp_path / "cut"
+    assert verb("library", day, "-o", cut, "--set", "library.size=6", *QUICK, "--set", "places.features=20").code == 0
+    warned = verb(*arguments[:-2], "--library", cut).json["warnings"]
+    assert any("20 strongest features of an image" in one and "vlad:centres=8" in one for one in warned)
     few = verb(*arguments, "--library-size", 50).json
     assert few["library"]["size"] == FRAMES
     assert any("16 images instead of 50" in warning for warning in few["warnings"])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,7 +34,7 @@ from vplog.execution.execution import Execution, logged_warnings
 from vplog.logs import EVERY_IMAGE
 from vplog.pipeline import Pipeline
 from vplog.places import KINDS
-from vplog.places.library_files import check_descriptors, load_references, references_hash
+from vplog.places.library_files import check_descriptors, load_references, read_library_record, references_hash
 from vplog.places.network_vector import OnnxSettings
 from vplog.places.reference_choice import FRAMES_A_REFERENCE, PAPER_SIZE, LibrarySettings, choose
 from vplog.places.self_recognition import MOST, NO_IMAGE, add_until_enough
@@ -112,7 +112,7 @@ def compare(
         without = {*KINDS.values(), AnswersSettings} - {OnnxSettings}  # those of vplog that learn from features alone
         images = any(type(one) not in without for one in recognisers.values())
         map_traversal, query_traversal, references, notes = drives.extract_all(images)
-        warnings += notes
+        warnings += notes + _fewer_features(options.library, references, recognisers)
         check_descriptors(references, map_traversal.store[0])
         stops = candidate_stops(query_traversal.frames, map_traversal.frames, options.min_gap)
         pairs = drives.known.pairs(query_traversal.frames, map_traversal.frames).below(stops)
@@ -277,6 +277,19 @@ def protocol(known: PlaceTruth, pairs: Pairs, min_gap: int | None) -> dict[str, 
 
 def _is_saved(library: Path | None) -> bool:
     return library is not None and os.path.lexists(library / "library.json")
+
+
+def _fewer_features(library: Path | None, references: list[Reference], recognisers: Mapping[str, Any]) -> list[str]:
+    """A warning where a saved library has the strongest features of its images alone, and some methods use more."""
+    if library is None or not _is_saved(library):
+        return []
+    kept = read_library_record(library)["settings"].get("features")
+    if not isinstance(kept, int) or max(len(one.features) for one in references) != kept:
+        return []
+    used = {name: getattr(one, "features", None) for name, one in recognisers.items()}
+    more = [name for name, count in used.items() if isinstance(count, int) and count > kept]
+    uses = f"has the {kept} strongest features of an image, and these methods use more: {', '.join(more)}."
+    return [f"{library} {uses} Give the log of its images as --library."] if more else []
 
 
 def _check_gap(query: Path, itself: bool, min_gap: int | None) -> None:
