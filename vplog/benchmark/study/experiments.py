@@ -21,7 +21,7 @@ Row = dict[str, Any]
 
 METHODS = ("bobb", "bobb_paper", "bovf", "fabmap", "vlad", "gist", "thumbnail")
 """Compared where the user names none."""
-KINDS_OF_BOXES = ("bobb", "bobb_paper")
+KINDS_OF_BOXES = ("bobb", "bobb_paper", "hybrid")
 """Recognisers that explain images by boxes on references: those that the size and the origin of a library matter to
 most, and that pictures can be drawn of."""
 BASE = "bobb"
@@ -104,14 +104,20 @@ class StudyOptions:
 
 
 def box_methods(bench: Bench, options: StudyOptions) -> list[str]:
-    """The methods that make boxes. Raises SettingsError where none does."""
-    found = [name for name in options.methods if bench.methods[name].kind in KINDS_OF_BOXES]
-    if not found:
+    """The methods that make boxes."""
+    return [name for name in options.methods if bench.methods[name].kind in KINDS_OF_BOXES]
+
+
+def fitting_sizes(bench: Bench, options: StudyOptions) -> tuple[list[int], int]:
+    """Library sizes that no drive is too short for, increasing, and the frames of the shortest. Raises SettingsError
+    where there is none."""
+    least = min(len(frames) for frames in bench.frames)
+    fitting = sorted({size for size in options.sizes if size <= least})
+    if not fitting:
         raise SettingsError(
-            f"--methods {','.join(options.methods)}: none of them makes boxes, which this experiment is about. "
-            f"Add {' or '.join(KINDS_OF_BOXES)}, or leave the experiment out with --only."
+            f"--sizes {min(options.sizes)}: the shortest drive has only {least} frames. Give smaller ones."
         )
-    return found
+    return fitting, least
 
 
 def pairs(bench: Bench, options: StudyOptions) -> dict[str, Any]:
@@ -149,15 +155,11 @@ def bits(bench: Bench, options: StudyOptions) -> dict[str, Any]:
 def sizes(bench: Bench, options: StudyOptions) -> dict[str, Any]:
     """Fig. 6: libraries of several sizes from the map."""
     names = box_methods(bench, options)
-    least = min(len(frames) for frames in bench.frames)
-    sizes = sorted(set(options.sizes))
-    fitting, left_out = [size for size in sizes if size <= least], [size for size in sizes if size > least]
-    if not fitting:
-        raise SettingsError(f"--sizes {','.join(map(str, sizes))}: the shortest drive has only {least} frames.")
+    fitting, least = fitting_sizes(bench, options)
     evaluations = (_every(bench, names, lambda drive, size=size: options.libraries(drive, size)) for size in fitting)
     rows = _rows(bench, "sizes", chain.from_iterable(evaluations))
     found: dict[str, Any] = {"rows": rows, "mean": _mean(rows, ("method", "size"))}
-    if left_out:
+    if left_out := sorted({*options.sizes} - {*fitting}):
         found["left_out"] = f"Sizes {left_out} are more than the {least} frames of the shortest drive."
     return found
 

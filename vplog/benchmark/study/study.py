@@ -22,7 +22,7 @@ from vplog.benchmark.feature_cache import FeatureFolder
 from vplog.benchmark.recogniser_specs import read_methods
 from vplog.benchmark.study.evaluation_store import Bench
 from vplog.benchmark.study.example_figures import PICTURES
-from vplog.benchmark.study.experiments import NUMBERS, StudyOptions
+from vplog.benchmark.study.experiments import KINDS_OF_BOXES, NUMBERS, StudyOptions, fitting_sizes
 from vplog.benchmark.study.score_charts import CHARTS
 from vplog.benchmark.traversals import candidate_stops
 from vplog.errors import ResultError, SettingsError, TruthError, nearest
@@ -49,6 +49,8 @@ _TWO_DRIVES = {
     "conditions": "a change of condition between drives",
 }
 """Subject of the experiments that need two drives."""
+_OF_BOXES = ("sizes", "library", *PICTURES)
+"""Experiments that need a method that makes boxes."""
 _SCORES = ("vplog.benchmark.study.evaluation_store", "vplog.benchmark.recogniser_specs")
 """Modules that the scores of an evaluation depend on, with all that these import."""
 
@@ -68,8 +70,8 @@ def study(
     min_gap, topics = options.min_gap, options.topics
     if truth.is_labels:
         topics = every_image(topics)
-    chosen = _choose(options.only, len(drives))
     recognisers = read_methods(options.methods, pipeline)
+    chosen = _choose(options.only, len(drives), any(one.kind in KINDS_OF_BOXES for one in recognisers.values()))
     _check_drives(drives, min_gap)
     warnings: list[str] = []
     with staged(out, lambda: _figures_in(out)) as made, ExitStack() as stack:
@@ -121,6 +123,8 @@ def study(
             "seeds": options.seeds,
             "methods": {name: settings.model_dump(mode="json") for name, settings in recognisers.items()},
         }
+        if "sizes" in chosen:
+            fitting_sizes(bench, options)  # before the long part
         inputs = key_of({**account, "pipeline": pipeline.model_dump(mode="json"), "code": [code_of(__name__), scoring]})
         work = out / _WORK
         done, files = {}, dict[str, Path]()
@@ -211,15 +215,18 @@ def _is_figure(file: Any) -> bool:
     return isinstance(file, str) and PurePath(file).name == file and file.endswith((".png", ".svg"))
 
 
-def _choose(only: Sequence[str] | None, drives: int) -> list[str]:
-    """Names of the experiments to do. Raises SettingsError for one that is none, or that needs more drives."""
+def _choose(only: Sequence[str] | None, drives: int, boxes: bool) -> list[str]:
+    """Names of the experiments to do, where some method makes `boxes` or none. Raises SettingsError for one that is
+    none, or that needs more drives or boxes."""
+    missing = {} if boxes else dict.fromkeys(_OF_BOXES, f"boxes; add {' or '.join(KINDS_OF_BOXES)} to --methods")
+    missing |= {name: f"{what}; give two drives or more" for name, what in _TWO_DRIVES.items() if drives < 2}
     for name in only or ():
         if name not in EXPERIMENTS:
             known = f"Experiments: {', '.join(EXPERIMENTS)}."
             raise SettingsError(f"--only {name}: there is no such experiment.{nearest(name, EXPERIMENTS)} {known}")
-        if drives < 2 and name in _TWO_DRIVES:
-            raise SettingsError(f"--only {name} is about {_TWO_DRIVES[name]}; give two drives or more.")
-    return [name for name in EXPERIMENTS if (only is None or name in only) and not (drives < 2 and name in _TWO_DRIVES)]
+        if name in missing:
+            raise SettingsError(f"--only {name} is about {missing[name]}.")
+    return [name for name in EXPERIMENTS if name not in missing and (only is None or name in only)]
 
 
 def _check_drives(drives: Sequence[Path], min_gap: int | None) -> None:
