@@ -37,6 +37,7 @@ from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
 from vplog.places.library_files import name_extractor
 from vplog.places.sequence import SequenceSettings
+from vplog.places.vectors import VectorsSettings
 from vplog.results.run_record import read_run_json
 
 if TYPE_CHECKING:
@@ -234,6 +235,11 @@ def test_methods_by_kind_pipeline_and_setting(tmp_path: Path) -> None:
     assert read_method(f"{file}:seed=3", SMALL) == PaperBobbSettings(boxes=2, seed=3)
     for kind, settings in KINDS.items():
         assert read_method(kind, Pipeline()).kind == kind == settings().kind
+
+
+def test_files_in_folders_with_an_equals_sign(tmp_path: Path) -> None:
+    path = tmp_path / "lr=0.1" / "a:b.npy"
+    assert read_method(f"vectors:{path}:order=frames", Pipeline()) == VectorsSettings(file=str(path), order="frames")
 
 
 def test_commas_inside_brackets_belong_to_a_value() -> None:
@@ -563,6 +569,24 @@ def test_libraries_of_every_origin(
     assert str(saved) in verb(*arguments, "--library", saved).error
 
 
+def test_a_drives_own_past_with_the_library_of_a_log(traversals: tuple[Path, Path]) -> None:
+    options = compare.CompareOptions(library=traversals[1], min_gap=5)
+    found = compare.compare(traversals[0], None, ["thumbnail"], None, SMALL, options).record["library"]
+    assert (found["from"], found["size"]) == (str(traversals[1]), FRAMES)
+
+
+def test_matches_that_do_not_decode_leave_answers_without_scores(
+    verb: Verb, traversals: tuple[Path, Path], tmp_path: Path
+) -> None:
+    shutil.copytree(traversals[1], tmp_path / "dusk")
+    os.truncate(tmp_path / "dusk" / "3.png", 200)
+    (tmp_path / "truth.csv").write_text("query,match\n3.png,3.png\n")
+    arguments = ("compare", tmp_path / "dusk", traversals[0], "--truth", tmp_path / "truth.csv", *QUICK)
+    said = verb(*arguments, "--methods", "thumbnail")
+    assert said.code == 0, said.err
+    assert "0 with a true match" in said.out
+
+
 def test_frames_without_truth_are_left_out(verb: Verb, drive: Demo, tmp_path: Path) -> None:
     part = tmp_path / "part.tum"
     lines = drive.truth.read_text().splitlines()
@@ -615,6 +639,7 @@ def test_what_cannot_be_compared_is_said_in_one_line(
 def test_what_a_comparison_would_ignore_is_refused(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
     options = (*traversals, "--truth", "index", "--methods", "bobb", *QUICK)
     assert "see --library-size" in verb("compare", *options, "--set", "library.size=5").error
+    assert "with --sequence" in verb("compare", *options, "--set", "sequence.length=5").error
     library = tmp_path / "library"
     assert verb("library", traversals[1], "-o", library, *QUICK, "--set", "library.size=4").code == 0
     assert "leave out --library-size" in verb("compare", *options, "--library", library, "--library-size", 4).error

@@ -182,7 +182,7 @@ class _Drives:
                 raise SettingsError(f"{self.library} is a saved library: leave out --library-size and --library-seed.")
             return map_traversal, query_traversal, source, warnings
         itself = self.query_log is self.map_log
-        size = options.library_size or (None if itself else PAPER_SIZE if source is not None else MOST)
+        size = options.library_size or (PAPER_SIZE if source is not None else None if itself else MOST)
         wanted = LibrarySettings(choose="random", size=size, seed=options.library_seed)
         if source is None or self.library is None:
             rows = self._reference_rows(map_traversal, wanted)

@@ -30,8 +30,8 @@ def read_method(text: str, pipeline: Pipeline, others: Iterable[str] = ()) -> An
     name, *assignments = text.split(":")
     known = KINDS
     location = next(iter(known[name].LOCATIONS), "") if name in known else ""
-    if location and assignments and "=" not in assignments[0]:  # a path may hold colons
-        cut = next((i for i, one in enumerate(assignments) if re.match(r"[a-z_0-9.]+=", one)), len(assignments))
+    cut = next((i for i, one in enumerate(assignments) if re.match(r"[a-z_0-9.]+=", one)), len(assignments))
+    if location and cut:  # a path may hold colons
         assignments = [f"{location}={json.dumps(':'.join(assignments[:cut]))}", *assignments[cut:]]
         chosen = known[name]()  # what a file says of itself is read from it
     elif name in known:

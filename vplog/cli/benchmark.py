@@ -17,9 +17,12 @@ from vplog.execution.execution import Execution
 
 def compare(arguments: argparse.Namespace) -> None:
     """Compare recognisers on two drives, or on one that revisits places."""
-    ignored = [one for one in arguments.set if one.partition(".")[0] not in ("features", "places", "sequence")]
+    groups = ("features", "places") + (("sequence",) if arguments.sequence is not None else ())
+    ignored = [one for one in arguments.set if one.partition(".")[0] not in groups]
     if ignored:
-        raise SettingsError(f"--set {ignored[0]}: only features, places and sequence count here; see --library-size.")
+        raise SettingsError(
+            f"--set {ignored[0]}: only features, places and, with --sequence, sequence count here; see --library-size."
+        )
     with Progress(arguments) as progress:
         done = call(api.compare, arguments, progress=progress)
     print_result(arguments, done.record, printing.print_comparison)

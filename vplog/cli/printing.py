@@ -562,7 +562,7 @@ def print_comparison(found: dict[str, Any]) -> None:
         "r_at_1": "R@1", "r_at_5": "R@5", "r_at_10": "R@10", "anr": "ANR\n%", "ap": "AP", "recall_at_p100": "R@\nP100",
         "f1": "F1",
     }  # fmt: skip
-    if not truth:
+    if not found["positives"]:
         shares = {}
         _print_best_answers(found["answers"])
     nowhere = any(one.get("open_set", {}).get("auroc") is not None for one in found["methods"].values())
