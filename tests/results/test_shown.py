@@ -21,6 +21,7 @@ from tests.results.test_mcap import decode, of
 from vplog.data import USED, Gps, Trajectory, Verdict
 from vplog.errors import ResultError
 from vplog.geometry import se3
+from vplog.maps.geo_bounds import earth_from_record, earth_record
 from vplog.results import foxglove, geo, mcap_read
 from vplog.results.contracts import TOPICS
 from vplog.results.geo import Earth
@@ -301,9 +302,12 @@ def test_a_run_without_metres_lies_on_earth_by_a_similarity() -> None:
     where = geo.on_earth(Earth((49.0, 8.0, 100.0), np.eye(4)), se3.pose(np.eye(3), enu))
     unknown = np.full((len(enu), 3, 3), np.nan)
     fixes = Gps(trajectory.stamp_ns, where[:, 1], where[:, 0], where[:, 2], unknown)
-    earth = earth_of(trajectory, fixes, None, metric=False)
+    mount = se3.pose(np.eye(3), np.array([1.5, 0.0, 1.0]))  # in metres, while the camera's path is in the unit
+    own = poses @ se3.inverse(mount)
+    earth = earth_of(Trajectory(trajectory.stamp_ns, own), fixes, None, mount)
+    earth = earth_from_record(earth_record(earth, own))
     assert earth is not None
-    np.testing.assert_allclose(geo.on_earth(earth, poses), where, atol=1e-5)
+    np.testing.assert_allclose(geo.on_earth(earth, own), where, atol=1e-5)
     ahead = np.array([100.0, 0.0, 0.0])  # of the antenna
     there = geo.on_earth(Earth((49.0, 8.0, 100.0), np.eye(4)), poses @ se3.pose(np.eye(3), ahead))
     placed = Gps(trajectory.stamp_ns, there[:, 1], there[:, 0], there[:, 2], unknown, ahead)
@@ -313,7 +317,7 @@ def test_a_run_without_metres_lies_on_earth_by_a_similarity() -> None:
     np.testing.assert_allclose(geo.on_earth(earth, poses)[:, :2], body[:, :2], atol=1e-6)
     still = np.zeros(len(enu))
     frozen = replace(fixes, latitude_deg=still, longitude_deg=still, altitude_m=still)
-    assert earth_of(trajectory, frozen, None, metric=False) is None
+    assert earth_of(trajectory, frozen, None, np.eye(4)) is None
 
 
 def test_the_antenna_comes_back_with_its_fixes(tmp_path: Path) -> None:

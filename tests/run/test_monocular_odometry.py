@@ -17,7 +17,7 @@ from vplog.errors import TruthError
 from vplog.execution.execution import Execution
 from vplog.geometry import geodesy, se3
 from vplog.pipeline import load_pipeline, run
-from vplog.results import run_record
+from vplog.results import run_record, tables
 from vplog.run.landmarks import run_drive
 from vplog.run.scale_drift import in_one_scale
 from vplog.run.visual_odometry.metres import in_metres
@@ -28,6 +28,7 @@ from vplog.testing import pictures
 from vplog.verbs.demo.scene import make_scene, take_picture
 from vplog.verbs.demo.settings import DemoSettings
 from vplog.verbs.evaluate_run import TruthOptions, evaluate
+from vplog.verbs.report import judge
 
 if TYPE_CHECKING:
     from vplog.data import Floats
@@ -231,7 +232,7 @@ def test_a_run_without_metres_is_evaluated_with_a_scale(finished: Path, drive: D
     found, known = (evaluate(one, str(drive.truth)) for one in (folder, finished))
     assert (found["ate_after"]["alignment"], known["ate_after"]["alignment"]) == ("Sim(3)", "SE(3)")
     assert found["scale"] == pytest.approx(1.0, abs=0.05)
-    assert found["ate_after"]["scale"] == pytest.approx(1.0)
+    assert found["ate_after"]["scale"] == pytest.approx(1.0, abs=0.01)  # the unit is that of the camera's path
     assert known["scale"] is None
     assert found["closures"]["accepted_true"] == known["closures"]["accepted_true"]
     assert evaluate(folder, str(drive.truth), options=TruthOptions(align="se3"))["ate_after"]["alignment"] == "SE(3)"
@@ -240,6 +241,35 @@ def test_a_run_without_metres_is_evaluated_with_a_scale(finished: Path, drive: D
     standing.write_text("".join(f"{line[0]} 1 2 3 {' '.join(line[4:])}\n" for line in lines))
     with pytest.raises(TruthError, match="move"):
         evaluate(folder, str(standing))
+
+
+def test_a_camera_off_the_body_keeps_its_place_there_in_metres(finished: Path, drive: Demo, tmp_path: Path) -> None:
+    """The finished run as one of a camera 1.5 m ahead of the body, in a unit of ten metres: its path alone is in it."""
+    folder, header = Path(shutil.copytree(finished, tmp_path / "run")), tables.TableMetadata({}, "")
+    record = run_record.read_finished_run(folder)
+    mount = np.array(record["calibrations"][0]["body_from_camera"])
+    mount[:3, 3] = 1.5, 0.0, 1.0
+    record["calibrations"][0]["body_from_camera"] = mount.tolist()
+    run_record.write_run_json(folder / "run.json", record | {"scale": "unknown"})
+
+    def own(poses: Floats) -> Floats:
+        return se3.stretched(poses, 0.1, mount)
+
+    after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
+    after = replace(after, world_from_body=own(after.world_from_body))
+    odometry = replace(odometry, odom_from_body=own(odometry.odom_from_body))
+    tables.write_trajectory(folder / "trajectory.parquet", after, odometry, header)
+    keyframes, poses = tables.read_keyframes(folder / "keyframes.parquet")
+    keyframes = replace(keyframes, odom_from_body=own(keyframes.odom_from_body))
+    tables.write_keyframes(folder / "keyframes.parquet", keyframes, own(poses), header)
+    ledger = tables.read_closures(folder / "closures.parquet")
+    ledger = replace(ledger, match_from_query=own(ledger.match_from_query))
+    tables.write_closures(folder / "closures.parquet", ledger, keyframes, header)
+    found, known = (evaluate(one, str(drive.truth), options=TruthOptions(align="sim3")) for one in (folder, finished))
+    assert found["ate_after"]["rmse_m"] == pytest.approx(known["ate_after"]["rmse_m"], rel=0.01)
+    assert found["closures"]["accepted_true"] == known["closures"]["accepted_true"]
+    shown = judge(folder, record | {"scale": "unknown"}, str(drive.truth), None, TruthOptions())
+    assert shown.error_m is not None and np.nanmedian(shown.error_m) < 3.0 * known["ate_after"]["rmse_m"]
 
 
 def test_fixes_without_an_altitude_give_metres() -> None:

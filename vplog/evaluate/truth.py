@@ -41,7 +41,7 @@ def local_enu(gps: Gps) -> tuple[Ints, Floats]:
 
 def ate_to_gps(estimate: Trajectory, gps: Gps, alignment: str = "se3") -> Ate:
     """ATE of the estimate, interpolated at the fixes, after an alignment. It is that of the antenna where its place on
-    the body is known, but for `sim3`, as the estimate's unit of length need not be that of the place.
+    the body is known, in the estimate's unit of length.
 
     Raises TruthError where fewer than three fixes lie within the estimate.
     """
@@ -57,5 +57,5 @@ def ate_to_gps(estimate: Trajectory, gps: Gps, alignment: str = "se3") -> Ate:
             "--truth."
         )
     poses = se3.interpolate_at(estimate.stamp_ns, estimate.world_from_body, stamp_ns[inside])
-    antenna_m = np.zeros(3) if gps.antenna_m is None or alignment == "sim3" else gps.antenna_m
+    antenna_m = np.zeros(3) if gps.antenna_m is None else gps.antenna_m
     return aligned_error(se3.transform(poses, antenna_m[None])[:, 0], positions[inside], alignment)

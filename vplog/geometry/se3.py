@@ -166,11 +166,13 @@ def _matrices(rows: list[list[Floats]]) -> Floats:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def stretched(poses: Floats, scale: float) -> Floats:
-    """Poses (..., 4, 4) with their translations multiplied."""
-    result = poses.copy()
+def stretched(poses: Floats, scale: float, body_from_camera: Floats | None = None) -> Floats:
+    """Poses (..., 4, 4) with their translations multiplied; those of a camera on the body where one is given, so that
+    its place there keeps its length."""
+    body_from_camera = np.eye(4) if body_from_camera is None else body_from_camera
+    result = inverse(body_from_camera) @ poses @ body_from_camera
     result[..., :3, 3] *= scale
-    return result
+    return np.asarray(body_from_camera @ result @ inverse(body_from_camera), np.float64)
 
 
 def umeyama(source: Floats, target: Floats, with_scale: bool = False) -> tuple[Floats, float]:

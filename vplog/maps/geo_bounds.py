@@ -15,6 +15,7 @@ from vplog.data import Floats, Gps, Ints
 from vplog.errors import ResultError, SettingsError, plural
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.geo import Earth, on_earth
+from vplog.results.run_cameras import unit_camera
 from vplog.run.figures.run_figures import earth_of
 
 Box = tuple[float, float, float, float]
@@ -40,7 +41,7 @@ def earth_of_run(folder: Path) -> Earth | None:
     if known is None and fixes is None:
         return None
     trajectory, _ = tables.read_trajectory(folder / "trajectory.parquet")
-    return earth_of(trajectory, fixes, known, run_record.has_metres(record))
+    return earth_of(trajectory, fixes, known, unit_camera(record))
 
 
 def earth_record(earth: Earth | None, world_from_body: Floats) -> dict[str, Any] | None:
@@ -48,6 +49,7 @@ def earth_record(earth: Earth | None, world_from_body: Floats) -> dict[str, Any]
     if earth is None:
         return None
     record = {"origin": list(earth.origin), "enu_from_world": earth.enu_from_world.tolist()}
+    record |= {"point": earth.point.tolist()} if earth.point.any() else {}
     if not len(world_from_body):
         return record
     where = on_earth(earth, world_from_body)[:, [1, 0]]
@@ -68,12 +70,17 @@ def is_finite(value: Any) -> bool:
 def earth_from_record(record: Any) -> Earth | None:
     """Inverse of `earth_record`; None where the record is not one."""
     try:
-        origin, enu_from_world = np.array(record["origin"], np.float64), np.array(record["enu_from_world"], np.float64)
+        known = {"point": np.zeros(3), **record}
+        origin, enu_from_world, point = (
+            np.array(known[name], np.float64) for name in ("origin", "enu_from_world", "point")
+        )
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
-    if origin.shape != (3,) or enu_from_world.shape != (4, 4) or not np.isfinite(enu_from_world).all():
+    if (origin.shape, enu_from_world.shape, point.shape) != ((3,), (4, 4), (3,)):
         return None
-    return Earth((float(origin[0]), float(origin[1]), float(origin[2])), enu_from_world)
+    if not np.isfinite([*enu_from_world.flat, *point]).all():
+        return None
+    return Earth((float(origin[0]), float(origin[1]), float(origin[2])), enu_from_world, point)
 
 
 def in_box(where: Floats, box: Box) -> NDArray[np.bool_]:

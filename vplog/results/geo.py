@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -34,11 +34,13 @@ class Earth:
     enu_from_world: Floats
     """(4, 4): from the trajectory's frame to m east, north and up of the origin; a similarity where the trajectory has
     a unit of length of its own."""
+    point: Floats = field(default_factory=lambda: np.zeros(3))
+    """(3,) of the body in the trajectory's unit: the point laid on earth, the camera of a run without metres."""
 
 
 def on_earth(earth: Earth, world_from_body: Floats) -> Floats:
     """(T, 3) longitude and latitude in degrees and altitude in m of poses (T, 4, 4)."""
-    enu = se3.transform(earth.enu_from_world, world_from_body[:, :3, 3])
+    enu = se3.transform(earth.enu_from_world, se3.transform(world_from_body, earth.point[None])[:, 0])
     return geodetic(enu, earth.origin)[:, [1, 0, 2]]
 
 

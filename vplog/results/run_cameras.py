@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vplog.data import Camera, Ints, Keyframes
+from vplog.data import Camera, Floats, Ints, Keyframes
 from vplog.errors import ResultError
 from vplog.geometry import se3
 from vplog.results import tables
+from vplog.results.run_record import has_metres
 
 _CAMERA: dict[str, Callable[[Any], Any]] = {
     "name": str, "distortion_model": str, "width": int, "height": int, "disparity_zero_px": float, "baseline_m": float,
@@ -38,6 +39,13 @@ def recorded_camera(record: dict[str, Any], number: int, otherwise: Camera) -> C
     if not isinstance(known, list) or not 0 <= number < len(known):
         return otherwise
     return camera_from(known[number] if isinstance(known[number], dict) else {}, "Run it again.")
+
+
+def unit_camera(record: dict[str, Any]) -> Floats | None:
+    """body_from_camera (4, 4) of the camera whose path is in the unit of a run without metres, while its place on the
+    body is in metres, the body's own where the record has no cameras. None of a run in metres."""
+    body = Camera("", None, "none", np.zeros(0), 0, 0, np.eye(4))
+    return None if has_metres(record) else recorded_camera(record, 0, body).body_from_camera
 
 
 class CameraPictures(NamedTuple):

@@ -127,12 +127,13 @@ def write(
     picture, gps = run.features.picture, log.gps()
     inputs = ClosureInputs(run.features.__getitem__, run.camera, run.state, run.places)
     previews = picture if run.features.has_pictures else None
+    camera = None if run.odometry.metric else run.camera.body_from_camera
     extras = replace(
         mcap_extras(inputs, previews, run.closures, run.references, verify, pictures, execution),
         thumbnails=camera_thumbnails(run.views, run.closures),
         further_cameras=[view.camera.body_from_camera for view in run.views[1:]],
         gps=gps,
-        earth=earth_of(trajectory, gps, about_gps(run.solved), run.odometry.metric),
+        earth=earth_of(trajectory, gps, about_gps(run.solved), camera),
         about={"versions": provenance.versions(), "inputs": steps.cache.hashes()},
     )
     places = [place for view in run.views for place in view.places]

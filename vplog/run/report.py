@@ -28,7 +28,7 @@ from vplog.results.report.page import (
     false_closures,
     page,
 )
-from vplog.results.run_record import has_metres
+from vplog.results.run_cameras import unit_camera
 from vplog.run.figures.run_figures import earth_of
 from vplog.run.questions import ask_ledger
 from vplog.storage.image_file import decode_image
@@ -70,7 +70,7 @@ def gather_tracks(folder: Path, record: dict[str, Any]) -> Tracks:
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
     found = mcap_read.read_pictures(folder / "result.mcap")
-    earth = earth_of(after, found.gps, record.get("gps"), has_metres(record))
+    earth = earth_of(after, found.gps, record.get("gps"), unit_camera(record))
     return tracks_of(keyframes, world_from_body, odometry, after, found, earth)
 
 

@@ -19,6 +19,7 @@ from vplog.evaluate.truth import ate_to_gps, read_truth
 from vplog.geometry import se3
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.results import mcap_read, run_record, tables
+from vplog.results.run_cameras import unit_camera
 from vplog.results.run_record import has_metres
 from vplog.run.provenance import reopened
 from vplog.storage.folders import is_below
@@ -132,31 +133,32 @@ def evaluate_poses(
     options = options.of(record)
     known = _shifted(read_truth(truth), options) if known is None else known
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
-    scale = 1.0
-    if not has_metres(record):
-        scale = trajectory.ate(trajectory.at_truth(after, known)[0], known, alignment="sim3").scale
+    scale, mount = 1.0, unit_camera(record)
+    if mount is not None:
+        path = Trajectory(after.stamp_ns, after.world_from_body @ mount)
+        scale = trajectory.ate(trajectory.at_truth(path, known)[0], known, alignment="sim3").scale
         if not (np.isfinite(scale) and scale > 0):
             raise TruthError(
                 f"{shown(truth)} does not move while the run does, so the run's unit of length is not known."
             )
-        after = Trajectory(after.stamp_ns, se3.stretched(after.world_from_body, scale))
-        odometry = replace(odometry, odom_from_body=se3.stretched(odometry.odom_from_body, scale))
+        after = Trajectory(after.stamp_ns, se3.stretched(after.world_from_body, scale, mount))
+        odometry = replace(odometry, odom_from_body=se3.stretched(odometry.odom_from_body, scale, mount))
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     covariance = tables.read_keyframe_covariance(folder / "keyframes.parquet")
     ledger = tables.read_closures(folder / "closures.parquet")
     settings = run_record.recorded(record, folder / "run.json", dict, "settings", "propose")
     stops = candidate_stops(keyframes, ProposeSettings.read(settings, f"{folder}/run.json"))
-    if not has_metres(record):
+    if mount is not None:
         keyframes, world_from_body, covariance, ledger = _stretched(
-            keyframes, world_from_body, covariance, ledger, scale
+            keyframes, world_from_body, covariance, ledger, scale, mount
         )
     cameras = _cameras(folder)
     of_body = body_truth(known, before, next(iter(cameras), None))
     score, judged = closures.score_closures(keyframes, ledger, of_body, stops, options, cameras)
     found = {
         "truth": shown(truth),
-        "scale": None if has_metres(record) else scale,
+        "scale": None if mount is None else scale,
         "truth_is": {
             "frame": of_body.frame,
             "oriented": of_body.oriented,
@@ -173,18 +175,19 @@ def evaluate_poses(
 
 
 def _stretched(
-    keyframes: Keyframes, world_from_body: Floats, covariance: Floats, ledger: Closures, scale: float
+    keyframes: Keyframes, world_from_body: Floats, covariance: Floats, ledger: Closures, scale: float, mount: Floats
 ) -> tuple[Keyframes, Floats, Floats, Closures]:
-    """A run in units of its own as one whose lengths are multiplied."""
-    units = np.array([1.0, 1.0, 1.0, scale, scale, scale])
+    """A run in units of its own as one in which the lengths of the path of the camera at `mount` are multiplied."""
+    units = se3.adjoint(mount) @ np.diag([1.0, 1.0, 1.0, scale, scale, scale]) @ se3.adjoint(se3.inverse(mount))
+    back = np.linalg.inv(units)
     ledger = replace(
         ledger,
-        match_from_query=se3.stretched(ledger.match_from_query, scale),
-        information=ledger.information / np.outer(units, units),
+        match_from_query=se3.stretched(ledger.match_from_query, scale, mount),
+        information=back.T @ ledger.information @ back,
     )
-    keyframes = replace(keyframes, odom_from_body=se3.stretched(keyframes.odom_from_body, scale))
-    covariance = covariance * np.outer(units, units)
-    return keyframes, se3.stretched(world_from_body, scale), covariance, ledger
+    keyframes = replace(keyframes, odom_from_body=se3.stretched(keyframes.odom_from_body, scale, mount))
+    covariance = units @ covariance @ units.T
+    return keyframes, se3.stretched(world_from_body, scale, mount), covariance, ledger
 
 
 def _shifted(known: Trajectory, options: TruthOptions) -> Trajectory:
@@ -284,6 +287,8 @@ def _against_gps(
     fixes = reopened(record, None, recorded_topics(record, topics), _PUT_BACK).gps() if fixes is None else fixes
     if fixes is None or not len(fixes.stamp_ns):
         raise TruthError(f"{record.get('log')} has no GPS fixes. Give a truth file: --truth FILE.tum")
+    if (mount := unit_camera(record)) is not None:  # the antenna is taken to be at the camera, whose path has one unit
+        fixes = replace(fixes, antenna_m=mount[:3, 3])
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
     return {
         "ate_before": asdict(ate_to_gps(before, fixes, options.align)),

@@ -20,8 +20,7 @@ from vplog.pipeline import Pipeline, recorded_pipeline
 from vplog.results import mcap_read, run_record, tables
 from vplog.results.previews import thumbnail
 from vplog.results.report.page import Pictures, TruthComparison
-from vplog.results.run_cameras import recorded_camera
-from vplog.results.run_record import has_metres
+from vplog.results.run_cameras import recorded_camera, unit_camera
 from vplog.run.figures.run_figures import ClosureInputs, choose_views, reference_pictures, view_closures
 from vplog.run.provenance import library_at
 from vplog.run.report import write_report
@@ -70,16 +69,20 @@ def judge(
     found = evaluate_poses(folder, record, truth, options, known)
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     at, known, judged = found.truth.at(keyframes.stamp_ns), found.truth.trajectory, found.judged
-    true, solved = at.world_from_body[at.known][:, :3, 3], world_from_body[at.known][:, :3, 3]
-    world_from_truth, units = se3.umeyama(true, solved, with_scale=not has_metres(record))
+    mount, units = unit_camera(record), 1.0
+    if mount is not None:
+        ends = ((poses[at.known] @ mount)[:, :3, 3] for poses in (at.world_from_body, world_from_body))
+        units = se3.umeyama(*ends, with_scale=True)[1]
+    true, solved = se3.stretched(at.world_from_body, units, mount), world_from_body[at.known][:, :3, 3]
+    world_from_truth, _ = se3.umeyama(true[at.known][:, :3, 3], solved)
     # of the truth only what the drive covers, so that the map is that of the drive
     during = (known.stamp_ns >= keyframes.stamp_ns[0]) & (known.stamp_ns <= keyframes.stamp_ns[-1])
-    path = se3.transform(world_from_truth, units * known.world_from_body[during][:, :3, 3])
+    path = se3.transform(world_from_truth, se3.stretched(known.world_from_body[during], units, mount)[:, :3, 3])
     error_m = np.full(len(keyframes.stamp_ns), np.nan)
-    error_m[at.known] = np.linalg.norm(se3.transform(world_from_truth, units * true) - solved, axis=1) / units
+    error_m[at.known] = np.linalg.norm(se3.transform(world_from_truth, true[at.known][:, :3, 3]) - solved, axis=1)
     closures = tables.read_closures(folder / "closures.parquet")
-    expected = se3.between(at.world_from_body[closures.match], at.world_from_body[closures.query])
-    apart_m = np.linalg.norm((expected - se3.stretched(closures.match_from_query, 1.0 / units))[:, :3, 3], axis=1)
+    expected = se3.between(true[closures.match], true[closures.query])
+    apart_m = np.linalg.norm((expected - closures.match_from_query)[:, :3, 3], axis=1) / units
     return TruthComparison(
         Path(shown(truth)).name,
         found.record,
@@ -89,7 +92,7 @@ def judge(
         judged.right | judged.wrong,
         judged.curves,
         judged.at_place,
-        error_m,
+        error_m / units,
         np.where(at.known[closures.match] & at.known[closures.query] & found.truth.oriented, apart_m, np.nan),
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -198,7 +198,7 @@ def _answer(
     drive, row = own[found.place]
     known, pose, where = places.drives[drive], found.world_from_camera, None
     if pose is not None and (earth := loaded[drive].earth) is not None:
-        where = tuple(on_earth(earth, pose[None])[0].tolist())
+        where = tuple(on_earth(replace(earth, point=np.zeros(3)), pose[None])[0].tolist())  # the camera is the pose's
     keyframe = int(loaded[drive].keyframe[row])
     sentence = _sentence(found, known.name, keyframe)
     return LocalizedPicture(name, one.stamp_ns, one.camera, found, sentence, known.name, keyframe, known.frame, where)

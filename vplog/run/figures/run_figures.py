@@ -246,11 +246,12 @@ def view_closures(
 
 
 def earth_of(
-    trajectory: Trajectory, gps: Gps | None, solved: dict[str, Any] | None, metric: bool = True
+    trajectory: Trajectory, gps: Gps | None, solved: dict[str, Any] | None, camera: Floats | None = None
 ) -> Earth | None:
     """The pose of a trajectory on earth: that of the solve (`solved`, the `gps` of run.json), else by alignment to the
-    fixes (Umeyama 1991), with scale where the trajectory is not `metric`. None without at least three fixes within the
-    drive, or where they do not move and there is no scale."""
+    fixes (Umeyama 1991), with scale and of the camera where its body_from_camera (4, 4) is given, as in
+    `unit_camera`. None without at least three fixes within the drive, or where they do not move and there is no
+    scale."""
     if solved is not None:
         try:
             origin = [float(solved["origin"][name]) for name in ("latitude_deg", "longitude_deg", "altitude_m")]
@@ -267,9 +268,10 @@ def earth_of(
     if inside.sum() < _LEAST_FIXES:
         return None
     poses = se3.interpolate_at(trajectory.stamp_ns, trajectory.world_from_body, fixes.stamp_ns[inside])
-    antenna_m = np.zeros(3) if gps.antenna_m is None or not metric else gps.antenna_m
+    point = np.zeros(3) if camera is None else camera[:3, 3]
+    antenna_m = point if gps.antenna_m is None or camera is not None else gps.antenna_m
     enu_from_world, scale = se3.umeyama(
-        se3.transform(poses, antenna_m[None])[:, 0], fixes.enu_m[inside], with_scale=not metric
+        se3.transform(poses, antenna_m[None])[:, 0], fixes.enu_m[inside], with_scale=camera is not None
     )
     enu_from_world[:3, :3] *= scale
-    return Earth(fixes.origin, enu_from_world) if scale > 0.0 else None
+    return Earth(fixes.origin, enu_from_world, point) if scale > 0.0 else None
