@@ -275,6 +275,16 @@ def test_a_truth_of_1_hz_between_the_stamps_is_compared_at_its_own() -> None:
     assert at_truth(estimate, estimate) == (estimate, False)
 
 
+def test_a_truth_of_20_hz_between_the_stamps_of_slower_odometry_is_compared_at_its_own() -> None:
+    whole = along_x(100.0)
+    estimate = Trajectory(whole.stamp_ns[::2], whole.world_from_body[::2])
+    at_ns = whole.stamp_ns[10:-10] + 25_000_000
+    truth = Trajectory(at_ns, se3.interpolate_at(whole.stamp_ns, whole.world_from_body, at_ns))
+    compared, interpolated = at_truth(estimate, truth)
+    assert interpolated
+    assert ate(compared, truth).count == len(at_ns)
+
+
 def test_what_lies_between_two_drives_of_a_map_is_not_compared() -> None:
     """A truth of 1 Hz goes on for half an hour between them, while the robot is driven elsewhere."""
     rows = np.r_[0:400, 1600:2001]
