@@ -192,6 +192,23 @@ def test_rerun_reads_its_own_with_its_blueprint(verb: Verb, drive: Demo, finishe
         assert sum(found) == rows, entity
 
 
+def test_a_recording_that_cannot_be_written_leaves_the_one_before(verb: Verb, finished: Path, tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource")
+    pytest.importorskip("rerun")
+    path = tmp_path / "run.rrd"
+    path.write_bytes(b"before")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))  # files stop growing as on a full disk
+    try:
+        said = verb("export", finished, "--format", "rrd", "-o", path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert (said.code, f"Cannot write {path}: " in said.err.splitlines()[-1]) == (1, True)  # after rerun's own lines
+    assert [path.read_bytes(), *tmp_path.iterdir()] == [b"before", path]
+    missing = tmp_path / "missing" / "run.rrd"
+    assert f"Cannot write {missing}: " in verb("export", finished, "--format", "rrd", "-o", missing).error
+
+
 def test_without_rerun_one_line_says_what_to_install(
     verb: Verb, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

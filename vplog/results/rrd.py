@@ -47,10 +47,12 @@ def write_rrd(
         for row, picture in tracks.found.pictures.items():
             recording.set_time(_TIMELINE, timestamp=_time(tracks.keyframes.stamp_ns[closures.query[row]]))
             recording.log(_PICTURES, rr.EncodedImage(contents=picture, media_type="image/jpeg"))
+        recording.flush()  # raises where the disk is full, which the rest does not
         recording.disconnect()
         put_in_place(part, path)
-    except OSError as error:
-        raise ResultError(f"Cannot write {path}: {error.strerror or error}. Choose another with -o.") from None
+    except (OSError, RuntimeError) as error:  # rerun's own are the latter
+        reason = getattr(error, "strerror", None) or error
+        raise ResultError(f"Cannot write {path}: {reason}. Free space or choose another folder with -o.") from None
     finally:
         part.unlink(missing_ok=True)
 
