@@ -27,7 +27,7 @@ from vplog.pipeline import load_pipeline, run
 from vplog.results import tables
 from vplog.results.mcap_read import read_pictures
 from vplog.results.run_cameras import CameraPictures
-from vplog.results.run_record import read_run_json
+from vplog.results.run_record import read_run_json, write_run_json
 from vplog.run import cameras
 from vplog.verbs.demo import SMALL, make_drive
 from vplog.verbs.demo.record import IMAGE, REAR, TYPES
@@ -101,6 +101,26 @@ def check_exports(run: Path, verb: Callable[..., Said], folder: Path) -> None:
     assert "fl_x" not in tree
     assert len({(folder / "nerfstudio" / frame["file_path"]).parent for frame in tree["frames"]}) == 2
     assert all(frame["fl_x"] > 0 for frame in tree["frames"])
+    # a picture of the rear camera that was not described, as it is damaged in the log, is not read again
+    described, record = run / "descriptors.parquet", read_run_json(run / "run.json")
+    before, kept = described.read_bytes(), np.arange(len(tables.read_stamps(described)) - 1)
+    column, made_by = tables.read_descriptors(described)
+    tables.write_some_descriptors(described, described, kept, column, made_by)
+    assert verb("export", run, "--format", "colmap", "-o", folder / "colmap").code == 0
+    assert len((sparse / "images.txt").read_text().splitlines()) == 2 * len(kept)
+    described.write_bytes(before)
+    rear = record["calibrations"][1]
+    fisheye = {**record, "calibrations": [record["calibrations"][0], rear | {"distortion_model": "equidistant"}]}
+    write_run_json(run / "run.json", fisheye)
+    said = verb("export", run, "--format", "nerfstudio", "-o", folder / "fisheye")
+    assert "some are fisheyes" in said.error
+    assert not list(folder.glob("*fisheye*"))
+    unknown = {**record, "calibrations": [record["calibrations"][0], rear | {"matrix": None}]}
+    write_run_json(run / "run.json", unknown)
+    said = verb("export", run, "--format", "colmap", "-o", folder / "colmap")
+    assert (said.code, f"Camera {REAR} is not calibrated" in said.err) == (0, True)
+    assert [line[:2] for line in (sparse / "cameras.txt").read_text().splitlines()] == ["1 "]
+    write_run_json(run / "run.json", record)
 
 
 def test_one_camera_that_is_chosen_is_alone(rig: Path, verb: Callable[..., Said], tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -28,10 +28,11 @@ _STEPS = 4
 """Gauss-Newton steps before each look at the errors; the linear start is within px."""
 
 
-def pairs_to_match(keyframe: Sequence[Ints], closures: Closures) -> list[tuple[int, int]]:
-    """Pairs (a, b), a < b, of images that share a view: neighbours, and the accepted closures that count. The images of
-    the first camera, at `keyframe[0]` increasing, come before those of the second."""
-    begin = np.cumsum([0, *map(len, keyframe)])
+def pairs_to_match(keyframe: Mapping[int, Ints], closures: Closures) -> list[tuple[int, int]]:
+    """Pairs (a, b), a < b, of images that share a view: neighbours, and the accepted closures that count. The images
+    are those of one camera after the other, at the rows `keyframe` by its number, increasing."""
+    begin = np.cumsum([0, *map(len, keyframe.values())])
+    images = {one: image for image, one in enumerate((n, row) for n in keyframe for row in keyframe[n].tolist())}
     pairs = {
         (row - back, row)
         for first, end in pairwise(begin.tolist())
@@ -40,8 +41,9 @@ def pairs_to_match(keyframe: Sequence[Ints], closures: Closures) -> list[tuple[i
     }
     used = closures.rows(np.flatnonzero(closures.weight > 0.5))  # NaN where the solver never had it
     for a, row_a, b, row_b in zip(used.query_camera, used.query, used.match_camera, used.match, strict=True):
-        ends = (int(begin[n] + np.searchsorted(keyframe[n], row)) for n, row in ((a, row_a), (b, row_b)))
-        pairs.add((min(pair := tuple(ends)), max(pair)))
+        ends = sorted(images[one] for one in ((a, row_a), (b, row_b)) if one in images)
+        if len(ends) == 2:  # a condensed map describes some of the pictures alone
+            pairs.add((ends[0], ends[1]))
     return sorted(pairs)
 
 

@@ -107,9 +107,7 @@ def _points(images: PosedImages) -> Iterator[str]:
 
 def write_nerfstudio(folder: Path, images: PosedImages) -> list[Path]:
     """transforms.json, whose cameras look along -z with y up, and points.ply, from which splats start; the files."""
-    own = [_intrinsics(camera) for camera in images.cameras]
-    if len({one["camera_model"] for one in own}) > 1:
-        raise ResultError("nerfstudio has one camera_model for all cameras, and some are fisheyes. Export colmap.")
+    own = intrinsics(images.cameras)
     poses = images.world_from_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
     shared = own[0] if len(own) == 1 else {"camera_model": own[0]["camera_model"]}  # it counts before that of a frame
     of_frame = [{name: value for name, value in one.items() if name not in shared} for one in own]
@@ -121,6 +119,14 @@ def write_nerfstudio(folder: Path, images: PosedImages) -> list[Path]:
     (folder / "transforms.json").write_text(json.dumps(tree, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     _write_ply(folder / "points.ply", images)
     return [folder / "transforms.json", folder / "points.ply"]
+
+
+def intrinsics(cameras: Sequence[Camera]) -> list[dict[str, Any]]:
+    """Fields of transforms.json about each camera. Raises ResultError where nerfstudio has no model for them."""
+    own = list(map(_intrinsics, cameras))
+    if len({one["camera_model"] for one in own}) > 1:
+        raise ResultError("nerfstudio has one camera_model for all cameras, and some are fisheyes. Export colmap.")
+    return own
 
 
 def _intrinsics(camera: Camera) -> dict[str, Any]:

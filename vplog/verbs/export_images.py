@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from dataclasses import dataclass, replace
 from glob import escape
@@ -22,15 +23,15 @@ from vplog.loops.structure import pairs_to_match, triangulate
 from vplog.pipeline import Pipeline, recorded_pipeline
 from vplog.results import colmap, run_record, tables
 from vplog.results.previews import jpeg
-from vplog.results.run_cameras import recorded_camera
+from vplog.results.run_cameras import camera_pictures, recorded_camera
 from vplog.results.staging import check_contents, staged
-from vplog.run.cameras import pictures_at
 from vplog.run.provenance import reopened
 from vplog.stages import EncodedFrame, Log
 from vplog.storage.folders import check_regular, is_below
 from vplog.storage.scratch import files_in, scratch
 from vplog.version import __version__
 
+_log = logging.getLogger(__name__)
 _WRITERS = {"colmap": colmap.write_colmap, "nerfstudio": colmap.write_nerfstudio}
 FOLDERS = tuple(_WRITERS)
 """Formats that are a folder."""
@@ -48,18 +49,21 @@ def export_images(
     topics = logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json")
     pipeline, closures = recorded_pipeline(folder, record), tables.read_closures(folder / "closures.parquet")
     cameras = _cameras(folder, record, topics, log)
-    for one in cameras:
-        colmap.camera_model(one.camera)  # before the long part
+    models = [one.camera for one in cameras]
+    for model in models:
+        colmap.camera_model(model)  # before the long part
+    if kind == "nerfstudio":
+        colmap.intrinsics(models)
     number = np.repeat(np.arange(len(cameras)), [len(one.stamp_ns) for one in cameras])
-    of_image = [cameras[one].camera for one in number.tolist()]
+    of_image = [models[one] for one in number.tolist()]
     with staged(out, lambda: _export_in(out)) as made, scratch("features") as place:
         with FeatureStore(place / "features") as store:
             names = list(chain(*(_pictures(one, pipeline, made, store, execution) for one in cameras)))
             world_from_camera = np.concatenate([one.world_from_camera for one in cameras])
-            pairs = pairs_to_match([one.keyframe for one in cameras], closures)
+            pairs = pairs_to_match({one.number: one.keyframe for one in cameras}, closures)
             matching = pipeline.verify.matching
             found = triangulate(world_from_camera, of_image, store.__getitem__, pairs, matching, execution)
-        models, colours = [one.camera for one in cameras], _colours(made / "images", names, found)
+        colours = _colours(made / "images", names, found)
         images = colmap.PosedImages(names, models, number, world_from_camera, found, colours)
         written = [path.relative_to(made) for path in _WRITERS[kind](made, images)]
         run_record.write_run_json(made / _RECORD, {"vplog": __version__, "format": 1, "files": files_in(made)})
@@ -70,6 +74,8 @@ def export_images(
 class _PosedCamera:
     """A camera's V pictures at the keyframes."""
 
+    number: int
+    """Among the cameras of the run."""
     log: Log
     camera: Camera
     folder: str
@@ -83,20 +89,24 @@ class _PosedCamera:
 
 
 def _cameras(folder: Path, record: dict[str, Any], topics: logs.TopicChoice, log: Path | None) -> list[_PosedCamera]:
-    """The cameras of a run: the first by the poses of the keyframes, the others by the trajectory at their stamps."""
+    """The cameras of a run: the first by the poses of the keyframes, the others that are calibrated by the trajectory
+    at their stamps."""
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     drive, names = reopened(record, log, topics), record.get("cameras") or []
     first, several = recorded_camera(record, 0, drive.camera()), len(names) > 1
     poses, rows = world_from_body @ first.body_from_camera, np.arange(len(keyframes.stamp_ns))
-    found = [_PosedCamera(drive, first, _folder(first.name) if several else "", rows, keyframes.stamp_ns, poses)]
+    found = [_PosedCamera(0, drive, first, _folder(first.name) if several else "", rows, keyframes.stamp_ns, poses)]
     for number, topic in enumerate(names[1:], 1):
-        trajectory, odometry = tables.read_trajectory(folder / "trajectory.parquet")
         other = reopened(record, log, topics.of_camera(topic))
-        row, pictures = pictures_at(keyframes, other.stamps(), odometry)
-        bodies = se3.interpolate_at(trajectory.stamp_ns, trajectory.world_from_body, pictures.stamp_ns)
         camera = recorded_camera(record, number, other.camera())
+        if camera.matrix is None:
+            _log.warning("Camera %s is not calibrated, so its pictures have no place and are left out.", camera.name)
+            continue
+        trajectory, _ = tables.read_trajectory(folder / "trajectory.parquet")
+        row, pictures = camera_pictures(folder, number)
+        bodies = se3.interpolate_at(trajectory.stamp_ns, trajectory.world_from_body, pictures.stamp_ns)
         poses = bodies @ camera.body_from_camera
-        found.append(_PosedCamera(other, camera, _folder(camera.name), row, pictures.stamp_ns, poses))
+        found.append(_PosedCamera(number, other, camera, _folder(camera.name), row, pictures.stamp_ns, poses))
     return found
 
 
