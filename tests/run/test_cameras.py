@@ -303,6 +303,15 @@ def test_every_camera_has_a_mask_of_its_own(masked: Path, tmp_path: Path) -> Non
         logs.open(masked, TopicChoice(mask_topics={REAR: "/rear/msk"}))
 
 
+def test_start_and_stop_are_by_the_images_of_the_first_camera(rig: Path) -> None:
+    """Further cameras, which may begin earlier or later, have the pictures near its keyframes."""
+    choice = TopicChoice(start_s=2.0, stop_s=4.0)
+    whole, some = (logs.open(rig / "drive.mcap", one) for one in (TopicChoice(), choice))
+    assert len(some.stamps()) < len(whole.stamps())
+    rear = logs.open(rig / "drive.mcap", choice.of_camera(REAR))
+    assert len(rear.stamps()) == len(whole.stamps())
+
+
 def test_masks_of_several_cameras_on_the_command_line(masked: Path, verb: Callable[..., Said], tmp_path: Path) -> None:
     mask = tmp_path / "mask.png"
     cv2.imwrite(str(mask), np.full((RIG.height, RIG.width), 255, np.uint8))

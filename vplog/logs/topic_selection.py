@@ -104,8 +104,9 @@ class TopicChoice(Settings):
     """s after the first image, from which on images are left out."""
 
     def of_camera(self, topic: str) -> TopicChoice:
-        """Choice of topics with a further camera as the one in use, and no others."""
-        own = {"depth": None, "right": None, "camera_info": None, "cameras": ()}
+        """Choice of topics with a further camera as the one in use, and no others. Of all its images, as the keyframes
+        say which are taken: `start_s` and `stop_s` count from the first camera's first image."""
+        own = {"depth": None, "right": None, "camera_info": None, "cameras": (), "start_s": None, "stop_s": None}
         own |= {"mask": self.mask_topics.get(topic), "mask_topics": {}}
         masks = {image: path for image, path in self.masks.items() if image}
         return self.model_copy(update={**own, "image": topic, "masks": masks})
