@@ -48,7 +48,7 @@ class TruthOptions(closures.PlaceCriterion):
     align: str = ""
     """Alignment of the ATE, a name of `trajectory.ALIGNMENTS`; empty takes `se3`, or `sim3` of a run without metres."""
     truth_offset_s: float = 0.0
-    """s added to the stamps of the truth, as evo's --t_offset."""
+    """s added to the stamps of the truth."""
 
     def of(self, record: dict[str, Any]) -> TruthOptions:
         """With the alignment for the run of this record."""
