@@ -249,6 +249,10 @@ def test_a_foxglove_layout_shows_topics_of_the_run_in_panels_that_lie_in_one_tre
 def test_a_truth_is_for_rerun_alone(verb: Verb, finished: Path, tmp_path: Path) -> None:
     said = verb("export", finished, "--format", "tum", "-o", tmp_path / "a.tum", "--truth", "auto")
     assert "--truth is shown in rrd alone" in said.error
+    if importlib.util.find_spec("rerun"):
+        said = verb("export", finished, "--format", "rrd", "-o", tmp_path / "a.rrd", "--truth", "auto")
+        assert "its fixes alone, which rrd does not show. Give --truth FILE.tum" in said.error
+        assert not (tmp_path / "a.rrd").exists()
 
 
 def test_a_run_without_fixes_has_no_place_on_earth(verb: Verb, finished: Path, tmp_path: Path) -> None:

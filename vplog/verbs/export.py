@@ -67,6 +67,8 @@ def export(
         case "rrd":
             closures = tables.read_closures(folder / "closures.parquet")
             judged = judge(folder, record, truth, None, TruthOptions()) if truth is not None else None
+            if judged is not None and judged.path is None:
+                raise ResultError("The log's truth is its fixes alone, which rrd does not show. Give --truth FILE.tum.")
             write_rrd(path, tracks, closures, folder / "result.mcap", judged)
         case "foxglove-layout":
             tree = foxglove_layout(read_topics(folder / "result.mcap"), tracks.world_from_body[:, :3, 3])
