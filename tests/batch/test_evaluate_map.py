@@ -50,6 +50,11 @@ def test_drives_are_evaluated_each_and_by_tag(
     assert (said.code, said.err.count("before has ate_m")) == (1, 1)
     assert "after has" not in said.err
     assert f"{manifest} names no truth of it." in said.out
+    positions = tmp_path / "positions.tum"
+    lines = [line.split() for line in drive.truth.read_text().splitlines() if not line.startswith("#")]
+    positions.write_text("".join(f"{' '.join(line[:4])} 0 0 0 1\n" for line in lines))
+    said = verb("evaluate", root, "--truth", positions)
+    assert [f"vplog: warning: {', '.join(sorted(alone))}: The truth has no orient" in said.err, said.code] == [True, 0]
     manifest.write_text("log,truth\nx.mcap,gps\n")
     assert "No drive of" in verb("evaluate", root, "--truth", manifest).error
     run = (root / "runs/drive=before", "--truth", drive.truth, "--fail-on")

@@ -20,7 +20,8 @@ _MEANS = ("ate_m", "recall")
 
 
 def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None = None) -> dict[str, Any]:
-    """Figures of every drive of a map against its truth, or `error`, why there are none; and of groups of drives.
+    """Figures of every drive of a map against its truth and what bears on them, as `evaluate` has it, or `error`, why
+    there are none; and of groups of drives.
 
     `truth` is a manifest with a column `truth`; a TUM file of all drives; `gps`; or `auto`: of each drive the truth
     that its manifest named when it was computed, else the one that comes with its log. Raises VplogError.
@@ -42,7 +43,8 @@ def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None =
                 found = evaluate(folder, own, None, options, about["log"])
             except VplogError as error:
                 found = {"error": str(error)}
-            drives.append({**row, **figures_of(found), "error": found.get("error", "")})
+            noted = {name: found.get(name) for name in ("truth_is", "scale", "interpolated")}
+            drives.append({**row, **figures_of(found), **noted, "error": found.get("error", "")})
             store.evict(drive)
     if all(one["error"] for one in drives):
         why = f" Of {drives[0]['drive']}: {drives[0]['error']}" if drives else ""

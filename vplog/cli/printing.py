@@ -10,7 +10,7 @@ import shlex
 import sys
 import textwrap
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import zip_longest
 from pathlib import Path
@@ -20,6 +20,8 @@ from typing import Any, TextIO
 from vplog.errors import plural
 from vplog.storage.urls import printable, without_secrets
 
+_NAMED = 3
+"""Drives that are named."""
 _UNMOVED_M = 1e-3
 """m: less is what rounding and the solver's last digits come to."""
 
@@ -217,6 +219,7 @@ def print_evaluation(found: dict[str, Any]) -> None:
     for drive, why in found.get("uncovered", {}).items():
         print_status(f"warning: {drive} is left out: {why}")
     if "maps" in found:
+        warn(_notes_of_drives([drive for one in found["maps"] for drive in one["drives"]]))
         return
     warn(_truth_notes(found))
     if found.get("closures"):
@@ -251,6 +254,18 @@ def print_evaluated_map(found: dict[str, Any]) -> None:
     print_records({"drive": "drive", "tags": "tags", "vplog": "vplog", **figures, "error": "error"}, drives)
     groups = [one | {"group": name} for name, one in found["groups"].items()]
     print_records({"mean of": "group", "drives": "drives", **figures}, groups)
+    warn(_notes_of_drives(found["drives"]))
+
+
+def _notes_of_drives(drives: Iterable[dict[str, Any]]) -> Iterator[str]:
+    """The notes about the truth, each once, with the first of the drives that it is about."""
+    notes: dict[str, list[str]] = {}
+    for drive in drives:
+        for note in _truth_notes(drive):
+            notes.setdefault(note, []).append(drive["drive"])
+    for note, names in notes.items():
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        yield f"{', '.join(names[:_NAMED])}{more}: {note}"
 
 
 def _truth_notes(found: dict[str, Any]) -> list[str]:

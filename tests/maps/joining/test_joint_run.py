@@ -144,6 +144,12 @@ def test_a_drive_that_the_truth_does_not_cover_is_named(
     said = verb("evaluate", joint, "--truth", tmp_path / "short.tum")
     assert "after is left out" in said.err
     assert "before: " in said.out
+    assert "before: The truth has no orientations" not in said.err
+    identity = np.tile(np.eye(4), (len(known.stamp_ns), 1, 1))
+    identity[:, :3, 3] = known.world_from_body[:, :3, 3]
+    write_tum(tmp_path / "positions.tum", Trajectory(known.stamp_ns, identity))
+    said = verb("evaluate", joint, "--truth", tmp_path / "positions.tum")
+    assert said.err.count("before, after, drive: The truth has no orientations") == 1
 
 
 def test_verbs_of_one_drive_say_which_there_are(joint: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:
