@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
 from vplog.data import Trajectory
-from vplog.errors import SettingsError
+from vplog.errors import ResultError, SettingsError
 from vplog.geometry import se3
-from vplog.maps.diff import diff_maps
+from vplog.maps.diff import _Content, _moved, diff_maps
 from vplog.results import tables
+from vplog.results.run_cameras import unit_camera
 from vplog.results.run_record import read_run_json, write_run_json
 from vplog.verbs.diff import FIGURES, check_limits, diff, exceeded
 
@@ -134,8 +136,41 @@ def test_a_run_without_metres_is_compared_by_its_shape(finished: Path, tmp_path:
     out = tmp_path / "run"
     shutil.copytree(finished, out)
     trajectory, odometry = tables.read_trajectory(out / "trajectory.parquet")
-    own = Trajectory(trajectory.stamp_ns, se3.stretched(trajectory.world_from_body, 0.1))
+    unknown = read_run_json(out / "run.json") | {"scale": "unknown"}
+    own = Trajectory(trajectory.stamp_ns, se3.stretched(trajectory.world_from_body, 0.1, unit_camera(unknown)))
     tables.write_trajectory(out / "trajectory.parquet", own, odometry, tables.TableMetadata({}, ""))
     assert diff(finished, out)["trajectory"]["rmse_m"] > 1.0
-    write_run_json(out / "run.json", read_run_json(out / "run.json") | {"scale": "unknown"})
+    write_run_json(out / "run.json", unknown)
     assert diff(finished, out)["trajectory"]["rmse_m"] < 1e-6
+
+
+def test_a_drive_of_a_map_without_metres_is_compared_by_its_shape() -> None:
+    rng = np.random.default_rng(0)
+    poses = se3.exp(rng.normal(size=(9, 6)))
+    mount = se3.exp(rng.normal(size=(1, 6)))[0]
+    stamps = {"drive": np.arange(9)}
+
+    def content(own: np.ndarray) -> _Content:
+        return _Content({}, stamps, {"drive": own}, {"drive": mount}, {"drive": "drive"}, {}, 0)
+
+    assert _moved(content(poses), content(se3.stretched(poses, 0.1, mount)))["rmse_m"] < 1e-9
+
+
+def test_runs_with_odometry_of_other_stamps_are_compared_at_those_of_the_baseline(
+    finished: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    trajectory, odometry = tables.read_trajectory(out / "trajectory.parquet")
+    at_ns = trajectory.stamp_ns[:-1] + 1_000_000
+    poses = se3.interpolate_at(trajectory.stamp_ns, trajectory.world_from_body, at_ns)
+    for shift_ns in (0, 10**12):
+        own = Trajectory(at_ns + shift_ns, poses)
+        other = replace(odometry, stamp_ns=own.stamp_ns, odom_from_body=odometry.odom_from_body[:-1], covariance=None)
+        tables.write_trajectory(out / "trajectory.parquet", own, other, tables.TableMetadata({}, ""))
+        if shift_ns == 0:
+            found = diff(finished, out)["trajectory"]
+            assert (found["samples"], found["rmse_m"] < 1e-3) == (len(at_ns) - 1, True)
+        else:
+            with pytest.raises(ResultError, match="have 0 stamps in common"):
+                diff(finished, out)

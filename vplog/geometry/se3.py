@@ -187,6 +187,15 @@ def umeyama(source: Floats, target: Floats, with_scale: bool = False) -> tuple[F
     return pose(r, mean_target - scale * r @ mean_source), scale
 
 
+def align(source: Floats, target: Floats, body_from_camera: Floats | None) -> tuple[Floats, float]:
+    """target_from_source (4, 4) of poses (T, 4, 4) by their positions, once they are `stretched` by the scale that
+    aligns the camera's path; 1 without a camera."""
+    scale = 1.0
+    if body_from_camera is not None:
+        scale = umeyama((source @ body_from_camera)[:, :3, 3], (target @ body_from_camera)[:, :3, 3], True)[1]
+    return umeyama(stretched(source, scale, body_from_camera)[:, :3, 3], target[:, :3, 3])[0], scale
+
+
 def mahalanobis2(error: Floats, covariance: Floats) -> Floats:
     """(K,) e^T C^-1 e of errors (K, d) with covariances (K, d, d)."""
     return (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)

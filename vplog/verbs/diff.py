@@ -11,11 +11,13 @@ import numpy as np
 from vplog import logs
 from vplog.data import USED, Floats
 from vplog.errors import ResultError, SettingsError
+from vplog.evaluate.pairs import poses_at
 from vplog.evaluate.trajectory import motion_figures
 from vplog.geometry import se3
 from vplog.results import run_record, tables
 from vplog.results.html import mapping
 from vplog.results.report.page import Changes
+from vplog.results.run_cameras import unit_camera
 from vplog.run.report import write_report
 from vplog.storage.json_records import differences
 from vplog.verbs import evaluate_run
@@ -93,12 +95,12 @@ def write_page(
     baseline, run = Path(found["baseline"]), Path(found["run"])
     record = run_record.read_single_run(run)
     known, poses, everything = _same_stamps((baseline, run))
-    run_from_baseline, scale = se3.umeyama(known[:, :3, 3], poses[:, :3, 3], not _in_metres((baseline, run)))
+    run_from_baseline, scale = se3.align(known, poses, mount := _mount((baseline, run)))
     changes = {tuple(pair): kind for kind in ("gained", "lost") for pair in found["closures"][kind]}
     closures = tables.read_closures(run / "closures.parquet")
     stamps = tables.read_keyframes(run / "keyframes.parquet")[0].stamp_ns
     pairs = zip(stamps[closures.query].tolist(), stamps[closures.match].tolist(), strict=True)
-    at = se3.transform(run_from_baseline, scale * everything[:, :3, 3])
+    at = se3.transform(run_from_baseline, se3.stretched(everything, scale, mount)[:, :3, 3])
     judged = judge(run, record, truth, topics, options or TruthOptions()) if truth is not None else None
     write_report(run, record, path, judged, changes=Changes(found, at, [changes.get(pair) for pair in pairs]))
 
@@ -135,24 +137,27 @@ def _closures(folder: Path) -> dict[tuple[int, int], None]:
 
 
 def _moved(folders: Sequence[Path]) -> dict[str, Any]:
-    """Distance and angle between the trajectories of two runs where they have the same stamps; in the unit of the
-    first, by a similarity where one of them has no metres."""
+    """Distance and angle between the trajectories of two runs at the stamps of the first; in its unit, by a similarity
+    where one of them has no metres."""
     known, poses, _ = _same_stamps(folders)
-    aligned, scale = se3.umeyama(poses[:, :3, 3], known[:, :3, 3], not _in_metres(folders))
-    return motion_figures(se3.between(known, aligned @ se3.stretched(poses, scale)))
+    aligned, scale = se3.align(poses, known, mount := _mount(folders))
+    return motion_figures(se3.between(known, aligned @ se3.stretched(poses, scale, mount)))
 
 
-def _in_metres(folders: Sequence[Path]) -> bool:
-    return all(run_record.has_metres(run_record.read_run_json(folder / "run.json")) for folder in folders)
+def _mount(folders: Sequence[Path]) -> Floats | None:
+    """The `unit_camera` of the first run without metres; None where all are in metres."""
+    mounts = (unit_camera(run_record.read_run_json(folder / "run.json")) for folder in folders)
+    return next((mount for mount in mounts if mount is not None), None)
 
 
 def _same_stamps(folders: Sequence[Path]) -> tuple[Floats, Floats, Floats]:
-    """Poses (S, 4, 4) of the trajectories of two runs where they have the same stamps, and all of the first."""
+    """Poses (S, 4, 4) of the trajectories of two runs at the stamps of the first that the second covers, which may be
+    of other odometry, and all of the first. Raises ResultError where these are fewer than three."""
     baseline, run = (tables.read_trajectory(folder / "trajectory.parquet")[0] for folder in folders)
-    stamps, one, other = np.intersect1d(baseline.stamp_ns, run.stamp_ns, return_indices=True)
-    if len(stamps) < 3:
-        raise ResultError(f"{folders[0]} and {folders[1]} share {len(stamps)} stamps. Give two runs of one drive.")
-    return baseline.world_from_body[one], run.world_from_body[other], baseline.world_from_body
+    poses, known = poses_at(run, baseline.stamp_ns)
+    if known.sum() < 3:
+        raise ResultError(f"{folders[0]} and {folders[1]} have {known.sum()} stamps in common. Give runs of one drive.")
+    return baseline.world_from_body[known], poses[known], baseline.world_from_body
 
 
 def _change(before: Any, after: Any) -> float | None:

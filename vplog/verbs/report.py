@@ -69,17 +69,14 @@ def judge(
     found = evaluate_poses(folder, record, truth, options, known)
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     at, known, judged = found.truth.at(keyframes.stamp_ns), found.truth.trajectory, found.judged
-    mount, units = unit_camera(record), 1.0
-    if mount is not None:
-        ends = ((poses[at.known] @ mount)[:, :3, 3] for poses in (at.world_from_body, world_from_body))
-        units = se3.umeyama(*ends, with_scale=True)[1]
-    true, solved = se3.stretched(at.world_from_body, units, mount), world_from_body[at.known][:, :3, 3]
-    world_from_truth, _ = se3.umeyama(true[at.known][:, :3, 3], solved)
+    mount, solved = unit_camera(record), world_from_body[at.known]
+    world_from_truth, units = se3.align(at.world_from_body[at.known], solved, mount)
+    true = se3.stretched(at.world_from_body, units, mount)
     # of the truth only what the drive covers, so that the map is that of the drive
     during = (known.stamp_ns >= keyframes.stamp_ns[0]) & (known.stamp_ns <= keyframes.stamp_ns[-1])
     path = se3.transform(world_from_truth, se3.stretched(known.world_from_body[during], units, mount)[:, :3, 3])
     error_m = np.full(len(keyframes.stamp_ns), np.nan)
-    error_m[at.known] = np.linalg.norm(se3.transform(world_from_truth, true[at.known][:, :3, 3]) - solved, axis=1)
+    error_m[at.known] = np.linalg.norm((world_from_truth @ true[at.known] - solved)[:, :3, 3], axis=1)
     closures = tables.read_closures(folder / "closures.parquet")
     expected = se3.between(true[closures.match], true[closures.query])
     apart_m = np.linalg.norm((expected - closures.match_from_query)[:, :3, 3], axis=1) / units
