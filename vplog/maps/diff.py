@@ -101,18 +101,17 @@ def _moved(before: _Content, after: _Content) -> dict[str, Any]:
     """Distance and angle between the keyframes of both maps, aligned frame by frame, by a similarity where a drive has
     no metres; None without three of a frame."""
     frames: dict[Pair, list[tuple[Floats, Floats]]] = {}
-    mounts: dict[Pair, Floats] = {}
     for drive in before.stamps.keys() & after.stamps.keys():
         _, one, other = np.intersect1d(before.stamps[drive], after.stamps[drive], return_indices=True)
-        frame = before.frame[drive], after.frame[drive]
-        frames.setdefault(frame, []).append((before.poses[drive][one], after.poses[drive][other]))
-        for mount in (before.mounts[drive], after.mounts[drive]):
-            if mount is not None:
-                mounts.setdefault(frame, mount)
+        frames.setdefault((before.frame[drive], after.frame[drive]), []).append(
+            (before.poses[drive][one], after.poses[drive][other])
+        )
     apart = []
     for frame, parts in sorted(frames.items()):
         known, poses = map(np.concatenate, zip(*parts, strict=True))
         if len(known) >= 3:
-            aligned, scale = se3.align(poses, known, mounts.get(frame))
-            apart.append(se3.between(known, aligned @ se3.stretched(poses, scale, mounts.get(frame))))
+            mount = before.mounts.get(frame[0])  # no drive without metres is joined with another
+            mount = after.mounts.get(frame[1]) if mount is None else mount
+            aligned, scale = se3.align(poses, known, mount)
+            apart.append(se3.between(known, aligned @ se3.stretched(poses, scale, mount)))
     return motion_figures(np.concatenate([np.zeros((0, 4, 4)), *apart]))
