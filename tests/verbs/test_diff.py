@@ -13,7 +13,7 @@ import pytest
 from vplog.data import Trajectory
 from vplog.errors import ResultError, SettingsError
 from vplog.geometry import se3
-from vplog.maps.diff import _Content, _moved, diff_maps
+from vplog.maps.diff import diff_maps
 from vplog.results import tables
 from vplog.results.run_cameras import unit_camera
 from vplog.results.run_record import read_run_json, write_run_json
@@ -142,18 +142,6 @@ def test_a_run_without_metres_is_compared_by_its_shape(finished: Path, tmp_path:
     assert diff(finished, out)["trajectory"]["rmse_m"] > 1.0
     write_run_json(out / "run.json", unknown)
     assert diff(finished, out)["trajectory"]["rmse_m"] < 1e-6
-
-
-def test_a_drive_of_a_map_without_metres_is_compared_by_its_shape() -> None:
-    rng = np.random.default_rng(0)
-    poses = se3.exp(rng.normal(size=(9, 6)))
-    mount = se3.exp(rng.normal(size=(1, 6)))[0]
-    stamps = {"drive": np.arange(9)}
-
-    def content(own: np.ndarray) -> _Content:
-        return _Content({}, stamps, {"drive": own}, {"drive": mount}, {"drive": "drive"}, {}, 0)
-
-    assert _moved(content(poses), content(se3.stretched(poses, 0.1, mount)))["rmse_m"] < 1e-9
 
 
 def test_runs_with_odometry_of_other_stamps_are_compared_at_those_of_the_baseline(

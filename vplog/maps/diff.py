@@ -13,8 +13,7 @@ from vplog.evaluate.trajectory import motion_figures
 from vplog.geometry import se3
 from vplog.maps.joining.joint_record import joint_components, keyframe_poses
 from vplog.maps.storage.map_store import Store, reading
-from vplog.results import run_record, tables
-from vplog.results.run_cameras import unit_camera
+from vplog.results import tables
 from vplog.storage.json_records import differences
 
 Pair = tuple[str, str]
@@ -27,8 +26,6 @@ class _Content:
     """(N,) ns of the keyframes of each drive."""
     poses: dict[str, Floats]
     """(N, 4, 4) in the frame of the component."""
-    mounts: dict[str, Floats | None]
-    """The `unit_camera` of each drive."""
     frame: dict[str, str]
     """The first drive of the component of each drive."""
     closures: dict[Pair, None]
@@ -74,7 +71,6 @@ def _content(store: Store) -> _Content:
     joint, abouts = joint_components(store), store.drives()
     stamps = {drive: tables.read_stamps(store.file(drive, "keyframes.parquet")) for drive in abouts}
     poses = {drive: keyframe_poses(store, joint, drive) for drive in abouts}
-    mounts = {drive: unit_camera(run_record.read_run_json(store.file(drive, "run.json"))) for drive in abouts}
     closures: dict[Pair, None] = {}
     for drive in abouts:
         closures |= _pairs(tables.read_closures(store.file(drive, "closures.parquet")), drive, drive, stamps)
@@ -85,7 +81,7 @@ def _content(store: Store) -> _Content:
         for (query, match), ledger in tables.read_joins(path).items():
             closures |= _pairs(ledger, query, match, stamps)
     frame = {drive: joint[drive].drives[0] if drive in joint else drive for drive in abouts}
-    return _Content(store.head().settings, stamps, poses, mounts, frame, closures, len(closures) - own)
+    return _Content(store.head().settings, stamps, poses, frame, closures, len(closures) - own)
 
 
 def _pairs(ledger: Closures, query: str, match: str, stamps: dict[str, Ints]) -> dict[Pair, None]:
@@ -98,8 +94,7 @@ def _pairs(ledger: Closures, query: str, match: str, stamps: dict[str, Ints]) ->
 
 
 def _moved(before: _Content, after: _Content) -> dict[str, Any]:
-    """Distance and angle between the keyframes of both maps, aligned frame by frame, by a similarity where a drive has
-    no metres; None without three of a frame."""
+    """Distance and angle between the keyframes of both maps, aligned frame by frame; None without three of a frame."""
     frames: dict[Pair, list[tuple[Floats, Floats]]] = {}
     for drive in before.stamps.keys() & after.stamps.keys():
         _, one, other = np.intersect1d(before.stamps[drive], after.stamps[drive], return_indices=True)
@@ -107,11 +102,9 @@ def _moved(before: _Content, after: _Content) -> dict[str, Any]:
             (before.poses[drive][one], after.poses[drive][other])
         )
     apart = []
-    for frame, parts in sorted(frames.items()):
+    for _, parts in sorted(frames.items()):
         known, poses = map(np.concatenate, zip(*parts, strict=True))
         if len(known) >= 3:
-            mount = before.mounts.get(frame[0])  # no drive without metres is joined with another
-            mount = after.mounts.get(frame[1]) if mount is None else mount
-            aligned, scale = se3.align(poses, known, mount)
-            apart.append(se3.between(known, aligned @ se3.stretched(poses, scale, mount)))
+            aligned, _ = se3.umeyama(poses[:, :3, 3], known[:, :3, 3])
+            apart.append(se3.between(known, aligned @ poses))
     return motion_figures(np.concatenate([np.zeros((0, 4, 4)), *apart]))
