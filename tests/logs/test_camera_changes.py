@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 RNG = np.random.default_rng(8)
 SIZE = (160, 120)
+INFO = "/cam/camera_info"
 K = np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]])
 _BLURRED = cv2.GaussianBlur(RNG.random((120, 160)), (0, 0), 3)
 SCENE = (255 * (_BLURRED - _BLURRED.min()) / np.ptp(_BLURRED)).astype(np.uint8)
@@ -49,7 +50,7 @@ def info(matrix: np.ndarray, size: tuple[int, int], number: int, ros: int = 2, *
         header=header(ros, stamp, "cam"), height=size[1], width=size[0], distortion_model="plumb_bob", **fields,
         binning_x=0, binning_y=0, roi=types["sensor_msgs/msg/RegionOfInterest"](**window),
     )  # fmt: skip
-    return Written("/cam/camera_info", "sensor_msgs/msg/CameraInfo", stamp, message)
+    return Written(INFO, "sensor_msgs/msg/CameraInfo", stamp, message)
 
 
 def written(path: Path, messages: list[Written], ros: int = 2) -> Path:
@@ -80,8 +81,12 @@ def test_depth_of_any_type_is_depth(encoding: str, tmp_path: Path) -> None:
     metres[20:30] = 0
     messages = [image((metres * unit).astype(TYPES[encoding]), i, "/x/data", encoding) for i in range(9)]
     messages += [image(SCENE, i, "/y/data") for i in range(4)]
-    log = logs.open(written(tmp_path / "drive", sorted(messages, key=lambda m: m.stamp_ns)))
+    messages = sorted(messages, key=lambda m: m.stamp_ns)
+    log = logs.open(written(tmp_path / "unknown", messages))
     assert {topic.name: topic.role for topic in log.info().topics} == {"/x/data": "depth", "/y/data": "image"}
+    assert next(iter(log.frames(log.stamps()[:1]))).decode().depth is None, "metres without a focal length"
+    assert "Depth is not used: camera /y/data is not calibrated. Give its --calibration." in log.warnings
+    log = logs.open(written(tmp_path / "drive", [info(K, SIZE, 0), *messages]), TopicChoice(camera_info=INFO))
     frame = next(iter(log.frames(log.stamps()[:1]))).decode()
     assert frame.depth is not None
     np.testing.assert_allclose(frame.depth[40:], metres[40:], atol=1e-3)
@@ -195,6 +200,7 @@ def test_depth_of_another_size_is_left_out_and_counted(tmp_path: Path) -> None:
     depth[:9] = 0
     messages = [image(SCENE, i, "/cam/image") for i in range(8)]
     messages += [image(depth if i < 4 else depth[:60].copy(), i, "/cam/depth", "16UC1") for i in range(8)]
+    messages += [info(K, SIZE, 0)]
     log: Any = logs.open(written(tmp_path / "drive", sorted(messages, key=lambda m: m.stamp_ns)))
     with_depth = [frame.decode().depth is not None for frame in log.frames(log.stamps())]
     assert with_depth == [True] * 4 + [False] * 4

@@ -273,13 +273,15 @@ class RecordedLog:
 
     @cached_property
     def _depth(self) -> tuple[Channel, DepthRegistration | None] | None:
-        """The depth topic, and its registration where it is another camera's; None, with a note, where its first images
-        do not decode or do not fit the camera's."""
+        """The depth topic, and its registration where it is another camera's; None, with a note, where the camera is
+        not calibrated, or its first images do not decode or do not fit the camera's."""
         depth, camera = self._selection.depth, self.camera()
         try:
             first = None if depth is None else self._images.first_depth(depth)
             if first is None or depth is None:
                 return None
+            if camera.matrix is None:  # metres beside an assumed focal length, whose motion is in a unit
+                raise LogError(f"camera {camera.name} is not calibrated. Give its --calibration.")
             own = camera_of(depth.topic, self._content.depth_calibration, (first.shape[1], first.shape[0]), Notes())
             frames = self._left[1], self._optical(known.frame) if (known := self._candidate(depth)) else ""
             return depth, registration_of(own, camera, frames, self._content.tree, self._notes)
