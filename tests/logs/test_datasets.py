@@ -382,6 +382,21 @@ def test_grey_video_keeps_its_black_and_white(name: str, codec: str, tmp_path: P
         assert np.abs(frame.decode().image.astype(int) - picture).mean() < 1
 
 
+def test_a_video_has_its_colours(tmp_path: Path) -> None:
+    av = pytest.importorskip("av")
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        stream = container.add_stream("mpeg4", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
+        red = av.VideoFrame.from_ndarray(np.full((32, 48, 3), (220, 30, 30), np.uint8), "rgb24")
+        for _ in range(3):
+            container.mux(stream.encode(red))
+        container.mux(stream.encode())
+    log = logs.open(tmp_path / "a.mp4")
+    frame = next(iter(log.frames(log.stamps()[:1]))).decode(colour=True)
+    assert frame.colour is not None
+    assert np.abs(frame.colour.astype(int) - (220, 30, 30)).max() < 20
+
+
 @pytest.mark.parametrize(("matrix", "turns"), [((0, 1, -1, 0), -1), ((-1, 0, 0, -1), 2), ((0, -1, 1, 0), 1)])
 def test_a_video_is_turned_as_its_flag_says(matrix: tuple[int, ...], turns: int, tmp_path: Path) -> None:
     """`tkhd` holds a, b, u, c, d, v, x, y, w: a b c d turn the picture clockwise as it is shown."""

@@ -498,6 +498,11 @@ def write_file(path: Path, codec: str, b_frames: int = 0, params: str = "") -> P
     return path
 
 
+def luma(frames: VideoFrames, row: int) -> np.ndarray:
+    message = frames.message(row)
+    return np.frombuffer(message.data, np.uint8).reshape(message.height, message.width)
+
+
 @pytest.mark.parametrize("codec", FILES)
 def test_damage_in_a_file_gives_no_wrong_picture(codec: str, tmp_path: Path) -> None:
     path = write_file(tmp_path / FILES[codec], codec)
@@ -510,7 +515,7 @@ def test_damage_in_a_file_gives_no_wrong_picture(codec: str, tmp_path: Path) -> 
     path.write_bytes(data)
     frames, lost = VideoFrames(path), []
     for row in range(COUNT):
-        image = frames.image(row)
+        image = luma(frames, row)
         if not image.size:
             lost.append(row)
         else:
@@ -522,7 +527,7 @@ def test_damage_in_a_file_gives_no_wrong_picture(codec: str, tmp_path: Path) -> 
 def test_sound_files_with_open_groups_lose_no_frame(codec: str, name: str, params: str, tmp_path: Path) -> None:
     frames = VideoFrames(write_file(tmp_path / name, codec, 3, params))
     for row in (*range(COUNT), 38, 3, 25, 26, 11, 12, 13, 0, 35, 36, 37, 23, 22, 14):
-        assert close(frames.image(row), row), row
+        assert close(luma(frames, row), row), row
 
 
 def test_a_packet_is_followed_by_zeros() -> None:

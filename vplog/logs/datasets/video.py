@@ -28,6 +28,7 @@ from vplog.logs.messages.video import (
     new_decoder,
     padded,
     pyav,
+    rgb,
 )
 
 _TURNS = {90: cv2.ROTATE_90_COUNTERCLOCKWISE, 180: cv2.ROTATE_180, -180: cv2.ROTATE_180, -90: cv2.ROTATE_90_CLOCKWISE}
@@ -63,11 +64,7 @@ def read(path: Path) -> DataSet:
     remarks = list[str]()
     frames = VideoFrames(path, remarks.append)
     channel = Channel("video", "sensor_msgs/Image", "ros1")
-
-    def message(row: int) -> ImageMessage:
-        return raw_image(int(frames.stamp_ns[row]), "video", "mono8", frames.image(row))
-
-    return DataSet("video", [Stream(channel, frames.stamp_ns, message, lambda _: MAX_PIXELS)], remarks=remarks)
+    return DataSet("video", [Stream(channel, frames.stamp_ns, frames.message, lambda _: MAX_PIXELS)], remarks=remarks)
 
 
 class VideoFrames:
@@ -116,14 +113,20 @@ class VideoFrames:
         times, parts = 10**9 * self._tick_s.numerator, self._tick_s.denominator
         return np.array([(tick - first) * times // parts for tick in ticks], np.int64)
 
-    def image(self, row: int) -> Bytes:
-        """(H, W) uint8 grey; (0, 0) where it does not decode. Rows are best read in increasing order."""
+    def message(self, row: int) -> ImageMessage:
+        """Its image, of no px where it does not decode. Rows are best read in increasing order."""
+        stamp_ns = int(self.stamp_ns[row])
         try:
             frame = self._video.frame(row)
         except BadMessageError:
-            return np.zeros((0, 0), np.uint8)
+            return raw_image(stamp_ns, "video", "mono8", np.zeros((0, 0), np.uint8))
         turn = _TURNS.get(round(frame.rotation) or self._turn)
-        return grey(frame) if turn is None else np.asarray(cv2.rotate(grey(frame), turn), np.uint8)
+
+        def turned(image: Bytes) -> Bytes:
+            return image if turn is None else np.asarray(cv2.rotate(image, turn), np.uint8)
+
+        grey_image = raw_image(stamp_ns, "video", "mono8", turned(grey(frame)))
+        return grey_image._replace(rgb=lambda: turned(rgb(frame)))
 
     def _packet(self, number: int) -> bytes:
         """Empty where it cannot be read."""

@@ -124,7 +124,7 @@ def grey(message: ImageMessage, levels: Levels | None = None) -> Bytes:
 
 def rgb(message: ImageMessage, levels: Levels | None = None) -> Bytes:
     """(H, W, 3) uint8 red, green, blue; three times the grey where it has no colour. As `grey`."""
-    return _converted(message, levels, *_pixels(message, colour=True), "RGB")
+    return message.rgb() if message.rgb else _converted(message, levels, *_pixels(message, colour=True), "RGB")
 
 
 def _converted(message: ImageMessage, levels: Levels | None, pixels: Any, conversion: str, to: str) -> Bytes:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
-from vplog.data import Floats
+from vplog.data import Bytes, Floats
 from vplog.logs.formats.container import Channel, RawData
 
 
@@ -31,6 +31,8 @@ class ImageMessage(NamedTuple):
     step: int = 0
     """Bytes per row, padding included; 0 where compressed."""
     big_endian: bool = False
+    rgb: Callable[[], Bytes] | None = None
+    """(H, W, 3) uint8 where `data` is the luma of an image in colour."""
 
 
 @dataclass(frozen=True, eq=False)
