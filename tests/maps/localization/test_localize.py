@@ -120,6 +120,9 @@ def test_the_verb_gives_a_record_and_a_table(
     assert {len(row[2]) for row in rows} == {36}
     folder = verb("localize", run, pictures / "pictures", "--calibration", calibration, "--json").json
     assert folder["answers"] == record["answers"]
+    for number, given in enumerate((files, [pictures / "pictures"])):  # the cameras of pictures, however they are given
+        verb("localize", run, *given, "--calibration", calibration, "-o", tmp_path / f"{number}.tum")
+    assert (tmp_path / "0.tum").read_text() == (tmp_path / "1.tum").read_text()
     shown = verb("localize", run, files[0], "--calibration", calibration)
     assert (shown.code, "1 of 1 picture localised in" in shown.out) == (0, True)
     one = vplog.open_run(run).localize(files[0], calibration).record()

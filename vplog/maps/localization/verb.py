@@ -49,7 +49,7 @@ def localize_paths(
         records = [one.record() for one in found]
         if out is not None:
             header = TableMetadata(places.pipeline.model_dump(mode="json"), places.state.hash)
-            warnings = warnings + _write(out, records, found, joined, is_log, header)
+            warnings = warnings + _write(out, records, found, joined, log.file_names() is None, header)
         return {
             "map": str(root),
             "log": " ".join(map(str, paths)),
