@@ -15,7 +15,7 @@ from vplog.execution.execution import Execution
 from vplog.graph.noise import NoiseSettings, broken_edges, edge_covariance
 from vplog.pipeline import load_pipeline, run
 from vplog.run.keyframes import KeyframeSettings
-from vplog.run.odometry import check_metric, read, source_of
+from vplog.run.odometry import camera_of, check_metric, read, source_of
 from vplog.testing import pictures
 from vplog.verbs.demo import SMALL, make_drive
 from vplog.verbs.evaluate_run import evaluate
@@ -93,6 +93,12 @@ def test_it_is_taken_where_the_log_has_no_other() -> None:
     with pytest.raises(LogError, match="no metres"):
         check_metric(single, logs.TopicChoice())
     check_metric(log, logs.TopicChoice())
+
+
+def test_pictures_without_a_calibration_look_ahead() -> None:
+    """Visual odometry has z up then, by which the height of the camera is over the ground."""
+    camera = camera_of(pictures.PictureLog([np.zeros((9, 9), np.uint8)] * 2), VISUAL)
+    np.testing.assert_array_equal(camera.body_from_camera[:3, :3] @ [0, -1, 0], [0, 0, 1])
 
 
 def test_nothing_is_known_of_the_motion_across_a_break() -> None:

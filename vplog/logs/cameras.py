@@ -26,7 +26,7 @@ _COUNTS = {
 """Numbers of coefficients that OpenCV takes of each lens, and the model that they make."""
 BODY = "base_link"
 """The body's frame where the odometry names none: ROS REP 105."""
-_AHEAD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+AHEAD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """body_from_camera of a camera that looks along the body's x, upright: ROS REP 103."""
 _UP = 0.9
 """Least z of an axis that points up, within 25 degrees: cameras are pitched by less."""
@@ -145,7 +145,7 @@ def optical_frame(tree: FrameTree, body: str, frame: str, odometry: Odometry | N
         f"{frame} looks up by the static transforms; it is taken for a frame with x ahead (REP 103), not an optical "
         "one. Where the camera does look up, give its mount with --calibration."
     )
-    tree.add(frame_name(frame), optical := f"{frame_name(frame)} (optical)", _AHEAD)
+    tree.add(frame_name(frame), optical := f"{frame_name(frame)} (optical)", AHEAD)
     return optical
 
 
@@ -165,7 +165,7 @@ def body_from_camera(tree: FrameTree, body: str, frame: str, notes: Notes, ahead
             notes.add(
                 "The static transforms do not place the camera; it is assumed at the body's origin, looking ahead."
             )
-        return _AHEAD.copy()
+        return AHEAD.copy()
     if len(tree) or (body and frame):
         notes.add(
             f"No static transforms lead from the body {body or '(not named)'} to the camera's frame "

@@ -16,6 +16,7 @@ from vplog.execution.execution import Execution
 from vplog.geometry.masking import masked
 from vplog.graph.gps_factors import NO_FIXES
 from vplog.logs import TopicChoice
+from vplog.logs.cameras import AHEAD
 from vplog.logs.image_folder import PERIOD_NS
 from vplog.loops import undistort
 from vplog.run.cache.codecs import json_codec
@@ -131,7 +132,9 @@ def camera_of(log: Log, topics: TopicChoice) -> Camera:
 def _assumed(camera: Camera) -> Camera:
     focal_px = _FOCAL_LENGTH * max(camera.width, camera.height)
     x, y = (camera.width - 1) / 2.0, (camera.height - 1) / 2.0
-    return replace(camera, matrix=np.array([[focal_px, 0.0, x], [0.0, focal_px, y], [0.0, 0.0, 1.0]]))
+    matrix = np.array([[focal_px, 0.0, x], [0.0, focal_px, y], [0.0, 0.0, 1.0]])
+    placed = camera.body_from_camera  # pictures have none: their truth may be poses of the camera
+    return replace(camera, matrix=matrix, body_from_camera=AHEAD if np.array_equal(placed, np.eye(4)) else placed)
 
 
 def is_metric(log: Log) -> bool:
