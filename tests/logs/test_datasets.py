@@ -296,6 +296,7 @@ def test_a_colmap_model_is_calibration_and_truth(write: Callable[[Path], None], 
     for path in {root, root / where}:
         log = logs.open(path)
         assert log.info().kind == "colmap"
+        assert log.assumed_times
         check_frames(log, np.arange(COUNT) * 100_000_000, images())
         check_truth(log, log.stamps(), poses())
         assert log.camera().matrix is not None

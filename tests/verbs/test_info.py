@@ -210,6 +210,10 @@ def test_the_rate_of_images_whose_names_are_no_times_is_not_made_up(
     record = preflight(tmp_path).record
     assert [record["frames"]["rate_hz"], record["topics"][0]["rate_hz"]] == [rate_hz, rate_hz]
     assert ("assumed to be 0.1 s apart" in dict(preflight_lines(record))["frames"]) == (rate_hz is None)
+    (tmp_path / names.format(2)).write_bytes(b"")  # pictures are no drive, whichever of them are read
+    for choice in (TopicChoice(), TopicChoice(start_s=0.1)):
+        record = preflight(tmp_path, choice).record
+        assert (record["frames"]["rate_hz"] is None, record["visual_odometry"] == "") == (rate_hz is None,) * 2
 
 
 def test_gaps_are_placed_in_time(tmp_path: Path) -> None:

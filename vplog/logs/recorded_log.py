@@ -125,6 +125,11 @@ class RecordedLog:
         names = self._contents.names
         return [names[stamp_ns] for stamp_ns in self.stamps().tolist()] if names else None
 
+    @property
+    def assumed_times(self) -> bool:
+        """As `Contents.assumed_times`."""
+        return self._contents.assumed_times
+
     def odometry(self) -> Odometry | None:
         return self._sidecar.odometry or self._content.odometry
 

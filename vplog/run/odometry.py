@@ -17,7 +17,6 @@ from vplog.geometry.masking import masked
 from vplog.graph.gps_factors import NO_FIXES
 from vplog.logs import TopicChoice
 from vplog.logs.cameras import AHEAD
-from vplog.logs.image_folder import PERIOD_NS
 from vplog.loops import undistort
 from vplog.run.cache.codecs import json_codec
 from vplog.run.cache.stage_cache import Inputs
@@ -145,12 +144,10 @@ def is_metric(log: Log) -> bool:
 
 
 def gives_visual(log: Log) -> bool:
-    """Whether there are images by which a run computes its odometry unasked: of any camera, but no pictures of a folder
+    """Whether there are images by which a run computes its odometry unasked: of any camera, but no pictures
     whose names hold no times, which need not follow each other."""
     with suppress(LogError):  # no images
-        stamp_ns = log.stamps()
-        pictures = log.file_names() is not None and np.array_equal(stamp_ns, np.arange(len(stamp_ns)) * PERIOD_NS)
-        return is_metric(log) or (len(stamp_ns) > 1 and not pictures)
+        return is_metric(log) or (len(log.stamps()) > 1 and not getattr(log, "assumed_times", False))
     return False
 
 

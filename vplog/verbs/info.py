@@ -17,7 +17,6 @@ from vplog.errors import LogError
 from vplog.geometry.masking import masked
 from vplog.logs import TopicChoice
 from vplog.logs.clocks import GAP_NS, GAP_PERIODS
-from vplog.logs.image_folder import PERIOD_NS
 from vplog.logs.odometry_sources import PROPERTIES, evidence_text
 from vplog.logs.stamps import rate_hz
 from vplog.results.html import render
@@ -123,8 +122,7 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
     warnings = [line for line in dict.fromkeys(found.warnings + log.warnings + missing) if line not in problems]
     named = {**asdict(found), "warnings": warnings}
     timing = _timing(stamp_ns)
-    assumed = found.kind in ("images", "utm-images") and np.array_equal(stamp_ns, np.arange(len(stamp_ns)) * PERIOD_NS)
-    if assumed:  # as the names of the images hold no times
+    if assumed := getattr(log, "assumed_times", False):
         timing["rate_hz"] = None
     for topic, entry in zip(found.topics, named["topics"], strict=True):
         if topic.part == "lidar" and computed != "lidar":

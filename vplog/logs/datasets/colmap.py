@@ -69,11 +69,13 @@ def read(path: Path) -> DataSet:
             raise LogError(f"The COLMAP model has no camera {missing.camera} of {missing.name[:60]}. Copy it again.")
         known = [cameras[one.camera].calibration for one in group]  # COLMAP may have a camera for every image
         streams += [*camera_streams(topic, stamp_ns, files, None), calibration_stream(topic, stamp_ns, known)]
-    stamp_ns, rows = np.unique(named_stamps([folder / one.name for one in groups[main]])[0], return_index=True)
+    stamp_ns, timed = named_stamps([folder / one.name for one in groups[main]])
+    stamp_ns, rows = np.unique(stamp_ns, return_index=True)
     streams.append(mount_stream(folder.name if main == "." else main, stamp_ns[:1], np.eye(4)))
     values = np.array([groups[main][row].pose for row in rows], np.float64)
     camera_from_world: Floats = se3.pose(se3.rotation(values[:, [1, 2, 3, 0]]), values[:, 4:])
-    return DataSet("colmap", streams, Trajectory(stamp_ns, se3.inverse(camera_from_world)), [_UNITS])
+    truth = Trajectory(stamp_ns, se3.inverse(camera_from_world))
+    return DataSet("colmap", streams, truth, [_UNITS], assumed_times=not timed)
 
 
 def _folder_of(images: list[_Image], near: list[Path], table: Path) -> Path:

@@ -24,12 +24,12 @@ def read(path: Path, files: list[Path], damaged: Collection[Path], choice: Topic
     times, remarks = stamps_of([file.stem for file in files]), []
     if times is not None and files[0].relative_to(path).parts[1:] and any(a >= b for a, b in pairwise(times)):
         times = None  # several folders, each with times of its own
-    if times is None:
+    if assumed := times is None:
         times = [number * PERIOD_NS for number in range(len(files))]
-        if choice.odometry_file is not None:  # who compares pictures alone uses no times
+        if choice.odometry_file is not None or choice.odometry == "visual":  # who compares pictures uses no times
             remarks = [f"The names in {path.name} are not times; its images are assumed to be 0.1 s apart."]
     names = {
         time_ns: file.relative_to(path).as_posix() for time_ns, file in reversed([*zip(times, files, strict=True)])
     }
     streams = camera_streams(path.name, np.array(times, np.int64), files, None, damaged)
-    return DataSet("images", streams, None, remarks, names)
+    return DataSet("images", streams, None, remarks, names, assumed)

@@ -61,6 +61,8 @@ class DataSet:
     remarks: list[str] = field(default_factory=list)
     names: dict[int, str] = field(default_factory=dict)
     """File of each image by its stamp, of pictures that are known by name."""
+    assumed_times: bool = False
+    """As in `Contents`."""
 
 
 class DataSetContainer:
@@ -69,6 +71,7 @@ class DataSetContainer:
     def __init__(self, found: DataSet, notes: Notes) -> None:
         """Raises LogError where a stamp is out of range."""
         self._streams, self._truth, self._names = found.streams, found.truth, found.names
+        self._assumed_times = found.assumed_times
         for remark in found.remarks:
             notes.add(remark)
         for one in found.streams:
@@ -88,7 +91,9 @@ class DataSetContainer:
             for one in self._streams
             if one.files
         }
-        return Contents(dict(sorted(counts.items())), *span_ns, self._truth, BODY, self._names, files)
+        return Contents(
+            dict(sorted(counts.items())), *span_ns, self._truth, BODY, self._names, files, self._assumed_times
+        )
 
     def messages(self, channels: Collection[Channel], header_only: Collection[Channel] = ()) -> Iterator[Message]:
         """The messages in order of time."""

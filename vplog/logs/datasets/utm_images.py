@@ -41,4 +41,4 @@ def read(path: Path) -> DataSet:
         streams.append(fix_stream("position", Gps(stamp_ns, latitude_deg, longitude_deg, position[:, 2], unknown)))
     truth = Trajectory(stamp_ns, se3.pose(np.eye(3), position))
     names = {time_ns: file.name for time_ns, file in zip(stamp_ns.tolist(), files, strict=True)}
-    return DataSet("utm-images", streams, truth, names=names)
+    return DataSet("utm-images", streams, truth, names=names, assumed_times=not timed)

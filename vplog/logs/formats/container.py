@@ -61,6 +61,8 @@ class Contents:
     """Image file by stamp, of images that are known by their names."""
     files: dict[str, dict[int, str]] = field(default_factory=dict)
     """By topic, the path of each image by its stamp, of those that are files."""
+    assumed_times: bool = False
+    """Where the names of the images hold no times: they are taken to be 0.1 s apart, and need not follow each other."""
 
     @property
     def messages(self) -> int:
