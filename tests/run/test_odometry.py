@@ -92,6 +92,9 @@ def test_it_is_taken_where_the_log_has_no_other() -> None:
     assert source_of(single, logs.TopicChoice()) == source_of(single, VISUAL) == "visual"
     with pytest.raises(LogError, match="no metres"):
         check_metric(single, logs.TopicChoice())
+    check_metric(single, with_height := logs.TopicChoice(camera_height_m=1.3))
+    with pytest.raises(LogError, match="no metres"):  # the images show no ground
+        check_metric(single, with_height, Odometry(np.arange(2), np.tile(np.eye(4), (2, 1, 1)), None, metric=False))
     check_metric(log, logs.TopicChoice())
 
 

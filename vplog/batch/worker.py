@@ -176,11 +176,12 @@ def fault_of(url: str, error: Exception) -> str:
 def _compute(task: Task, path: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:
     """Make the run folder of a drive: its run.json, the name of the drive in its tables, and its drive.json."""
     execution, log = Execution(task.threads), logs.open(path, task.topics)
-    if _is_pictures(log):
+    if task.topics.odometry != "visual" and _is_pictures(log):
         return _write_pictures(task, path, log, execution), task.drive, {**task.record, layout.PICTURES: True}
     check_metric(log, task.topics)
     options = CacheOptions(task.cache, use=task.cache is not None)
     done = run_alone(path, task.folder, task.pipeline, task.library, task.topics, execution, options)
+    check_metric(done.log, task.topics, done.odometry)
     return done.record, done.keyframes.drive, task.record
 
 

@@ -151,12 +151,18 @@ def gives_visual(log: Log) -> bool:
     return False
 
 
-def check_metric(log: Log, topics: TopicChoice) -> None:
-    """Raise LogError where a drive has no metres, or no odometry at all, so that no other drive is joined with it."""
-    if source_of(log, topics) == "visual" and not is_metric(log):
+def check_metric(log: Log, topics: TopicChoice, odometry: Odometry | None = None) -> None:
+    """Raise LogError where a drive has no metres by its odometry, or before that is computed, nothing that may give
+    them, or no odometry at all, so that no other drive is joined with it."""
+    if odometry is None:
+        given = source_of(log, topics) != "visual" or topics.camera_height_m is not None
+        metric = given or is_metric(log) or log.imu() is not None
+    else:
+        metric = odometry.metric
+    if not metric:
         raise LogError(
             f"{log.name}: the visual odometry of a single camera has no metres, so no other drive is joined with it. "
-            "Run it by itself, or give its poses by --odometry-file."
+            "Run it by itself, or give --camera-height-m, or its poses by --odometry-file."
         )
 
 

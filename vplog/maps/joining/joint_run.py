@@ -76,8 +76,9 @@ def run_joint(
     for log, path in zip(opened, paths, strict=True):
         drives_at[numbered(log.name, log.name, {"library", *drives_at})] = path
     check_library(library, pipeline)
+    topics = topics or logs.TopicChoice()
     for log in opened:  # before the first drive is computed
-        check_metric(log, topics or logs.TopicChoice())
+        check_metric(log, topics)
     head = {**provenance.head(pipeline, paths[0], execution.threads), **provenance.logs_of(paths)}
     watch = StageTimer()
     with ExitStack() as stack:
@@ -95,6 +96,7 @@ def run_joint(
                 done = run_alone(
                     path, made / name, pipeline, library, topics, execution.within(name), CacheOptions(caches / name)
                 )
+                check_metric(done.log, topics, done.odometry)
                 drives.append(_drive_run(name, done, pipeline))
         with watch.stage("between"):
             state = drives[0].run.state
