@@ -205,6 +205,13 @@ def test_us_and_ns_since_a_start_are_told_by_the_period(unit: int, width: int) -
         assert stamps_of(names) == [value * unit for value in values.tolist()]
 
 
+def test_names_of_phones_are_dates_with_times() -> None:
+    names = ["PXL_20230512_235959999", "PXL_20230513_000000099~2", "PXL_20230513_000001000.MP"]
+    assert stamps_of(names) == [1683935999999000000, 1683936000099000000, 1683936001000000000]
+    assert stamps_of([f"PXL_20230512_1430{second}123" for second in range(10, 60, 7)]) is not None
+    assert stamps_of([*names, "a picture"]) is None
+
+
 def test_numbers_that_no_clock_has_count_the_images(tmp_path: Path) -> None:
     assert stamps_of(["9" * 20, "9" * 19 + "8"]) is None
     assert stamps_of(["00000000000000000007"]) is None

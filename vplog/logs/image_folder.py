@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import statistics
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from datetime import datetime
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -23,6 +25,8 @@ _SINCE_1970_S = (631_152_000, 4_102_444_800)
 """1990 to 2100: whole numbers of s, ms, us or ns in it have 9 to 19 digits, and never fit two of the units."""
 _PERIODS_NS = (5_000_000, 5_000_000_000)
 """200 Hz down to 0.2 Hz, as cameras have it: in us and in ns two ranges that meet and do not overlap."""
+_DATE = re.compile(r"(?<!\d)(20\d{6})[_-]?(\d{9})(?!\d)")
+"""A day and a time to the ms, as phones name their pictures."""
 _LEAST = 3
 """Images of a camera, at least: fewer may be strays."""
 _SHARE = 0.5
@@ -70,10 +74,14 @@ def stamps_of(names: list[str]) -> list[int] | None:
     """ns from file stems that are times, or hold one beside words that all have (`frame_1403715273262142976`); None
     where they count the images.
 
-    Times are decimal seconds, or whole s, ms, us or ns that all lie between 1990 and 2100. Others are us or ns since
-    some start, as of a machine's boot, where their median step is the period of a camera in one of the two: counters
-    go in steps of a few, with leading zeros or without.
+    Times are decimal seconds, whole s, ms, us or ns that all lie between 1990 and 2100, or a date and a time of day to
+    the ms (`PXL_20230512_143015123`). Others are us or ns since some start, as of a machine's boot, where their median
+    step is the period of a camera in one of the two: counters go in steps of a few, with leading zeros or without.
     """
+    dates = [_DATE.search(name) for name in names]
+    with suppress(ValueError):  # no such day
+        if found := [datetime.strptime(f"{one[1]}{one[2]}Z", "%Y%m%d%H%M%S%f%z") for one in dates if one]:
+            return [round(at.timestamp() * 1e3) * 10**6 for at in found] if len(found) == len(names) else None
     names = _changing(names)
     if all(re.fullmatch(r"[0-9]{1,10}\.[0-9]{1,9}", name) for name in names):
         parts = [name.split(".") for name in names]
