@@ -168,6 +168,8 @@ def test_pictures_of_a_kind_that_is_not_read_are_counted(below: str, tmp_path: P
     log = logs.open(tmp_path)
     assert len(log.stamps()) == COUNT
     assert "3 pictures of kinds that are not read left out (AVIF, HEIC)" in " ".join(log.warnings)
+    with pytest.raises(LogError, match=r"1 picture of kinds that are not read left out .HEIC.*Convert"):
+        logs.open(tmp_path / below / "IMG_1.HEIC")
     for file in (tmp_path / below).glob("*.png"):
         file.unlink()
     with pytest.raises(LogError, match=r"no images\. 3 pictures of kinds" if below == "." else "nothing"):

@@ -424,6 +424,14 @@ def test_start_and_stop_leave_images_out(tmp_path: Path) -> None:
         logs.open(tmp_path, TopicChoice(start_s=9)).stamps()
 
 
+def test_clips_are_to_be_joined_to_one_drive(tmp_path: Path) -> None:
+    clips = [tmp_path / "a.mp4", tmp_path / "b.mp4"]
+    for clip in clips:
+        clip.write_bytes(b"\0\0\0\x18ftypisom")
+    with pytest.raises(LogError, match=r"a\.mp4 is a video.*ffmpeg -f concat"):
+        logs.open_drive(clips)
+
+
 def test_what_is_cut_from_a_video_is_one_line(tmp_path: Path) -> None:
     write_video(tmp_path / "a.mp4", np.zeros((4, 32, 48), np.uint8), "mpeg4")
     data = (tmp_path / "a.mp4").read_bytes()

@@ -206,6 +206,11 @@ def open_drive(
             _check_there(path)
             if path.is_dir():
                 raise LogError(f"{path} is a folder; give it by itself. Give a drive in several logs as its files.")
+            if video.is_video(path):
+                raise LogError(
+                    f"{path} is a video, and one drive is one video. Join the clips first: "
+                    "ffmpeg -f concat -i LIST -c copy DRIVE.mp4."
+                )
             same_name = sum(other.name == path.name for other in paths) > 1
             try:
                 container, kind = open_container(path, notes, str(path) if same_name else path.name)
@@ -419,4 +424,5 @@ def _no_folder(path: Path, files: list[Path]) -> str:
 def _no_log(path: Path) -> str:
     if path.stat().st_size == 0:
         return f"{path} is empty (0 bytes). Was the recording stopped before anything was written?"
-    return f"{path} starts with {image_folder.first_bytes(path, 8)!r}, which no log does. A log is {_KNOWN}."
+    found = f"{path} starts with {image_folder.first_bytes(path, 8)!r}, which no log does."
+    return " ".join([found, *_unread([path]), f"A log is {_KNOWN}."])

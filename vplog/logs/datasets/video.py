@@ -33,6 +33,8 @@ from vplog.logs.messages.video import (
 
 _TURNS = {90: cv2.ROTATE_90_COUNTERCLOCKWISE, 180: cv2.ROTATE_180, -180: cv2.ROTATE_180, -90: cv2.ROTATE_90_CLOCKWISE}
 """By the degrees counterclockwise that PyAV gives of the display matrix (ISO/IEC 14496-12, 8.3.2)."""
+_STILLS = (b"heic", b"heix", b"mif1", b"avif")
+"""Brands of files that hold a picture: ISO/IEC 23008-12, annex B; AVIF 1.1."""
 _AHEAD = 250
 """Packets that are read to reach one, rather than sought from the key frame before it: usual distances of these."""
 _FILTERS = {"h264": "h264_mp4toannexb,dump_extra", "hevc": "hevc_mp4toannexb,dump_extra"}
@@ -54,9 +56,10 @@ class _Packet(NamedTuple):
 
 
 def is_video(path: Path) -> bool:
-    """By the first bytes: ISO base media, Matroska and WebM, AVI."""
+    """By the first bytes: ISO base media but still pictures (HEIC, AVIF), Matroska and WebM, AVI."""
     head = first_bytes(path, 12)
-    return head[4:8] == b"ftyp" or head[:4] == b"\x1a\x45\xdf\xa3" or (head[:4] == b"RIFF" and head[8:] == b"AVI ")
+    is_media = head[4:8] == b"ftyp" and head[8:] not in _STILLS
+    return is_media or head[:4] == b"\x1a\x45\xdf\xa3" or (head[:4] == b"RIFF" and head[8:] == b"AVI ")
 
 
 def read(path: Path) -> DataSet:
