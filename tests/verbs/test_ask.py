@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import shutil
 from pathlib import Path
@@ -62,6 +63,8 @@ def test_questions_are_asked_and_once_answered_the_next_ones(
 def test_nothing_is_asked_where_all_is_decided(finished: Path, verb: Callable[..., Said], tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(finished, run)
+    (run / "run.json").write_text(json.dumps({**read_run_json(run / "run.json"), "scale": "unknown"}))
+    assert "no metres" in verb("ask", run, "-o", tmp_path / "asked", "--json").json["warnings"][0]
     closures = tables.read_closures(run / "closures.parquet")
     keyframes, _ = tables.read_keyframes(run / "keyframes.parquet")
     posed = np.isfinite(closures.match_from_query[:, 0, 0])

@@ -185,8 +185,8 @@ def test_rerun_reads_its_own_with_its_blueprint(verb: Verb, drive: Demo, finishe
         ("/map/path/truth", 1, "LineStrips3D:strips"),
         ("/closures/picture", len(read_pictures(finished / "result.mcap").pictures), "EncodedImage:blob"),
         ("/errors/sigma/after", accepted, "Scalars:scalars"),
-        ("/errors/metres/odometry", len(keyframes.stamp_ns), "Scalars:scalars"),
-        ("/errors/metres/truth", len(keyframes.stamp_ns), "Scalars:scalars"),
+        ("/errors/distance/odometry", len(keyframes.stamp_ns), "Scalars:scalars"),
+        ("/errors/distance/truth", len(keyframes.stamp_ns), "Scalars:scalars"),
     ):
         found = [int(c.split("with ")[1].split()[0]) for c in chunks if f"- {entity} -" in c and component in c]
         assert sum(found) == rows, entity

@@ -343,6 +343,7 @@ def print_questions(found: dict[str, Any]) -> None:
     pictures = [one["picture"] for one in found["questions"] if one["picture"]]
     if pictures:
         print(f"{'pictures':10}{os.path.dirname(pictures[0])}")  # noqa: PTH120
+    warn(found["warnings"])
     print_line("answer", f"accept or reject, in the third column: {found['decisions']}")
     print(f"{'next':10}{found['command']}")
 

@@ -93,7 +93,7 @@ def _blueprint(tracks: Tracks, topics: Collection[str]) -> Any:
     upper = rrb.Horizontal(space, rrb.Vertical(*pictures), column_shares=[3, 2]) if pictures else space
     plots = [
         rrb.TimeSeriesView(origin="errors/sigma", name="Residual of accepted closures in sigma"),
-        rrb.TimeSeriesView(origin="errors/metres", name="Metres from the solution"),
+        rrb.TimeSeriesView(origin="errors/distance", name="Distance from the solution"),
     ]
     panels = rrb.TimePanel(timeline=_TIMELINE, state="collapsed"), rrb.SelectionPanel(state="collapsed")
     return rrb.Blueprint(rrb.Vertical(upper, rrb.Horizontal(*plots), row_shares=[3, 1]), *panels)
@@ -116,9 +116,9 @@ def _log_errors(recording: Any, rr: Any, tracks: Tracks, closures: Closures, jud
     if judged is not None and judged.error_m is not None and judged.path is not None:
         distances.append(("truth", judged.error_m, _VIOLET))
         recording.log("map/path/truth", rr.LineStrips3D([judged.path], colors=[_VIOLET]), static=True)
-    for name, metres, colour in distances:
+    for name, distance, colour in distances:
         style = rr.SeriesLines(colors=colour, names=f"to the {name}")
-        _series(recording, rr, f"errors/metres/{name}", style, stamp_ns, metres)
+        _series(recording, rr, f"errors/distance/{name}", style, stamp_ns, distance)
 
 
 def _series(recording: Any, rr: Any, entity: str, style: Any, stamp_ns: Ints, values: Floats) -> None:

@@ -119,6 +119,11 @@ def has_metres(record: dict[str, Any]) -> bool:
     return record.get("scale") != "unknown"
 
 
+def unit_warnings(record: dict[str, Any]) -> list[str]:
+    """A warning beside lengths of a run that are not metres."""
+    return [] if has_metres(record) else ["This run has no metres: lengths in m here are in its own unit."]
+
+
 def command_of(record: dict[str, Any], out: str | Path, *more: str | Path) -> str:
     """The command that runs a drive again into a folder, by its run.json; of older ones its log alone."""
     known = record.get("arguments")

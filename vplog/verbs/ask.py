@@ -50,6 +50,7 @@ def ask(folder: Path, count: int = 10, output: Path | None = None) -> dict[str, 
         "decided": len(lines),
         "left": len(found) - len(chosen),
         "decisions": str(path),
+        "warnings": run_record.unit_warnings(record),
         "command": run_record.command_of(record, folder, "--decisions", path),
     }
 

@@ -54,9 +54,7 @@ def explain(
     siblings = [closures.verdict[one].value for one in np.flatnonzero(closures.query == row["query"])]
     reason = str(run_record.recorded(record, folder / "run.json", dict, "solution").get("reason", ""))
     explanation = explain_text.describe(row, keyframes, world_from_body, siblings, pipeline, reason)
-    if not run_record.has_metres(record):
-        text = f"{explanation.solver} This run has no metres: lengths in m here are in its own unit."
-        explanation = replace(explanation, solver=text)
+    explanation = replace(explanation, solver=" ".join([explanation.solver, *run_record.unit_warnings(record)]))
     shown = None
     if not words_only:
         topics = logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json")

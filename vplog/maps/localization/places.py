@@ -157,7 +157,7 @@ def _of_run(folder: Path, execution: Execution) -> Iterator[Places]:
 
         stack.callback(load.cache_clear)
         own = PlacesOfDrive(keyframes.drive, keyframes.drive, load)
-        yield Places(str(folder), state, pipeline, [own], search, [])
+        yield Places(str(folder), state, pipeline, [own], search, run_record.unit_warnings(record))
 
 
 @contextmanager

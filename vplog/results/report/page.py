@@ -162,6 +162,7 @@ def page(content: ReportContent) -> str:
         judged=judged,
         changes=content.changes and _changes(content.changes),
         questions=_questions(content),
+        unit=_unit(content),
         truth=_truth(judged) if judged else [],
         curves=curves,
         verdicts=[(verdict.value, figure(count), verdict.sentence) for verdict, count in counts if count],
