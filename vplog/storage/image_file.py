@@ -24,11 +24,11 @@ except ImportError:  # no wheel for this processor
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # errors of files are raised here
 
-MAX_PIXELS = 2**26
-"""px of a compressed image that are decoded (67 million: above the cameras of vehicles and robots)."""
+MAX_PIXELS = 2**28
+"""px of a compressed image that are decoded (268 million: above the 200 of phones)."""
 MAX_PIXELS_PER_BYTE = 1100
 """px that a byte of a compressed image may claim: deflate, the tightest of PNG, reaches 1032 bytes per byte, baseline
-and progressive JPEG stay below 512 px. WebP has no such limit; MAX_PIXELS alone bounds it."""
+and progressive JPEG stay below 512 px. WebP has no such limit; a quarter of MAX_PIXELS bounds it."""
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 """Markers that a JPEG begins and ends with: ITU T.81, table B.1. Some cameras write more behind its end."""
@@ -69,9 +69,9 @@ def decode_image(data: bytes | memoryview, unchanged: bool = False) -> Any:
     size = image_size(data)
     if size is None:
         raise BadImageError(f"its {len(data)} bytes are not a whole JPEG, PNG, WebP, BMP, TIFF or PNM image")
-    limit = MAX_PIXELS if data[:4] == b"RIFF" else min(MAX_PIXELS, MAX_PIXELS_PER_BYTE * len(data))
+    limit = MAX_PIXELS // 4 if data[:4] == b"RIFF" else min(MAX_PIXELS, MAX_PIXELS_PER_BYTE * len(data))
     if not 0 < size[0] * size[1] <= limit:
-        raise BadImageError(f"{size[0]} x {size[1]} px are more than its {len(data)} bytes can hold")
+        raise BadImageError(f"{size[0]} x {size[1]} px are more than the {limit} that are read of {len(data)} bytes")
     if data[:2] == JPEG:
         return _decode_jpeg(data, unchanged)
     if data[:8] == PNG:

@@ -260,11 +260,19 @@ def test_size_that_the_data_do_not_justify_is_refused_before_it_is_allocated() -
         grey(ImageMessage(0, "", "rgb8", bytes(100), False, 10, 10, 10))
     with pytest.raises(BadMessageError, match="do not hold"):
         grey(ImageMessage(0, "", "mono8", b"", False, 0, 0, 0))
+    webp = b"RIFF\0\0\0\0WEBPVP8X" + bytes(8) + (19_999).to_bytes(3, "little") + (9_999).to_bytes(3, "little")
+    with pytest.raises(BadMessageError, match="20000 x 10000 px are more than the 67108864 that are read of 30 bytes"):
+        grey(ImageMessage(0, "", "webp", webp, True))
     head = b"IHDR" + struct.pack(">IIBBBBB", 100_000, 100_000, 8, 0, 0, 0, 0)
     end = struct.pack(">I4sI", 0, b"IEND", zlib.crc32(b"IEND"))
     bomb = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + head + struct.pack(">I", zlib.crc32(head)) + end
     with pytest.raises(BadMessageError, match="100000 x 100000"):
         grey(ImageMessage(0, "", "png", bomb, True))
+
+
+def test_pictures_of_phones_are_read() -> None:
+    data = cv2.imencode(".jpg", np.zeros((9000, 12000), np.uint8))[1].tobytes()
+    assert grey(ImageMessage(0, "", "jpeg", data, True)).shape == (9000, 12000)
 
 
 def test_cut_files_are_no_half_images() -> None:
