@@ -121,6 +121,18 @@ def test_ros_covariance_depth_and_fixes(kind: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(gps.covariance[0], np.diag([1.0, 4.0, 9.0]))
 
 
+@pytest.mark.parametrize("odometry", [None, "visual", "gps"])
+def test_the_antenna_is_placed_whatever_gives_the_odometry(odometry: str | None, tmp_path: Path) -> None:
+    messages = ros_messages(DRIVE, 2)
+    for m in messages:
+        if m.topic == "/fix":
+            m.message.header.frame_id = "camera"
+    gps = logs.open(write_ros2(tmp_path / "drive", messages), TopicChoice(odometry=odometry)).gps()
+    assert gps is not None
+    assert gps.antenna_m is not None
+    np.testing.assert_allclose(gps.antenna_m, DRIVE.body_from_camera[:3, 3])
+
+
 def test_bag_folder_and_its_file_give_the_same(tmp_path: Path) -> None:
     folder = write_ros2(tmp_path / "drive", ros_messages(DRIVE, 2))
     a, b = logs.open(folder), logs.open(folder / "drive.mcap")

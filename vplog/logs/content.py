@@ -16,7 +16,7 @@ from vplog.logs.messages.records import CalibrationMessage
 from vplog.logs.odometry_sources import choose_odometry, other_sources, rank_sources, read_sources
 from vplog.logs.recorder_clock import correct_clock_steps
 from vplog.logs.stamps import nearest, set_common_clock
-from vplog.logs.tf_odometry import FrameTree
+from vplog.logs.tf_odometry import BODIES, FrameTree
 from vplog.logs.topic_selection import Selection
 
 
@@ -141,7 +141,8 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
             odometry = without_jumps(odometry, chosen.odometry.topic, notes)
     body = frames[-1] if frames else ""
     notes.extend(gps_notes)
-    if gps is not None and read.fixes and body and (placed := tree.between(body, read.fixes.frame)) is not None:
+    placed = tree.between(body or BODIES[0], read.fixes.frame) if read.fixes else None
+    if gps is not None and placed is not None:
         gps = replace(gps, antenna_m=placed[:3, 3])
     imu = (read.imu.frame, *read.imu.finish(notes)) if chosen.imu is not None and odometry is None else None
     calibrations = read.calibrations(chosen.camera_info, "image", notes)
