@@ -16,13 +16,14 @@ from vplog.errors import LogError, plural
 from vplog.geometry.masking import filled
 from vplog.logs.cameras import camera_from_image
 from vplog.logs.formats.container import Channel, Container, Notes, Place, RawData
-from vplog.logs.masks import Mask, resized_mask
+from vplog.logs.masks import Mask, is_used, resized_mask
 from vplog.logs.messages import pixels, video
 from vplog.logs.messages.decode import decode
 from vplog.logs.messages.pixels import Levels, depth_m, levels_of, spread
 from vplog.logs.messages.records import BadMessageError, CalibrationMessage, ImageMessage
 from vplog.logs.messages.video import VideoStream
 from vplog.logs.rectification import Pair
+from vplog.storage.image_file import JPEG
 
 if TYPE_CHECKING:
     from av import VideoFrame
@@ -63,6 +64,14 @@ class LoggedImage:
     def rgb(self, stamp_ns: int) -> Bytes:
         """(H, W, 3) uint8. Raises LogError."""
         return self._pixels(stamp_ns, partial(pixels.rgb, levels=self.levels), video.rgb)
+
+    def used(self, stamp_ns: int) -> Bools:
+        """(H, W) px that count, of a mask. Raises LogError."""
+
+        def of_message(message: ImageMessage) -> Bools:
+            return is_used(pixels.values(message), message.compressed and message.data[:2] == JPEG)
+
+        return self._pixels(stamp_ns, of_message, video.grey)
 
     def depth_m(self, stamp_ns: int) -> Float32s:
         """(H, W) float32 m, NaN where unknown. Raises LogError."""
@@ -148,7 +157,7 @@ class RecordedFrame:
         try:
             if not isinstance(self.mask, LoggedImage):
                 return None if self.mask is None else self.mask.used(size)
-            return resized_mask(self.mask.grey(self.stamp_ns) > 0, size, self.mask.channel.topic)
+            return resized_mask(self.mask.used(self.stamp_ns), size, self.mask.channel.topic)
         except LogError as error:
             self._count_undecodable(self.image.channel, str(error))
             raise
@@ -239,7 +248,8 @@ class ImageReader:
     def companion(self, part: str, row: int) -> LoggedImage | None:
         """The `depth` or `right` image or the `mask` of a row; None where there is none."""
         channel, place = getattr(self.content.chosen, part), self.content.companions[part][row]
-        return None if place is None else LoggedImage(channel, self._container.read(place), self._levels)
+        levels = self._levels if part == "right" else None
+        return None if place is None else LoggedImage(channel, self._container.read(place), levels)
 
     @cached_property
     def _levels(self) -> Levels | None:

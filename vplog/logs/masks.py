@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import cv2
 import numpy as np
@@ -48,7 +49,12 @@ class Mask:
             raise LogError(f"Cannot read the mask {self.path}: {error.strerror or error}.") from None
         except BadImageError as error:
             raise LogError(f"The mask {self.path} cannot be decoded: {error}. Write it as PNG.") from None
-        return image >= _HALF if data[:2] == JPEG else image > 0
+        return is_used(image, data[:2] == JPEG)
+
+
+def is_used(image: Any, jpeg: bool) -> Bools:
+    """(H, W) px that count, of a mask as it was decoded."""
+    return image >= _HALF if jpeg else image > 0
 
 
 class Masks:

@@ -122,6 +122,12 @@ def grey(message: ImageMessage, levels: Levels | None = None) -> Bytes:
     return _converted(message, levels, *_pixels(message), "GRAY")
 
 
+def values(message: ImageMessage) -> Any:
+    """(H, W) as they come, such as labels; the grey of colours. Raises BadMessageError."""
+    pixels, conversion = _pixels(message)
+    return pixels if pixels.ndim == 2 else _converted(message, None, pixels, conversion, "GRAY")
+
+
 def rgb(message: ImageMessage, levels: Levels | None = None) -> Bytes:
     """(H, W, 3) uint8 red, green, blue; three times the grey where it has no colour. As `grey`."""
     return message.rgb() if message.rgb else _converted(message, levels, *_pixels(message, colour=True), "RGB")
