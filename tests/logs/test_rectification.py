@@ -79,7 +79,8 @@ def drive(folder: Path, lenses: tuple[Lens, Lens], right_from_left: np.ndarray, 
     """Three frames of a still pair as a ROS 2 bag: images, camera_infos, transforms, odometry.
 
     Options: `rp` the R, P of each camera_info; `tf` whether /tf_static places the right camera; `names` of the two
-    cameras; `late_ns` of the right images; `lost` the frames without a right image; `camera` the name of images.
+    cameras; `late_ns` of the right images; `lost` the frames without a right image; `camera` the name of images;
+    `depth` the rows of depth images in the left camera's frame.
     """
     t = store(2).types
 
@@ -129,6 +130,12 @@ def drive(folder: Path, lenses: tuple[Lens, Lens], right_from_left: np.ndarray, 
                 p=rp[side][1].ravel(), binning_x=0, binning_y=0, roi=roi,
             )  # fmt: skip
             found.append(Written(f"/stereo/{name}/camera_info", "sensor_msgs/msg/CameraInfo", stamp, info))
+        if rows := options.get("depth"):
+            depth = new(
+                "sensor_msgs/msg/Image", header=header(stamp, "left_optical"), height=rows, width=SIZE[0],
+                encoding="16UC1", is_bigendian=0, step=2 * SIZE[0], data=np.full(2 * rows * SIZE[0], 8, np.uint8),
+            )  # fmt: skip
+            found.append(Written("/depth/image", "sensor_msgs/msg/Image", stamp, depth))
         pose = new(
             "geometry_msgs/msg/Pose", position=new("geometry_msgs/msg/Point", x=float(i), y=0.0, z=0.0),
             orientation=new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
@@ -239,8 +246,18 @@ def test_right_images_pair_by_stamp_and_a_missing_one_is_said(tmp_path: Path) ->
     assert "1 of 3 images without a right image" in " ".join(log.warnings)
     assert "ms off" not in " ".join(log.warnings)
     late = logs.open(drive(tmp_path / "late", PINHOLES, RIGHT_FROM_LEFT, tf=True, late_ns=20_000_000))
-    late.stamps()
+    late.camera()
     assert "20 ms off the left ones" in " ".join(late.warnings)
+
+
+@pytest.mark.parametrize("fits", [False, True])
+def test_depth_that_is_of_no_use_leaves_the_pair(fits: bool, tmp_path: Path) -> None:
+    rows = SIZE[1] if fits else SIZE[1] // 2
+    log = logs.open(drive(tmp_path, PINHOLES, RIGHT_FROM_LEFT, tf=True, late_ns=20_000_000, depth=rows))
+    frame = next(iter(log.frames(log.stamps()))).decode()
+    assert (frame.depth is not None, frame.right is not None) == (fits, not fits)
+    assert ("ms off the left ones" in " ".join(log.warnings)) == (not fits)
+    assert ("right" in {topic.part for topic in log.info().topics}) == (not fits)
 
 
 def test_a_damaged_right_image_costs_its_depth_alone_and_is_counted(tmp_path: Path) -> None:

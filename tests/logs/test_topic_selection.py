@@ -84,7 +84,7 @@ def test_pairs_by_their_names() -> None:
         assert (chosen["camera_info"], chosen["right_info"]) == tuple(one.channel.topic for one in infos)
         assert pick(*pair, *infos, right="")["right"] is None
         assert pick(*pair, *infos, image=right)["right"] is None
-        assert pick(*pair, *infos, topic("/depth", "depth"))["right"] is None  # depth needs no second image
+        assert pick(*pair, *infos, topic("/depth", "depth"))["right"] == right, "the depth may be of no use"
     assert pick(topic("/front/left"), topic("/rear/right"))["right"] is None
 
 

@@ -41,6 +41,8 @@ class LogContent:
     """Calibrations that are set and differ from the one before: the first is the camera's, a later one that of images
     behind its stamp."""
     right_calibration: CalibrationMessage | None
+    right_notes: Notes
+    """Remarks on the right images, for where they make a pair."""
     depth_calibration: CalibrationMessage | None
     odometry: Odometry | None
     frames: list[str]
@@ -119,17 +121,7 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
         notes.add(f"{plural(tree.dropped, 'static transform')} with NaN or without a rotation left out.")
     stamp_ns, places, rows = read.images["image"].finish(notes)
     scan_ns, scan_places, _ = read.images["lidar"].finish(notes)
-    companions = {}
-    for name in ("depth", "right", "mask"):
-        other_ns, other_places, _ = read.images[name].finish(notes)
-        pairs = nearest(stamp_ns, other_ns)
-        companions[name] = [None if pair < 0 else other_places[pair] for pair in pairs.tolist()]
-        if read.images[name].channel and (alone := int((pairs < 0).sum())):
-            notes.add(f"{alone} of {plural(len(pairs), 'image')} without a {name} image within half a frame period.")
-        both = pairs >= 0
-        late_ns = np.abs(other_ns[pairs[both]] - stamp_ns[both])
-        if name == "right" and len(late_ns) and (typical := float(np.median(late_ns))) > _TOGETHER_NS:
-            notes.add(f"The right images are taken {typical / 1e6:.0f} ms off the left ones; depth is wrong in motion.")
+    companions, right_notes = _companions(read, stamp_ns, notes)
     for one in found.values():
         if one.odometry is None:
             notes.extend(one.notes)
@@ -150,6 +142,25 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     depth_calibration = next(iter(read.calibrations(chosen.depth_info, "depth", notes)), None)
     return LogContent(
         stamp_ns, places, read.images["image"].stream, rows, scan_ns, scan_places, companions, calibrations,
-        right_calibration, depth_calibration, odometry, frames, gps, imu, tree, read.clock_offset_ms(), chosen,
-        [source for source, _ in sources], rates_hz,
+        right_calibration, right_notes, depth_calibration, odometry, frames, gps, imu, tree, read.clock_offset_ms(),
+        chosen, [source for source, _ in sources], rates_hz,
     )  # fmt: skip
+
+
+def _companions(read: TopicCollector, stamp_ns: Ints, notes: Notes) -> tuple[dict[str, list[Place | None]], Notes]:
+    """Places of the `depth`, `right` and `mask` of each image (F,), and remarks on the right ones."""
+    companions, right_notes = {}, Notes()
+    for name in ("depth", "right", "mask"):
+        other_ns, other_places, _ = read.images[name].finish(notes)
+        pairs = nearest(stamp_ns, other_ns)
+        companions[name] = [None if pair < 0 else other_places[pair] for pair in pairs.tolist()]
+        remarks = right_notes if name == "right" else notes
+        if read.images[name].channel and (alone := int((pairs < 0).sum())):
+            remarks.add(f"{alone} of {plural(len(pairs), 'image')} without a {name} image within half a frame period.")
+        both = pairs >= 0
+        late_ns = np.abs(other_ns[pairs[both]] - stamp_ns[both])
+        if name == "right" and len(late_ns) and (typical := float(np.median(late_ns))) > _TOGETHER_NS:
+            remarks.add(
+                f"The right images are taken {typical / 1e6:.0f} ms off the left ones; depth is wrong in motion."
+            )
+    return companions, right_notes

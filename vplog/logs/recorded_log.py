@@ -80,9 +80,13 @@ class RecordedLog:
         """Reads the chosen topics once, so that the warnings are complete."""
         content = self._content
         others = self.further_cameras()
-        topics = [self._topic(channel, count, others) for channel, count in self._contents.counts.items()]
-        if self._selection.image is not None:
-            self._check_images()
+        parts = content.chosen.parts
+        if self._selection.image is not None and self._check_images():
+            parts = {channel: part for channel, part in parts.items() if not part.startswith("right")}
+        topics = [
+            self._topic(channel, count, parts.get(channel) or ("image" if channel.topic in others else ""))
+            for channel, count in self._contents.counts.items()
+        ]
         tracks = [track for track in (content, content.odometry, content.gps) if track and len(track.stamp_ns)]
         start_ns = min((int(track.stamp_ns[0]) for track in tracks), default=self._contents.start_ns)
         end_ns = max((int(track.stamp_ns[-1]) for track in tracks), default=self._contents.end_ns)
@@ -91,10 +95,8 @@ class RecordedLog:
             [frame for frame in content.frames if frame], content.clock_offset_ms, content.sources, self._truth_name,
         )  # fmt: skip
 
-    def _topic(self, channel: Channel, count: int, others: list[str]) -> Topic:
-        part, rate_hz = self._content.chosen.parts.get(channel, ""), self._content.rates_hz.get(channel)
-        part = part or ("image" if channel.topic in others else "")
-        known = self._candidate(channel) or Candidate(channel, count, "")
+    def _topic(self, channel: Channel, count: int, part: str) -> Topic:
+        rate_hz, known = self._content.rates_hz.get(channel), self._candidate(channel) or Candidate(channel, count, "")
         calibrated = known.calibrated if known.role == "camera_info" else None
         return Topic(
             *channel, count, known.role, bool(part), part, known.encoding, *known.size, known.frame, calibrated, rate_hz
@@ -249,14 +251,15 @@ class RecordedLog:
         given += [f"--odometry lidar takes it from {clouds[0]}"] if clouds else []
         return "; ".join([*given, "--odometry-file takes poses from a file; `vplog library` needs none"]) + "."
 
-    def _check_images(self) -> None:
-        """Everything that decoding the first image and depth would warn of, for info."""
+    def _check_images(self) -> bool:
+        """Note everything that decoding the first image and depth would warn of, for info; whether depth is used, which
+        needs no right images."""
         try:
             self.camera()
-            _ = self._depth
-            _ = self._pair
+            return self._depth is not None
         except LogError as error:
             self._notes.add(str(error))
+            return False
 
     def _image_channel(self) -> Channel:
         if self._selection.image is None:
@@ -280,7 +283,7 @@ class RecordedLog:
     def _depth(self) -> tuple[Channel, DepthRegistration | None] | None:
         """The depth topic, and its registration where it is another camera's; None, with a note, where the camera is
         not calibrated, or its first images do not decode or do not fit the camera's."""
-        depth, camera = self._selection.depth, self.camera()
+        depth, camera = self._selection.depth, self._left[0]
         try:
             first = None if depth is None else self._images.first_depth(depth)
             if first is None or depth is None:
@@ -360,9 +363,10 @@ class RecordedLog:
 
     @cached_property
     def _pair(self) -> Pair | None:
-        """The left and right images as a rectified pair, or None, with a note where a right topic was there."""
+        """The left and right images as a rectified pair; None where there is depth, or, with a note, where a right
+        topic was there."""
         image, right, content = self._selection.image, self._selection.right, self._content
-        if image is None or right is None:
+        if image is None or right is None or self._depth is not None:
             return None
         left, frame = self._left
         if left.matrix is None:  # warned of as such: it costs more than the depth
@@ -386,6 +390,7 @@ class RecordedLog:
                 raise NoPairError(
                     f"rectified by its calibration, its rows lie {error_px:.1f} px off those of the left image"
                 )
+            self._notes.extend(content.right_notes)
             return pair
         except (NoPairError, LogError) as error:
             self._notes.add(f"The right image is not used: {str(error).rstrip('.')}.")

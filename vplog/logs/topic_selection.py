@@ -7,7 +7,8 @@ Static transforms are those of all topics whose name ends in `static`. Of severa
 other parts the first by these rules does, unless TopicChoice names another:
 - image: encodings that can be decoded first, thermal cameras last, then calibrated ones, then those that are not the
   right one of a pair, then those that do not look back by their name, then most messages, then name;
-- right: the topic named like the image's with `right` for `left` (or another of PAIRS), where no depth is used;
+- right: the topic named like the image's with `right` for `left` (or another of PAIRS); they are used where no
+  depth is;
 - depth: with the image's frame_id first, then the longest namespace in common with it, then most messages, then name;
 - camera_info: of those whose namespace holds the image (`/cam0/camera_info` and `/cam0/image_raw/compressed`), else of
   those with the image's frame_id: longest namespace in common, then the same frame_id, calibrated, most messages, name;
@@ -195,11 +196,6 @@ class Selection:
         return dict(many) | dict(one)
 
     @property
-    def has_depth(self) -> bool:
-        """Whether depth or right images are among them."""
-        return self.depth is not None or self.right is not None
-
-    @property
     def channels(self) -> list[Channel]:
         return list(dict.fromkeys((*self.parts, *self.sources)))
 
@@ -268,18 +264,16 @@ def _image_order(c: Candidate, usable: list[Candidate]) -> tuple[bool, ...]:
 def _of_image(
     image: Candidate, usable: list[Candidate], choice: TopicChoice, log: str, pick: Callable[..., Candidate | None]
 ) -> dict[str, Candidate | None]:
-    """Depth or right images of a camera, and its calibrations. Raises LogError where both are named."""
+    """Depth and right images of a camera, and its calibrations. Raises LogError where both are named."""
     depth = None
     if choice.depth is not None or not choice.right:
         depth = pick("depth", "image", lambda c: (c.frame != image.frame, -_shared(c, image)), image)
     right = pick("right", image=image) if choice.right is not None else _partner(image, usable)
-    if right is not None and depth is not None:
-        if choice.right and choice.depth:
-            raise LogError(
-                f"{log}: depth comes from {choice.depth} or from the pair {image.channel.topic} and {choice.right}, "
-                "not both. Leave out --depth-topic or --right-topic."
-            )
-        right = None
+    if choice.right and choice.depth:
+        raise LogError(
+            f"{log}: depth comes from {choice.depth} or from the pair {image.channel.topic} and {choice.right}, "
+            "not both. Leave out --depth-topic or --right-topic."
+        )
     info, depth_info = _calibration(image, usable), None if depth is None else _calibration(depth, usable)
     found = {"depth": depth, "right": right, "depth_info": None if depth_info is info else depth_info}
     if choice.calibration_file is not None:
