@@ -274,6 +274,19 @@ def test_a_damaged_right_image_costs_its_depth_alone_and_is_counted(tmp_path: Pa
     assert "/stereo/right/image_raw 1" in " ".join(log.warnings)
 
 
+def test_cameras_to_two_sides_are_no_pair_but_two_cameras(tmp_path: Path) -> None:
+    turned = matrix(np.array([-0.5, 0, 0.2]), Rotation.from_euler("y", 1.0))
+    path, right = drive(tmp_path, PINHOLES, turned, tf=True, late_ns=20_000_000), "/stereo/right/image_raw"
+    log = logs.open(path)
+    assert log.camera().baseline_m is None
+    assert log.further_cameras() == [right]
+    assert "right image" not in " ".join(log.info().warnings)
+    log = logs.open(path, TopicChoice(right=right))
+    assert log.camera().baseline_m is None
+    assert log.further_cameras() == []
+    assert "57 degrees" in " ".join(log.warnings)
+
+
 def test_what_is_no_pair_is_said_and_left_out(tmp_path: Path) -> None:
     def why(name: str, right_from_left: np.ndarray = RIGHT_FROM_LEFT, **options: Any) -> str:
         log = logs.open(drive(tmp_path / name, PINHOLES, right_from_left, **options))
@@ -289,7 +302,5 @@ def test_what_is_no_pair_is_said_and_left_out(tmp_path: Path) -> None:
     tilted = Rotation.from_euler("x", 0.02).as_matrix() @ rp[1][0]
     assert "its rows lie" in why("unfit", rp=[rp[0], (tilted, shifted)])
     assert "to the left of" in why("swapped", np.linalg.inv(STRAIGHT), tf=True)
-    turned = matrix(np.array([-0.5, 0, 0.2]), Rotation.from_euler("y", 1.0))
-    assert "57 degrees" in why("surround", turned, tf=True)
     below = matrix(np.array([0.0, -0.3, 0.0]), Rotation.identity())
     assert "beside" in why("below", below, tf=True)

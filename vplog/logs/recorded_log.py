@@ -380,7 +380,7 @@ class RecordedLog:
                 raise NoPairError(f"{right.topic} has no calibration")
             other, size = self._images.first(right, content.companions["right"], self._path.name)
             camera, other = camera_of(right.topic, theirs, size, self._notes), self._optical(other)
-            if other and frame and self._choice.cameras is not None and self._are_apart(frame, other):
+            if other and frame and not self._choice.right and self._are_apart(frame, other):
                 return None  # the other is a camera by itself
             right_from_left = content.tree.between(other, frame) if other and frame else None
             right_from_left = self._sidecar.right_from_left(image.topic, right.topic) if known else right_from_left

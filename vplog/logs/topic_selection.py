@@ -306,7 +306,8 @@ def further_cameras(
     """Calibrated cameras beside the one in use, each by its best topic: with another frame_id than any before it; and,
     where its name is that of the right one of a pair, the left one."""
     usable = sorted((c for c in candidates if c.count), key=lambda c: (-c.count, c.channel))
-    taken = {c.frame for c in usable if c.channel in (used.image, used.right)}
+    requested = used.right if choice.right else None  # any other is a pair by its name, and may look elsewhere
+    taken = {c.frame for c in usable if c.channel in (used.image, requested)}
     found = []
     for c in usable:
         info = _calibration(c, usable) if c.role == "image" and c.supported else None
