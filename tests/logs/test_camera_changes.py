@@ -101,6 +101,28 @@ def test_sixteen_bits_registered_to_a_camera_are_depth(tmp_path: Path) -> None:
     assert {topic.name: topic.role for topic in log.info().topics} == {"/cam/z": "depth", "/cam/image": "image"}
 
 
+@pytest.mark.parametrize("encoding", ["png", "mono16; png compressed"])
+def test_a_png_of_16_bits_is_depth_by_its_name(encoding: str, tmp_path: Path) -> None:
+    messages = []
+    for i in range(5):
+        for topic, pixels in (("/a/depth/image", 1000 + SCENE.astype(np.uint16)), ("/b/image", SCENE)):
+            file = np.frombuffer(cv2.imencode(".png", pixels)[1].tobytes(), np.uint8)
+            of = encoding if "depth" in topic else "png"
+            stamp = START_NS + i * PERIOD_NS
+            message = store(2).types["sensor_msgs/msg/CompressedImage"](
+                header=header(2, stamp, "cam"), format=of, data=file
+            )
+            messages.append(Written(topic, "sensor_msgs/msg/CompressedImage", stamp, message))
+    log = logs.open(written(tmp_path / "drive", [info(K, SIZE, 0), *messages]))
+    assert {topic.name: topic.role for topic in log.info().topics if topic.name != INFO} == {
+        "/a/depth/image": "depth",
+        "/b/image": "image",
+    }
+    frame = next(iter(log.frames(log.stamps()[:1]))).decode()
+    assert frame.depth is not None
+    np.testing.assert_allclose(frame.depth, 1 + SCENE / 1000, atol=1e-6)
+
+
 def test_depth_that_is_asked_for_as_the_image_is_not_its_own_depth(tmp_path: Path) -> None:
     holes = (20 * SCENE.astype(np.uint16)).astype(np.uint16)
     holes[:30] = 0

@@ -12,7 +12,7 @@ from vplog.logs.messages.records import BadMessageError, CalibrationMessage, Ima
 from vplog.logs.messages.video import codec_of
 from vplog.logs.tf_odometry import frame_name
 from vplog.logs.topic_selection import Candidate
-from vplog.storage.image_file import image_size
+from vplog.storage.image_file import PNG, image_size
 
 _THERMAL = re.compile(r"therm|infra|lwir|flir|boson|lepton|(?<![a-z])ir(?![a-z])")
 """Words for thermal cameras: their kind, their band, and the most common makes."""
@@ -54,8 +54,9 @@ def _candidate(channel: Channel, count: int, kind: str, first: _First | None) ->
         codec, encoding = codec_of(first.encoding) if first.compressed else "", first.encoding
         size = image_size(first.data) if first.compressed else (first.width, first.height)
         # by their name where encodings are ambiguous: old compressedDepth is `png`, RealSense records mono16
-        named = channel.topic.endswith("/compressedDepth")
-        named |= first.encoding == "mono16" and "depth" in channel.topic.lower()
+        head = bytes(first.data[:26])  # of a PNG ends with its bits and colour type: PNG 1.2, 4.1.1
+        grey16 = first.encoding.startswith("mono16") or (head.startswith(PNG) and head.endswith(b"\x10\0"))
+        named = channel.topic.endswith("/compressedDepth") or (grey16 and "depth" in channel.topic.lower())
         if not codec and (is_depth(first) or named):
             role = "depth"
     calibrated = isinstance(first, CalibrationMessage) and bool(first.matrix[0, 0] > 0)

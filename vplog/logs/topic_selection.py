@@ -1,8 +1,8 @@
 """Selection of the topic of each part of a log.
 
-An image topic is depth where its encoding is 16UC1, 16SC1, 32FC1 or 64FC1, or compressedDepth, or mono16 under a name
-with `depth`; 16UC1 without px that lack a measurement is a thermal camera's, where its name says so or no camera shares
-its frame.
+An image topic is depth where its encoding is 16UC1, 16SC1, 32FC1 or 64FC1, or compressedDepth, or mono16 or a PNG of
+16 bits under a name with `depth`; 16UC1 without px that lack a measurement is a thermal camera's, where its name says
+so or no camera shares its frame.
 Static transforms are those of all topics whose name ends in `static`. Of several topics that could play one of the
 other parts the first by these rules does, unless TopicChoice names another:
 - image: encodings that can be decoded first, thermal cameras last, then calibrated ones, then those that are not the
