@@ -119,10 +119,13 @@ def test_rectified_frames_have_rectified_masks(tmp_path: Path) -> None:
     mask = np.ones((height, width), np.uint8)
     mask[:, :80] = 0
     file = write(tmp_path / "mask.png", mask)
-    path = rectification.drive(tmp_path, rectification.PINHOLES, rectification.RIGHT_FROM_LEFT, tf=True)
+    options = {"tf": True, "late_ns": 3000}
+    path = rectification.drive(tmp_path, rectification.PINHOLES, rectification.RIGHT_FROM_LEFT, **options)
+    for i in range(3):  # by the right images' own stamps
+        write(tmp_path / f"right/{START_NS + i * 10**8 + 3000}.png", mask)
     plain = logs.open(path)
     right = next(topic.name for topic in plain.info().topics if topic.part == "right")
-    log = logs.open(path, TopicChoice(masks={"": file, right: file}))
+    log = logs.open(path, TopicChoice(masks={"": file, right: tmp_path / "right"}))
     a, b = (next(iter(one.frames(one.stamps()))).decode() for one in (log, plain))
     assert a.mask is not None
     assert a.mask.shape == a.image.shape
@@ -134,6 +137,11 @@ def test_rectified_frames_have_rectified_masks(tmp_path: Path) -> None:
     changed = (a.right != b.right).any(axis=0)
     assert changed[:50].mean() > 0.5
     assert not changed[130:].any()
+    black = write(tmp_path / "black.png", 0 * mask)
+    with pytest.raises(LogError, match="is black"):
+        logs.open(path, TopicChoice(masks={right: black})).camera()
+    apart = rectification.drive(tmp_path / "apart", rectification.PINHOLES, rectification.RIGHT_FROM_LEFT)
+    assert logs.open(apart, TopicChoice(masks={right: black})).camera().baseline_m is None, "no pair, no mask of it"
 
 
 REFUSED = {

@@ -41,6 +41,8 @@ class LogContent:
     """Calibrations that are set and differ from the one before: the first is the camera's, a later one that of images
     behind its stamp."""
     right_calibration: CalibrationMessage | None
+    right_ns: Ints
+    """(F,) stamps of the right images, -1 for none."""
     right_notes: Notes
     """Remarks on the right images, for where they make a pair."""
     depth_calibration: CalibrationMessage | None
@@ -87,7 +89,7 @@ class LogContent:
         companions = {part: list(compress(found, wanted)) for part, found in self.companions.items()}
         return replace(
             self, stamp_ns=self.stamp_ns[wanted], places=places, stream_rows=self.stream_rows[wanted],
-            companions=companions,
+            companions=companions, right_ns=self.right_ns[wanted],
         )  # fmt: skip
 
 
@@ -121,7 +123,7 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
         notes.add(f"{plural(tree.dropped, 'static transform')} with NaN or without a rotation left out.")
     stamp_ns, places, rows = read.images["image"].finish(notes)
     scan_ns, scan_places, _ = read.images["lidar"].finish(notes)
-    companions, right_notes = _companions(read, stamp_ns, notes)
+    companions, right_ns, right_notes = _companions(read, stamp_ns, notes)
     for one in found.values():
         if one.odometry is None:
             notes.extend(one.notes)
@@ -142,14 +144,16 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     depth_calibration = next(iter(read.calibrations(chosen.depth_info, "depth", notes)), None)
     return LogContent(
         stamp_ns, places, read.images["image"].stream, rows, scan_ns, scan_places, companions, calibrations,
-        right_calibration, right_notes, depth_calibration, odometry, frames, gps, imu, tree, read.clock_offset_ms(),
-        chosen, [source for source, _ in sources], rates_hz,
+        right_calibration, right_ns, right_notes, depth_calibration, odometry, frames, gps, imu, tree,
+        read.clock_offset_ms(), chosen, [source for source, _ in sources], rates_hz,
     )  # fmt: skip
 
 
-def _companions(read: TopicCollector, stamp_ns: Ints, notes: Notes) -> tuple[dict[str, list[Place | None]], Notes]:
-    """Places of the `depth`, `right` and `mask` of each image (F,), and remarks on the right ones."""
-    companions, right_notes = {}, Notes()
+def _companions(
+    read: TopicCollector, stamp_ns: Ints, notes: Notes
+) -> tuple[dict[str, list[Place | None]], Ints, Notes]:
+    """Places of the `depth`, `right` and `mask` of each image (F,), and stamps of and remarks on the right ones."""
+    companions, right_ns, right_notes = {}, np.full(len(stamp_ns), -1, np.int64), Notes()
     for name in ("depth", "right", "mask"):
         other_ns, other_places, _ = read.images[name].finish(notes)
         pairs = nearest(stamp_ns, other_ns)
@@ -158,9 +162,11 @@ def _companions(read: TopicCollector, stamp_ns: Ints, notes: Notes) -> tuple[dic
         if read.images[name].channel and (alone := int((pairs < 0).sum())):
             remarks.add(f"{alone} of {plural(len(pairs), 'image')} without a {name} image within half a frame period.")
         both = pairs >= 0
-        late_ns = np.abs(other_ns[pairs[both]] - stamp_ns[both])
-        if name == "right" and len(late_ns) and (typical := float(np.median(late_ns))) > _TOGETHER_NS:
-            remarks.add(
-                f"The right images are taken {typical / 1e6:.0f} ms off the left ones; depth is wrong in motion."
-            )
-    return companions, right_notes
+        if name == "right":
+            right_ns[both] = other_ns[pairs[both]]
+            late_ns = np.abs(right_ns - stamp_ns)[both]
+            if len(late_ns) and (typical := float(np.median(late_ns))) > _TOGETHER_NS:
+                right_notes.add(
+                    f"The right images are taken {typical / 1e6:.0f} ms off the left ones; depth is wrong in motion."
+                )
+    return companions, right_ns, right_notes

@@ -117,7 +117,8 @@ class RecordedLog:
             at_ns, image = int(content.stamp_ns[row]), images.image(row)
             depth = images.companion("depth", row) if self._depth else None
             right = images.companion("right", row) if pair else None
-            mask, right_mask = images.companion("mask", row) or self._masks[0].of(at_ns), self._masks[1].of(at_ns)
+            mask = images.companion("mask", row) or self._masks[0].of(at_ns)
+            right_mask = self._masks[1].of(int(content.right_ns[row])) if right else None
             later = bisect_right(self._later_calibrations, at_ns, key=lambda calibration: calibration.stamp_ns)
             own = self._later_calibrations[later - 1] if later else None
             beside = depth, right, pair, self._notes, own, mask, right_mask, registration
@@ -340,8 +341,7 @@ class RecordedLog:
             notes.add(f"The calibration is of {known.topic} by its file; {image.topic} takes it all the same.")
         calibration = known.calibration if known else content.calibration
         camera = camera_of(image.topic, calibration, size, notes)
-        for masks in self._masks:
-            masks.check(content.stamp_ns.tolist(), size, notes)
+        self._masks[0].check(content.stamp_ns.tolist(), size, notes)
         body = self._body
         named = body and frame and frame == logged and content.tree.between(body, frame) is not None
         visual = camera.matrix is not None or self._contents.names is None
@@ -390,11 +390,12 @@ class RecordedLog:
                 raise NoPairError(
                     f"rectified by its calibration, its rows lie {error_px:.1f} px off those of the left image"
                 )
-            self._notes.extend(content.right_notes)
-            return pair
         except (NoPairError, LogError) as error:
             self._notes.add(f"The right image is not used: {str(error).rstrip('.')}.")
             return None
+        self._masks[1].check(content.right_ns[content.right_ns >= 0].tolist(), size, self._notes)
+        self._notes.extend(content.right_notes)
+        return pair
 
     def _rectified(self, pair: Pair) -> Iterator[tuple[Bytes, Bytes]]:
         """Images of a few frames; what does not decode is left out."""
