@@ -86,6 +86,13 @@ def test_pairs_by_their_names() -> None:
         assert pick(*pair, *infos, image=right)["right"] is None
         assert pick(*pair, *infos, topic("/depth", "depth"))["right"] == right, "the depth may be of no use"
     assert pick(topic("/front/left"), topic("/rear/right"))["right"] is None
+    several = ("/left_stereo_camera/left/image", "/left_stereo_camera/right/image", "/right_stereo_camera/left/image",
+               "/right_stereo_camera/right/image")  # fmt: skip
+    for at in (0, 2):
+        assert pick(*map(topic, several), image=several[at])["right"] == several[at + 1]
+    several = "/camera_left/infra1/image", "/camera_left/infra2/image", "/camera_right/infra1/image"
+    assert pick(*map(topic, several), image=several[0])["right"] == several[1]
+    assert pick(*map(topic, several[:2]), image=several[0])["right"] == several[1]
 
 
 def test_pair_or_depth_but_not_both() -> None:

@@ -7,8 +7,8 @@ Static transforms are those of all topics whose name ends in `static`. Of severa
 other parts the first by these rules does, unless TopicChoice names another:
 - image: encodings that can be decoded first, thermal cameras last, then calibrated ones, then those that are not the
   right one of a pair, then those that do not look back by their name, then most messages, then name;
-- right: the topic named like the image's with `right` for `left` (or another of PAIRS); they are used where no
-  depth is;
+- right: the topic named like the image's with `right` for one `left` or all (or another of PAIRS), the longest
+  namespace in common first; used where no depth is;
 - depth: with the image's frame_id first, then the longest namespace in common with it, then most messages, then name;
 - camera_info: of those whose namespace holds the image (`/cam0/camera_info` and `/cam0/image_raw/compressed`), else of
   those with the image's frame_id: longest namespace in common, then the same frame_id, calibrated, most messages, name;
@@ -393,13 +393,15 @@ def _geometry(c: Candidate, choice: TopicChoice) -> tuple[float, float] | None:
 
 def _partner(image: Candidate, usable: list[Candidate], back: bool = False) -> Candidate | None:
     """The right image topic of a pair whose left one is `image`, or back, the left one of the right."""
-    for left, right in PAIRS:
-        here, there = (right, left) if back else (left, right)
-        name = image.channel.topic.replace(here, there)
-        if here in image.channel.topic:
-            found = (c for c in usable if c.channel.topic == name and c.role == "image")
-            return min(found, key=lambda c: c.channel, default=None)
-    return None
+    names = list[str]()
+    for pair in PAIRS:
+        here, there = pair[::-1] if back else pair
+        parts = image.channel.topic.split(here)
+        names += [there.join([here.join(parts[:at]), here.join(parts[at:])]) for at in range(1, len(parts))]
+        names.append(there.join(parts))
+    found = [c for c in usable if c.role == "image" and c.channel.topic in names]
+    others = (c for c in found if c.channel.topic != image.channel.topic)
+    return min(others, key=lambda c: (-_shared(c, image), names.index(c.channel.topic), c.channel), default=None)
 
 
 def _calibration(image: Candidate, usable: list[Candidate]) -> Candidate | None:
