@@ -176,6 +176,16 @@ def test_a_topic_on_another_clock_is_moved_where_it_fits_nowhere_and_told_of_whe
         assert ("from another clock" if moved else "Were they recorded late") in notes.lines[0]
 
 
+@pytest.mark.parametrize("offset_s", [-1_000_000, 0])
+def test_the_cameras_of_a_body_end_on_the_clock_of_its_odometry(offset_s: int) -> None:
+    """Of few messages: the log of each camera holds it, and other images."""
+    true_ns, log_ns = times(100)
+    camera, odometry = stamps(true_ns + offset_s * SECOND, log_ns), stamps(true_ns[::2], log_ns[::2])
+    set_common_clock([camera, odometry], [odometry])
+    np.testing.assert_array_equal(odometry.order("/odometry", Notes())[0], true_ns[::2])
+    assert np.abs(camera.order("/camera", Notes())[0] - true_ns).max() <= JITTER_NS
+
+
 def test_a_clock_that_is_set_in_a_whole_log(tmp_path: Path) -> None:
     """Every topic's clock is set an hour ahead in the middle: images and odometry stay together."""
     messages = []

@@ -105,7 +105,7 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
         read.add(message)
     read.finish_poses()
     correct_clock_steps(read.every_stamps(), notes)
-    set_common_clock(stamps for _, stamps in read.stamps())
+    set_common_clock((stamps for _, stamps in read.stamps()), read.shared_stamps())
     gps_notes = Notes()
     gps = read.fixes.finish(gps_notes) if read.fixes else None
     found = read_sources(read, chosen) | other_sources(gps, contents, chosen)

@@ -174,12 +174,14 @@ def _no_clock(header_ns: Ints, log_ns: Ints) -> str:
     return ""
 
 
-def set_common_clock(topics: Iterable[Stamps]) -> None:
-    """Set the common clock of all topics of a log: that of most messages, by log time less stamp."""
+def set_common_clock(topics: Iterable[Stamps], shared: Iterable[Stamps] = ()) -> None:
+    """Set the common clock of all topics of a log: that of most messages, by log time less stamp, of the `shared` ones
+    where these have any: the logs of the cameras of one body have these in common, and then one clock."""
     topics = [one for one in topics if len(one.header_ns)]
     pooled: dict[int, int] = {}
-    steady = [one for one in topics if len(one.clocks()) == 1]
-    for one in steady or topics:  # a clock that was set is moved to one that was not
+    pool = [one for one in shared if one.clocks()] or topics
+    steady = [one for one in pool if len(one.clocks()) == 1]
+    for one in steady or pool:  # a clock that was set is moved to one that was not
         for offset, count in sorted(one.clocks().items()):
             known = next((other for other in pooled if abs(other - offset) <= LEAST_JUMP_NS), offset)
             pooled[known] = pooled.get(known, 0) + count
