@@ -84,7 +84,8 @@ def test_low_bits_of_sixteen_are_seen(bits: int) -> None:
     file = cv2.imencode(".png", pixels)[1].tobytes()
     np.testing.assert_array_equal(grey(ImageMessage(0, "", "mono16; png compressed ", file, True)), expected)
     for encoding in ("rgb16", "bgr16", "16UC3", "rgba16", "bgra16", "16UC4"):
-        colour = grey(raw(encoding, np.stack([pixels] * (4 if "4" in encoding or "a" in encoding else 3), axis=-1)))
+        opaque = [np.full_like(pixels, 2**16 - 1)] * ("4" in encoding or "a" in encoding)
+        colour = grey(raw(encoding, np.stack([*[pixels] * 3, *opaque], axis=-1)))
         np.testing.assert_allclose(colour, expected, atol=1)
 
 

@@ -102,7 +102,8 @@ def levels_of(messages: Iterable[ImageMessage]) -> Levels | None:
         with suppress(BadMessageError):
             pixels, _ = _pixels(message)
             if pixels.dtype == np.uint16:
-                counts += np.bincount(pixels.ravel(), minlength=2**16)
+                shown = pixels[..., :3] if pixels.ndim > 2 else pixels  # no alpha
+                counts += np.bincount(shown.ravel(), minlength=2**16)
             elif not counts.any():
                 break
     if not counts.any():
