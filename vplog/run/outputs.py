@@ -223,6 +223,7 @@ def _results_record(run: Run, spacing: int) -> dict[str, Any]:
     from vplog.graph.certificate import certify
 
     solution, refined, verdicts = run.solution, run.solved.refined, run.closures.verdict
+    losses = [loss for view in run.views for loss in getattr(view.log, "losses", [])]
     constrained = set(run.graph.kind) - {EdgeKind.ODOMETRY} or run.solved.refined.fixes
     return {
         "cameras": [view.camera.name for view in run.views],
@@ -242,7 +243,7 @@ def _results_record(run: Run, spacing: int) -> dict[str, Any]:
             "candidates": len(run.closures),
             "verdicts": {verdict.value: verdicts.count(verdict) for verdict in Verdict if verdict in verdicts},
         },
-        "losses": [asdict(loss) for loss in getattr(run.log, "losses", [])],
+        "losses": [asdict(loss) for loss in dict.fromkeys(losses)],  # what all cameras share once
         "noise": run.solved.noise_source,
         "scale": "metric" if run.odometry.metric else "unknown",
         "solution": {
