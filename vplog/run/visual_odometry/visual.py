@@ -83,7 +83,7 @@ class _Start:
 
 
 @dataclass(eq=False)
-class _Tracker:
+class Tracker:
     """State of the tracking from frame to frame."""
 
     sensor: Sensor
@@ -394,7 +394,7 @@ def visual_odometry(
     pair; None where fewer than two frames have a pose. Frames that are lost have none. The covariance is that of each
     frame's motion since the one before it, by the bundle adjustment's marginals. The height of a camera without depth
     over the ground gives metres where its images show the ground."""
-    tracker = _Tracker(Sensor(camera, metric), None if metric else height_m)
+    tracker = Tracker(Sensor(camera, metric), None if metric else height_m)
     for frame in frames:
         tracker.add(frame)
     return tracker.odometry()
