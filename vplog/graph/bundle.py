@@ -140,7 +140,9 @@ class _Equations:
         count = 6 * len(state.poses)
         step = np.zeros(count + 2)
         factor = scipy.linalg.cho_factor(self.hessian, check_finite=False)
-        step[6 : 6 + len(self.gradient)] = -np.asarray(scipy.linalg.cho_solve(factor, self.gradient, check_finite=False))
+        step[6 : 6 + len(self.gradient)] = -np.asarray(
+            scipy.linalg.cho_solve(factor, self.gradient, check_finite=False)
+        )
         views, lens = step[:count].reshape(-1, 6), step[count:]
         by_views = np.add.reduceat((views[self.view, None] @ self.gains)[:, 0], self.first)
         points = state.points + self.own - by_views - lens @ self.by_lens

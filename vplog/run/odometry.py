@@ -3,40 +3,35 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 
-from vplog.data import Camera, Frame, Imu, Keyframes, Odometry
+from vplog.data import Camera, Imu, Keyframes, Odometry
 from vplog.errors import LogError, plural
 from vplog.execution.execution import Execution
-from vplog.geometry.masking import masked
 from vplog.graph.gps_factors import NO_FIXES
 from vplog.logs import TopicChoice
 from vplog.logs.cameras import AHEAD
-from vplog.loops import undistort
 from vplog.run.cache.codecs import json_codec
 from vplog.run.cache.stage_cache import Inputs
 from vplog.run.cache.steps import Steps, step
 from vplog.run.feature_extraction import image_topics
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.run.lidar_odometry import lidar_odometry, range_of
+from vplog.run.self_calibration import decoded, self_calibrated
 from vplog.run.visual_odometry.inertial import SURE, with_imu
 from vplog.run.visual_odometry.metres import in_metres
 from vplog.run.visual_odometry.visual import visual_odometry
-from vplog.stages import EncodedFrame, Log
+from vplog.stages import Log
 
 _log = logging.getLogger(__name__)
 _UNCALIBRATED = (
     "Camera %s is not calibrated, so no closure gets a metric pose: the trajectory is the odometry's. "
     "Record its camera_info, or name it with --camera-info-topic."
 )
-_FOCAL_LENGTH = 1.2
-"""Focal length of a camera that is not calibrated as a share of the longer side of its images: COLMAP's, a field of
-view of 45 degrees; phones have some 0.8 to 1.2."""
 _BY_HEIGHT = "The camera's height of %.2f m over the ground gives visual odometry its metres."
 _NO_GROUND = (
     "The images show no flat ground ahead of the camera often enough, so that its height of %.2f m gives no metres."
@@ -64,8 +59,8 @@ def read(
     Raises LogError where there is no odometry, or, with `use_gps`, no fix."""
     if use_gps and log.gps() is None:
         raise LogError(NO_FIXES)
-    odometry = odometry_of(log, topics, steps)
-    camera = camera_of(log, topics)
+    camera = camera_of(log, topics, steps)
+    odometry = odometry_of(log, topics, camera, steps)
     if source_of(log, topics) == "visual" and (imu := log.imu()) is not None and not _is_unknown(odometry):
         odometry = _with_imu(odometry, imu, camera)
     if topics.camera_height_m is not None and (is_metric(log) or source_of(log, topics) != "visual"):
@@ -119,21 +114,15 @@ def _with_scale(odometry: Odometry, log: Log, camera: Camera, use_gps: bool) -> 
     return odometry
 
 
-def camera_of(log: Log, topics: TopicChoice) -> Camera:
+def camera_of(log: Log, topics: TopicChoice, steps: Steps) -> Camera:
     """The camera of a run: that of the log, or where its motion is to be computed from images that nothing calibrates,
-    with the matrix that COLMAP assumes."""
+    with the lens that they tell, or else an assumed one."""
     camera = log.camera()
     if camera.matrix is not None or source_of(log, topics) != "visual":
         return camera
-    return _assumed(camera)
-
-
-def _assumed(camera: Camera) -> Camera:
-    focal_px = _FOCAL_LENGTH * max(camera.width, camera.height)
-    x, y = (camera.width - 1) / 2.0, (camera.height - 1) / 2.0
-    matrix = np.array([[focal_px, 0.0, x], [0.0, focal_px, y], [0.0, 0.0, 1.0]])
     placed = camera.body_from_camera  # pictures have none: their truth may be poses of the camera
-    return replace(camera, matrix=matrix, body_from_camera=AHEAD if np.array_equal(placed, np.eye(4)) else placed)
+    lens = steps(self_calibrated, log, steps.cache.inputs, image_topics(topics, camera.name))
+    return replace(lens.of(camera), body_from_camera=AHEAD if np.array_equal(placed, np.eye(4)) else placed)
 
 
 def is_metric(log: Log) -> bool:
@@ -166,16 +155,6 @@ def check_metric(log: Log, topics: TopicChoice, odometry: Odometry | None = None
         )
 
 
-def about_assumed(camera: Camera) -> str:
-    """Assumption about a camera that is not calibrated."""
-    focal_px = undistort.focal_px(_assumed(camera))
-    return (
-        f"Camera {camera.name} is not calibrated: a focal length of {focal_px:.0f} px ({_FOCAL_LENGTH} times the "
-        "longer side of its images), its centre in their middle, and no distortion are assumed. --calibration takes "
-        "one from a file."
-    )
-
-
 def source_of(log: Log, topics: TopicChoice) -> Literal["log", "visual", "lidar"]:
     """The source of the odometry. Raises LogError where there is none at all.
 
@@ -199,30 +178,28 @@ def source_of(log: Log, topics: TopicChoice) -> Literal["log", "visual", "lidar"
     raise LogError(f"{log.name} has no odometry{requested}, and a trajectory is built on it. {log.without_odometry()}")
 
 
-def odometry_of(log: Log, topics: TopicChoice, steps: Steps) -> Odometry:
-    """The odometry of a drive. Raises LogError where there is none."""
+def odometry_of(log: Log, topics: TopicChoice, camera: Camera, steps: Steps) -> Odometry:
+    """The odometry of a drive whose camera is given. Raises LogError where there is none."""
     odometry, source = log.odometry(), source_of(log, topics)
     if source == "log" and odometry is not None:
         return odometry
-    compute = by_lidar if source == "lidar" else by_images
-    others = (topics.camera_height_m,) if source == "visual" else ()
-    images = image_topics(topics, log.camera().name)
-    return steps(compute, log, topics.odometry is None, steps.cache.inputs, images, *others)
+    given = log, topics.odometry is None, steps.cache.inputs, image_topics(topics, log.camera().name)
+    if source == "lidar":
+        return steps(by_lidar, *given)
+    return steps(by_images, *given, camera, topics.camera_height_m)
 
 
 @step("odometry", lambda *_: json_codec(_from_plain, _plain), lambda log, *_: len(log.stamps()), ("log",))
 def by_images(
-    log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], height_m: float | None, *, execution: Execution
-) -> Odometry:
+    log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], camera: Camera, height_m: float | None,
+    *, execution: Execution,
+) -> Odometry:  # fmt: skip
     """Visual odometry, its breaks noted, in metres where the height of a single camera gives them. Where tracking fails
     from the first frame to the last: without depth a motion of which nothing is known, else raises LogError."""
     if unasked:
         _log.warning("The log has no odometry, so visual odometry of its images is used (--odometry visual).")
-    stamp_ns, camera, metric = log.stamps(), log.camera(), is_metric(log)
-    if camera.matrix is None:
-        _log.warning(about_assumed(camera))
-        camera = _assumed(camera)
-    odometry = visual_odometry(_decoded(log, stamp_ns, execution), camera, metric, height_m)
+    stamp_ns, metric = log.stamps(), is_metric(log)
+    odometry = visual_odometry(decoded(log, stamp_ns, execution, "odometry"), camera, metric, height_m)
     if odometry is None and metric:
         raise LogError(
             f"{log.name}: no two of {len(stamp_ns)} frames could be tracked: too few corners with depth, or too little "
@@ -275,19 +252,6 @@ def _unknown(stamp_ns: np.ndarray) -> Odometry:
 def _is_unknown(odometry: Odometry) -> bool:
     """Whether it is `_unknown`."""
     return not odometry.metric and len(odometry.breaks) == len(odometry.stamp_ns) - 1
-
-
-def _decoded(log: Log, stamp_ns: np.ndarray, execution: Execution) -> Iterator[Frame]:
-    """All frames that decode, in order."""
-
-    def work(encoded: EncodedFrame) -> Frame | None:
-        try:
-            return masked(encoded.decode())
-        except LogError:
-            return None  # counted by the log
-
-    frames = execution.map(work, log.frames(stamp_ns))
-    return (frame for frame in execution.counted("odometry", frames, len(stamp_ns)) if frame is not None)
 
 
 def _log_breaks(what: str, odometry: Odometry, stamp_ns: np.ndarray, of: str) -> None:

@@ -24,8 +24,9 @@ from vplog.results.previews import jpeg
 from vplog.results.run_record import command_of
 from vplog.run.keyframes import KeyframeSettings, select_keyframes
 from vplog.run.lidar_odometry import new_registration
-from vplog.run.odometry import UNIT, about_assumed, gives_visual, is_metric, source_of
+from vplog.run.odometry import UNIT, gives_visual, is_metric, source_of
 from vplog.run.provenance import arguments
+from vplog.run.self_calibration import about_uncalibrated
 from vplog.run.visual_odometry.visual import visual_odometry
 from vplog.stages import Log
 from vplog.storage.json_records import plain
@@ -113,7 +114,7 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
         if metric:
             _check_moves(log.name, sampled, camera, problems)
         elif camera.matrix is None:
-            missing = [about_assumed(camera)]
+            missing = [about_uncalibrated(camera)]
     elif computed == "lidar":
         with _noted(problems):
             new_registration(1.0)

@@ -16,16 +16,18 @@ import numpy as np
 
 from vplog.data import Camera, Floats, Frame, Ints
 from vplog.graph.bundle import Bundle, Observations, adjust
-from vplog.loops import undistort
 from vplog.run.visual_odometry.sensor import Sensor
 from vplog.run.visual_odometry.visual import Tracker
 
-EXCERPT = 120
+EXCERPT = 80
 """Frames of an excerpt."""
-_STARTS = 1.2, 0.7
-"""Focal lengths by the longer side that excerpts begin with in turns: COLMAP's, and that of a wide lens."""
-_PASSES = 5
-"""Times that an excerpt is tracked at most: from a focal length twice too long three or four do."""
+_STARTS = (0.9, 0.0), (0.5, -0.2)
+"""Focal lengths by the longer side, and radial distortions, that excerpts begin with in turns: longer than a phone's
+some 0.75, and an action camera's."""
+_PASSES = 7
+"""Times that an excerpt is tracked at most: from a focal length twice too long three or four do without distortion."""
+_UNSURE = 2
+"""Times after which a focal length that is not sure will not become so."""
 _STAYS = 0.01
 """Relative change of the focal length below which it stays."""
 _SURE = 0.02
@@ -58,8 +60,8 @@ def lens_of(excerpts: Iterable[Callable[[], Iterable[Frame]]], camera: Camera) -
     """The lens that two of the excerpts, each read several times, agree on; None where the images do not tell it."""
     found = list[Lens]()
     for number, excerpt in enumerate(excerpts):
-        start = _STARTS[number % len(_STARTS)] * max(camera.width, camera.height)
-        if (lens := _of_excerpt(excerpt, camera, Lens(start, 0.0))) is None:
+        share, radial = _STARTS[number % len(_STARTS)]
+        if (lens := _of_excerpt(excerpt, camera, Lens(share * max(camera.width, camera.height), radial))) is None:
             continue
         for other in found:
             if abs(np.log(other.focal_px / lens.focal_px)) < _AGREE:
@@ -71,16 +73,17 @@ def lens_of(excerpts: Iterable[Callable[[], Iterable[Frame]]], camera: Camera) -
 def _of_excerpt(excerpt: Callable[[], Iterable[Frame]], camera: Camera, lens: Lens) -> Lens | None:
     """The lens at which the adjustment of an excerpt ends; None where it does not settle, or is not sure."""
     low, high = (share * max(camera.width, camera.height) for share in _RANGE)
-    for _ in range(_PASSES):
+    for number in range(_PASSES):
         bundle = _adjusted(excerpt(), lens.of(camera), lens)
         if bundle is None:
             return None
         s, k = bundle.lens.tolist()
         before, lens = lens, Lens(lens.focal_px * s, k)
-        if not low < lens.focal_px < high:
+        is_sure = bool(np.sqrt(bundle.lens_covariance[0, 0]) < _SURE * s)
+        if not low < lens.focal_px < high or not (is_sure or number < _UNSURE):
             return None
         if abs(np.log(lens.focal_px / before.focal_px)) < _STAYS:
-            return lens if np.sqrt(bundle.lens_covariance[0, 0]) < _SURE * s else None
+            return lens if is_sure else None
     return None
 
 

@@ -1,0 +1,93 @@
+"""The camera that a run computes its motion with: the log's, or one with a lens that its own images tell."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from vplog.data import Camera, Frame
+from vplog.errors import LogError
+from vplog.execution.execution import Execution
+from vplog.geometry.masking import masked
+from vplog.run.cache.codecs import json_codec
+from vplog.run.cache.stage_cache import Inputs
+from vplog.run.cache.steps import step
+from vplog.run.visual_odometry.self_calibration import EXCERPT, Lens, lens_of
+from vplog.stages import EncodedFrame, Log
+
+_log = logging.getLogger(__name__)
+_FOCAL_LENGTH = 1.2
+"""Focal length of a camera that is not calibrated as a share of the longer side of its images, where they do not tell
+it: COLMAP's, a field of view of 45 degrees; phones have some 0.7 to 1.2."""
+_RATE_HZ = 15.0
+"""Frames a second of an excerpt, at most: 5 s, in which a car passes a bend."""
+_EXCERPTS = 6
+"""Excerpts that are tried until two agree."""
+_GOLDEN = 0.618034
+"""Multiples of it, without their integers, spread evenly however many there are."""
+
+
+def assumed(camera: Camera) -> Lens:
+    """The lens of a camera whose images do not tell it."""
+    return Lens(_FOCAL_LENGTH * max(camera.width, camera.height), 0.0)
+
+
+def about_uncalibrated(camera: Camera) -> str:
+    """What a run does about a camera that is not calibrated."""
+    return (
+        f"Camera {camera.name} is not calibrated: where the motion of its images does not tell its focal length, "
+        f"{_about_assumed(camera)}"
+    )
+
+
+def _about_assumed(camera: Camera) -> str:
+    return (
+        f"{assumed(camera).focal_px:.0f} px ({_FOCAL_LENGTH} times the longer side of its images) and no distortion are "
+        "assumed, its centre in their middle. --calibration takes all from a file."
+    )
+
+
+@step("self_calibration", lambda *_: json_codec(lambda found: Lens(*found), list), without=("log",))
+def self_calibrated(log: Log, inputs: Inputs, images: dict[str, Any], *, execution: Execution) -> Lens:
+    """The lens of an uncalibrated camera by its images, else the assumed one; noted."""
+    camera = log.camera()
+    lens = lens_of(_excerpts(log, execution), camera)
+    if lens is None:
+        _log.warning(
+            "Camera %s is not calibrated, and the motion of its images does not tell its focal length: %s",
+            camera.name, _about_assumed(camera),
+        )  # fmt: skip
+        return assumed(camera)
+    _log.warning(
+        "Camera %s is not calibrated: by the motion of its images a focal length of %.0f px and a radial distortion of "
+        "%.3f are used, its centre in their middle. --calibration takes all from a file.", camera.name, *lens,
+    )  # fmt: skip
+    return lens
+
+
+def _excerpts(log: Log, execution: Execution) -> Iterator[Callable[[], Iterator[Frame]]]:
+    stamp_ns = log.stamps()
+    if len(stamp_ns) < 2:
+        return
+    every = max(round(1e9 / _RATE_HZ / float(np.median(np.diff(stamp_ns)))), 1)
+    last = max(len(stamp_ns) - EXCERPT * every, 0)
+    for number in range(_EXCERPTS if last else 2):
+        first = round(last * ((number + 1) * _GOLDEN % 1.0))
+        yield partial(decoded, log, stamp_ns[first : first + EXCERPT * every : every], execution, "self_calibration")
+
+
+def decoded(log: Log, stamp_ns: np.ndarray, execution: Execution, stage: str) -> Iterator[Frame]:
+    """All frames of these stamps (F,) that decode, in order."""
+
+    def work(encoded: EncodedFrame) -> Frame | None:
+        try:
+            return masked(encoded.decode())
+        except LogError:
+            return None  # counted by the log
+
+    frames = execution.map(work, log.frames(stamp_ns))
+    return (frame for frame in execution.counted(stage, frames, len(stamp_ns)) if frame is not None)
