@@ -17,7 +17,6 @@ WIDTH, HEIGHT = 400, 225
 FOCAL_PX = 230.0
 
 
-@pytest.mark.slow
 def test_a_bend_of_a_street_tells_the_focal_length() -> None:
     """From a focal length half as long again as from one with the distortion of a wide lens."""
     scene = make_scene(DemoSettings(seed=11, laps=0.6, frame_rate_hz=10.0, width=WIDTH, height=HEIGHT))
