@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from vplog.graph.noise import NoiseSettings, broken_edges, edge_covariance
 from vplog.pipeline import load_pipeline, run
 from vplog.run.keyframes import KeyframeSettings
 from vplog.run.odometry import camera_of, check_metric, read, source_of
+from vplog.run.visual_odometry.self_calibration import Lens
 from vplog.testing import pictures
 from vplog.verbs.demo import SMALL, make_drive
 from vplog.verbs.evaluate_run import evaluate
@@ -100,7 +102,8 @@ def test_it_is_taken_where_the_log_has_no_other() -> None:
 
 def test_pictures_without_a_calibration_look_ahead() -> None:
     """Visual odometry has z up then, by which the height of the camera is over the ground."""
-    camera = camera_of(pictures.PictureLog([np.zeros((9, 9), np.uint8)] * 2), VISUAL)
+    steps = MagicMock(return_value=Lens(9.0, 0.0))
+    camera = camera_of(pictures.PictureLog([np.zeros((9, 9), np.uint8)] * 2), VISUAL, steps)
     np.testing.assert_array_equal(camera.body_from_camera[:3, :3] @ [0, -1, 0], [0, 0, 1])
 
 

@@ -96,7 +96,7 @@ def adjust(
                 equations = window.equations(state, damping)
             if not before - cost > converged * before:
                 break
-        covariance = np.linalg.inv(window.equations(state, 0.0).hessian)
+        covariance = np.asarray(np.linalg.inv(window.equations(state, 0.0).hessian), np.float64)
     except np.linalg.LinAlgError:  # an indeterminate system
         return None
     poses = state.poses

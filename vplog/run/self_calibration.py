@@ -46,8 +46,8 @@ def about_uncalibrated(camera: Camera) -> str:
 
 def _about_assumed(camera: Camera) -> str:
     return (
-        f"{assumed(camera).focal_px:.0f} px ({_FOCAL_LENGTH} times the longer side of its images) and no distortion are "
-        "assumed, its centre in their middle. --calibration takes all from a file."
+        f"{assumed(camera).focal_px:.0f} px ({_FOCAL_LENGTH} times the longer side of its images) and no distortion "
+        "are assumed, its centre in their middle. --calibration takes all from a file."
     )
 
 
