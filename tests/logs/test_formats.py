@@ -221,6 +221,7 @@ def test_names_of_phones_are_dates_with_times() -> None:
     names = ["PXL_20230512_235959999", "PXL_20230513_000000099~2", "PXL_20230513_000001000.MP"]
     assert stamps_of(names) == [1683935999999000000, 1683936000099000000, 1683936001000000000]
     assert stamps_of([f"PXL_20230512_1430{second}123" for second in range(10, 60, 7)]) is not None
+    assert stamps_of([f"PXL_20230512_143015123_{row:04}" for row in range(1, 9)]) is None  # frames of one clip
     assert stamps_of([*names, "a picture"]) is None
 
 

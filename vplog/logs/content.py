@@ -140,7 +140,7 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
         gps = replace(gps, antenna_m=placed[:3, 3])
     imu = (read.imu.frame, *read.imu.finish(notes)) if chosen.imu is not None and odometry is None else None
     calibrations = read.calibrations(chosen.camera_info, "image", notes)
-    right_calibration = next(iter(read.calibrations(chosen.right_info, "right", notes)), None)
+    right_calibration = next(iter(read.calibrations(chosen.right_info, "right", right_notes)), None)
     depth_calibration = next(iter(read.calibrations(chosen.depth_info, "depth", notes)), None)
     return LogContent(
         stamp_ns, places, read.images["image"].stream, rows, scan_ns, scan_places, companions, calibrations,
@@ -155,10 +155,10 @@ def _companions(
     """Places of the `depth`, `right` and `mask` of each image (F,), and stamps of and remarks on the right ones."""
     companions, right_ns, right_notes = {}, np.full(len(stamp_ns), -1, np.int64), Notes()
     for name in ("depth", "right", "mask"):
-        other_ns, other_places, _ = read.images[name].finish(notes)
+        remarks = right_notes if name == "right" else notes
+        other_ns, other_places, _ = read.images[name].finish(remarks)
         pairs = nearest(stamp_ns, other_ns)
         companions[name] = [None if pair < 0 else other_places[pair] for pair in pairs.tolist()]
-        remarks = right_notes if name == "right" else notes
         if read.images[name].channel and (alone := int((pairs < 0).sum())):
             remarks.add(f"{alone} of {plural(len(pairs), 'image')} without a {name} image within half a frame period.")
         both = pairs >= 0

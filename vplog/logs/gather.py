@@ -230,8 +230,8 @@ class TopicCollector:
         return images + [(one.topic, one.stamps) for one in tracks if one and one.topic]
 
     def shared_stamps(self) -> list[Stamps]:
-        """Stamps of the topics that do not depend on the camera in use."""
-        return [one.stamps for one in (*self.poses.values(), self.fixes, self.imu, self.images["lidar"]) if one]
+        """Stamps of the odometry, which does not depend on the camera in use."""
+        return [one.stamps for one in self.poses.values()]
 
     def every_stamps(self) -> list[Stamps]:
         """Stamps of every topic that was read, each pose with its position."""

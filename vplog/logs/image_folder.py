@@ -80,7 +80,8 @@ def stamps_of(names: list[str]) -> list[int] | None:
     """
     dates = [_DATE.search(name) for name in names]
     with suppress(ValueError):  # no such day
-        if found := [datetime.strptime(f"{one[1]}{one[2]}Z", "%Y%m%d%H%M%S%f%z") for one in dates if one]:
+        found = [datetime.strptime(f"{one[1]}{one[2]}Z", "%Y%m%d%H%M%S%f%z") for one in dates if one]
+        if 2 * len({*found}) > len(found):  # else of a burst, or of the clip that they are the frames of
             return [round(at.timestamp() * 1e3) * 10**6 for at in found] if len(found) == len(names) else None
     names = _changing(names)
     if all(re.fullmatch(r"[0-9]{1,10}\.[0-9]{1,9}", name) for name in names):

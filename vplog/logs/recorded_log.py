@@ -183,7 +183,11 @@ class RecordedLog:
         return self._content.body or self._scans.body
 
     def gps(self) -> Gps | None:
-        return self._content.gps
+        """Without the place of its antenna where a calibration file, and not the odometry, says what the body is."""
+        gps, channel = self._content.gps, self._content.chosen.image
+        known = None if channel is None else self._sidecar.camera(channel.topic)
+        by_file = known is not None and known.body_from_camera is not None and not self._content.body
+        return replace(gps, antenna_m=None) if gps is not None and by_file else gps
 
     def imu(self) -> Imu | None:
         """By the static transforms, else the calibration file; noted where neither places it."""

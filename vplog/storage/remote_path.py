@@ -226,7 +226,7 @@ class RemotePath:
     @property
     def _there(self) -> ObjectMeta:
         if self._meta is None:
-            raise OSError("the server has no such file")
+            raise FileNotFoundError("the server has no such file")
         return self._meta
 
     @property

@@ -2,8 +2,8 @@
 
 An excerpt is tracked with a focal length that may be wrong, and one bundle adjustment of all its references leaves the
 focal length and the first radial distortion free, as COLMAP's of cameras without a calibration; then it is tracked with
-what was found, until it stays. Excerpts begin with focal lengths far apart: where they end at the same one, the images
-tell it. They do not where the camera hardly turns, moves or finds anything to follow.
+what was found, until it stays. Excerpts begin with focal lengths far apart, in turns: where two end at the same one,
+the images tell it. They do not where the camera hardly turns, moves or finds anything to follow.
 """
 
 from __future__ import annotations
