@@ -15,21 +15,23 @@ import json
 import secrets
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from vplog.data import Ints
 from vplog.errors import ResultError
 from vplog.maps.storage import delta_log, objects
 from vplog.maps.storage.contents import Store, skip_damaged
 from vplog.maps.storage.damage import files_of, reading_drive
-from vplog.maps.storage.layout import TABLES
+from vplog.maps.storage.layout import TABLES, grouped
 from vplog.maps.storage.snapshot import store_errors
 from vplog.results import tables
 from vplog.storage import remote_path
@@ -246,31 +248,21 @@ def _write_files(
 ) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
     """Write drives as files: these by name, and the schemas of the tables."""
     found, schemas = dict[str, dict[str, Any]](), dict[str, str]()
-    for group in _groups(store, drives):
+
+    def sizes(drive: str) -> Ints:
+        held = store.sizes(drive)
+        return np.array([held.get(f"{name}.parquet", 0) for name in TABLES])
+
+    for group in grouped(drives, sizes, _FILE_BYTES):
         name = f"part-{secrets.token_hex(16)}"
         with scratch("delta") as folder:
             counts, plain = _write_drives(store, folder, group)
             schemas = {table: delta_log.schema_string(schema) for table, schema in plain.items()}
-            sizes = {table: ((folder / table).stat().st_size, rows) for table, rows in counts.items() if rows}
-            for table in sizes:
+            written = {table: ((folder / table).stat().st_size, rows) for table, rows in counts.items() if rows}
+            for table in written:
                 remote_path.send(place / f"{table}/{name}.parquet", folder / table)
-        found[name] = {"drives": {drive: drives[drive] for drive in group}, "tables": sizes}
+        found[name] = {"drives": {drive: drives[drive] for drive in group}, "tables": written}
     return found, schemas
-
-
-def _groups(store: Store, drives: Iterable[str]) -> Iterator[list[str]]:
-    """Drives that come into one file."""
-    group, held = list[str](), dict.fromkeys(TABLES, 0)
-    for drive in drives:
-        sizes = store.sizes(drive)
-        more = {name: held[name] + sizes.get(f"{name}.parquet", 0) for name in TABLES}
-        if group and max(more.values()) > _FILE_BYTES:
-            yield group
-            group, more = [], {name: more[name] - held[name] for name in TABLES}
-        group.append(drive)
-        held = more
-    if group:
-        yield group
 
 
 def _write_drives(store: Store, folder: Path, drives: Sequence[str]) -> tuple[dict[str, int], dict[str, pa.Schema]]:
