@@ -309,7 +309,6 @@ def _record_pairs(work: _Work, wanted: Sequence[DrivePair], reasons: dict[tuple[
                 "candidates": len(verdicts),
                 "verified": sum(verdict in ACCEPTED for verdict in verdicts),
                 "ledger": "" if why else tables.read_metadata(path).get("vplog.made_from", ""),
-                **({"reason": why} if why else {}),
             })  # fmt: skip
         drives.joins[at] = replace(own, made_from=made_from, pairs=tuple(pairs))
         held, before = ({pair["match"] for pair in one.pairs if pair["ledger"]} for one in (drives.joins[at], own))

@@ -113,8 +113,6 @@ class _Drive(TypedDict):
     """Figures of its run.json."""
     packed: NotRequired[str]
     """When files of its folder were put into a pack, in UTC: from then on they are replaced."""
-    component: NotRequired[str | None]
-    """Folder of its joint graph."""
 
 
 class _Layer(TypedDict):

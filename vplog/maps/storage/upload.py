@@ -308,7 +308,6 @@ def send_rest(mirror: Mirror) -> None:
     generation, began = secrets.token_hex(8), time.time()
     sent = _send_all(new, mirror.local, mirror.remote / "rest" / generation)
     changes = {**{name: {**about, "generation": generation} for name, about in sent.items()}, **dict.fromkeys(gone)}
-    components = _components(mirror.local / "joint.json") if "joint.json" in changes else None
 
     def change(snapshot: Snapshot) -> None:
         check_recent(began)
@@ -321,10 +320,6 @@ def send_rest(mirror: Mirror) -> None:
                 raise LostRaceError(f"Another writer has joined drives of {mirror.remote} at the same time. Run again.")
         there = set(map(folder_name, snapshot["drives"]))
         _replace_rest(snapshot, {name: about for name, about in changes.items() if not drives_in(name) - there})
-        if components is not None:
-            for drive, entry in list(snapshot["drives"].items()):
-                if entry.get("component") != (found := components.get(drive)):
-                    snapshot["drives"][drive] = {**entry, "component": found}
 
     try:
         mirror.commit("joins", change)
@@ -344,15 +339,6 @@ def _replace_rest(snapshot: Snapshot, changes: dict[str, Any]) -> None:
             snapshot["rest"][name] = about
         if name.endswith((".parquet", ".json")):
             snapshot["copies"][name] = None if about is None else f"rest/{about['generation']}/{name}"
-
-
-def _components(path: Path) -> dict[str, str]:
-    """Folder of the joint graph of each drive that is in one."""
-    with suppress(ResultError, KeyError, TypeError):
-        groups = run_record.read_run_json(path)["groups"] if path.exists() else []
-        found = [component for group in groups for component in group["components"]]
-        return {drive: str(component["folder"]) for component in found for drive in component["drives"]}
-    return {}
 
 
 def drop_copies(mirror: Mirror) -> None:
