@@ -14,15 +14,9 @@ from urllib.parse import unquote
 
 from vplog.errors import LibraryError, NewerError, ResultError, nearest_path
 from vplog.maps.geo_bounds import earth_from_record
+from vplog.maps.storage import damage
 from vplog.maps.storage.catalogue import Entry, read_catalogue, state_of, write_catalogue
-from vplog.maps.storage.damage import (
-    DamagedDriveError,
-    UnreachableError,
-    check_run_tables,
-    damaged_files,
-    reading_drive,
-    rows_of,
-)
+from vplog.maps.storage.damage import DamagedDriveError, UnreachableError, reading_drive
 from vplog.maps.storage.layout import FORMAT, HASH, RUN_TABLES, drive_record, folder_name, write_changed
 from vplog.maps.storage.remote_map import Mirror
 from vplog.maps.storage.upload import send_rest, update_failures, write_head
@@ -112,7 +106,7 @@ class Store:
     def damaged_files(self, drive: str) -> list[str]:
         """A line for each file of a drive that is not as it was written; of a map on a store, by what the store says of
         them. Raises UnreachableError."""
-        return damaged_files(self.run(drive)) if self.mirror is None else self.mirror.damaged_files(drive)
+        return damage.damaged_files(self.run(drive)) if self.mirror is None else self.mirror.damaged_files(drive)
 
     def is_present(self, drive: str) -> bool:
         """Whether nothing of a drive of a folder is removed yet. Of one that failed there is its failure alone."""
@@ -123,7 +117,7 @@ class Store:
         if self.mirror is not None:
             return int(self.mirror.drives[drive]["files"].get(f"{name}.parquet", {}).get("rows", 0))
         with reading_drive(drive):
-            return rows_of(self.run(drive) / f"{name}.parquet")
+            return damage.rows_of(self.run(drive) / f"{name}.parquet")
 
     def earth(self, drive: str) -> Earth | None:
         """The georeference of a drive, None where it has none. Raises DamagedDriveError."""
@@ -228,12 +222,12 @@ class Store:
         """drive.json of a run folder whose tables are there. Raises ResultError."""
         record = drive_record(folder)
         try:
-            check_run_tables(folder, record)
+            damage.check_run_tables(folder, record)
         except ResultError:
             if _identity(folder) is None:
                 raise
             record = drive_record(folder)  # of a folder that was replaced meanwhile
-            check_run_tables(folder, record)
+            damage.check_run_tables(folder, record)
         return record
 
     def read(self, drive: str, reader: Callable[[Path], T], names: Iterable[str] = RUN_TABLES) -> T:
