@@ -1,8 +1,7 @@
 """A Ray cluster as the engine of a batch: drives as Ray tasks, on machines that share nothing but the logs.
 
 The library goes once into Ray's object store, and from there once to each machine. A drive's run folder is made on the
-worker's own disk; it is sent from there to a map on an object store, and comes back in pieces for one in a folder. This
-module is imported only with `--engine ray`, and by Ray's workers.
+worker's own disk; it is sent from there to a map on an object store, and comes back in pieces for one in a folder.
 """
 
 from __future__ import annotations
@@ -19,10 +18,11 @@ from typing import Any, cast
 
 from vplog.batch.ray_cluster import ClusterHead, connected, watched_head
 from vplog.batch.worker import Outcome, Task, compute_drive, made_by
+from vplog.data import Bytes
 from vplog.errors import SettingsError, VplogError, is_of_disk
 from vplog.run.feature_extraction import ExtractionPart, compute_part, missing_parts, parts_of, put_part
 from vplog.storage.remote_path import located, stands_for
-from vplog.storage.scratch import Bytes, files_in, packed, pieces, scratch, unpacked, write_pieces
+from vplog.storage.scratch import files_in, packed, pieces, scratch, unpacked, write_pieces
 from vplog.version import __version__
 
 Files = tuple[tuple[str, tuple[Any, ...]], ...]

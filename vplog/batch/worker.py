@@ -89,11 +89,6 @@ class Outcome:
     sent: SentRun | None = None
     """The run folder, where it was sent to a store: the batch commits it."""
 
-    @property
-    def retryable(self) -> bool:
-        """Whether the cause of the error may be gone at another attempt."""
-        return self.fault in ("network", "io", "memory", "worker")
-
 
 @dataclass(frozen=True)
 class DriveState:

@@ -251,9 +251,6 @@ class _Ranges(io.RawIOBase):
         self._at = max(start + offset, 0)
         return self._at
 
-    def tell(self) -> int:
-        return self._at
-
     def readinto(self, buffer: Any) -> int:
         wanted = min(len(buffer), max(self._length - self._at, 0))
         if wanted == 0:

@@ -15,13 +15,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vplog.data import Bytes
 from vplog.errors import ResultError
 from vplog.storage.folders import check_replaceable, is_below, regular_files
-
-Bytes = NDArray[np.uint8]
-
 
 _PART = re.compile(r"\d+(-[0-9a-f]{8})?")
 """Number of the process that writes a file, which is not the only one of that number where containers share a disk."""

@@ -40,7 +40,7 @@ from vplog.places.library_files import ReferencesState, name_extractor, read_lib
 from vplog.results import run_record, tables
 from vplog.run.provenance import library_of
 from vplog.stages import CodedState, FrameState, PlaceState
-from vplog.storage.folders import regular_files
+from vplog.storage.input_hashes import bytes_of
 from vplog.storage.scratch import copy_folder
 
 LOSS = 0.01
@@ -224,7 +224,7 @@ def _account(found: Condensed, store: Store, new: Store, warnings: list[str]) ->
             name: {end: sum(one[name][end] for one in drives) for end in ("before", "after")}
             for name in ("places", "descriptor_bytes")
         },
-        "library_bytes": _ends([_bytes_in(one.library(state.hash)) for one, state in ends]),
+        "library_bytes": _ends([bytes_of(one.library(state.hash)) for one, state in ends]),
         "references": _ends([state.shape[0] for _, state in ends if isinstance(state, CodedState)]),
         "drives": drives,
         "warnings": warnings,
@@ -233,7 +233,3 @@ def _account(found: Condensed, store: Store, new: Store, warnings: list[str]) ->
 
 def _ends(figures: Sequence[int]) -> dict[str, int] | None:
     return dict(zip(("before", "after"), figures, strict=True)) if figures else None
-
-
-def _bytes_in(folder: Path) -> int:
-    return sum((folder / name).stat().st_size for name in regular_files(folder))

@@ -108,10 +108,6 @@ class Store:
         them. Raises UnreachableError."""
         return damage.damaged_files(self.run(drive)) if self.mirror is None else self.mirror.damaged_files(drive)
 
-    def is_present(self, drive: str) -> bool:
-        """Whether nothing of a drive of a folder is removed yet. Of one that failed there is its failure alone."""
-        return (self.root / "runs" / folder_name(drive)).is_dir() or drive in self.failures()
-
     def rows(self, name: str, drive: str) -> int:
         """Rows of a table of a drive, by its footer. Raises DamagedDriveError."""
         if self.mirror is not None:

@@ -276,8 +276,11 @@ def _write_drives(store: Store, folder: Path, drives: Sequence[str]) -> tuple[di
             writers[name].write_table(rows, max(len(rows), 1))
             held[name].clear()
 
+        def read_all(run: Path) -> dict[str, pa.Table]:
+            return {name: tables.read_arrow(run / f"{name}.parquet") for name in TABLES}
+
         for drive in drives:
-            for name, table in store.read(drive, _read_all, [f"{name}.parquet" for name in TABLES]).items():
+            for name, table in store.read(drive, read_all, [f"{name}.parquet" for name in TABLES]).items():
                 schema = delta_log.plain_schema(table.schema)
                 if name not in writers:
                     options: Any = {"compression": "zstd", "store_schema": False, "write_page_checksum": True}
@@ -296,10 +299,6 @@ def _write_drives(store: Store, folder: Path, drives: Sequence[str]) -> tuple[di
         for name in filter(held.get, TABLES):
             write(name)
     return counts, {name: writer.schema for name, writer in writers.items()}
-
-
-def _read_all(folder: Path) -> dict[str, pa.Table]:
-    return {name: tables.read_arrow(folder / f"{name}.parquet") for name in TABLES}
 
 
 def _write_logs(place: RemotePath, commits: Sequence[delta_log.Commit]) -> None:

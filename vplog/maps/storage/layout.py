@@ -110,8 +110,6 @@ def link(source: str | Path, target: str | Path) -> str | Path:
     changes a file, each replaces it. Raises OSError."""
     try:
         os.link(source, target)
-    except FileNotFoundError:
-        raise
     except OSError:
         shutil.copyfile(source, target)
     return target

@@ -160,7 +160,8 @@ def remove(store: Store, drives: Sequence[str]) -> None:
         _finish_removals(store)
     except ResultError as error:
         out = f"{error} {named} removed from {store}; the next command that writes to it deletes the rest of the files."
-        if all(map(store.is_present, drives)):
+        # of a drive that failed there is its failure alone
+        if all((store.root / "runs" / folder_name(one)).is_dir() or one in store.failures() for one in drives):
             with suppress(ResultError):  # where that cannot be taken back they are out
                 store.write_removed([])
                 out = f"{error} {named} in {store} as before."
