@@ -180,25 +180,22 @@ class Store:
             if name in removed or not name.startswith("drive="):
                 continue
             state, (known, record) = state_of(f"{self.root}/runs/{name}"), self._catalogue.get(name, (None, {}))
-            if state is not None and state == known:
-                if record["drive"] not in self.damaged:
-                    found[record["drive"]] = record
-                continue
-            folder = self.root / "runs" / name
-            if not any((folder / one).exists() for one in ("drive.json", *RUN_TABLES)):
-                continue
-            try:
-                record = self._checked_record(folder)
-            except NewerError:
-                raise
-            except ResultError as error:
-                self.damaged.setdefault(_drive_of(folder), str(error))
-            else:
+            if state is None or state != known:
+                folder = self.root / "runs" / name
+                if not any((folder / one).exists() for one in ("drive.json", *RUN_TABLES)):
+                    continue
+                try:
+                    record = self._checked_record(folder)
+                except NewerError:
+                    raise
+                except ResultError as error:
+                    self.damaged.setdefault(_drive_of(folder), str(error))
+                    continue
                 self.uncatalogued.add(name)
                 if state is not None:
                     self._catalogue[name] = [state, record]
-                if record["drive"] not in self.damaged:
-                    found[record["drive"]] = record
+            if record["drive"] not in self.damaged:
+                found[record["drive"]] = record
         return dict(sorted(found.items()))
 
     @cached_property

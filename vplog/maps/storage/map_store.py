@@ -65,12 +65,16 @@ def reading(root: Path, cache: Cache | None = None, as_of: str | None = None) ->
 
 
 @contextmanager
-def writing(root: Path) -> Iterator[Store]:
+def writing(root: Path, *, there: bool = False) -> Iterator[Store]:
     """The map for a writer, made where it is not there yet; drives that a killed writer had finished are put in.
 
     A folder has one writer at a time, an object store any number. Raises SettingsError where the folder holds other
-    things, or where another process writes.
+    things, or where another process writes, and ResultError, with nothing made, where the map is to be `there` and is
+    not.
     """
+    if there:
+        with reading(root) as store:
+            store.head()
     if isinstance(root, RemotePath):
         with _writing_remote(root) as store:
             yield store
