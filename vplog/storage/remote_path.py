@@ -180,7 +180,7 @@ class RemotePath:
 
     @property
     def _is_http(self) -> bool:
-        return self.scheme not in STORES
+        return self.scheme in ("http", "https")
 
     @property
     def place(self) -> tuple[ObjectStore, str]:

@@ -18,9 +18,9 @@ import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
+from urllib.parse import quote
 
 import numpy as np
 import pyarrow as pa
@@ -36,13 +36,9 @@ from vplog.maps.storage.snapshot import store_errors
 from vplog.results import tables
 from vplog.storage import remote_path
 from vplog.storage.json_records import has_checksum, key_of, with_checksum
-from vplog.storage.object_store import plain_errors
 from vplog.storage.parquet_limits import check_version
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.scratch import scratch
-
-if TYPE_CHECKING:
-    from obstore.store import ObjectStore
 
 _FORMAT = 1
 """Version of the commits."""
@@ -59,37 +55,10 @@ PATIENCE_S = 60.0
 """Time from one commit of a batch to the next."""
 
 
-@dataclass(frozen=True)
-class _Folder:
-    """A local folder as objects of a store, as a RemotePath is."""
-
-    store: ObjectStore
-    name: str = ""
-
-    def __truediv__(self, name: str) -> _Folder:
-        return _Folder(self.store, f"{self.name}/{name}".lstrip("/"))
-
-    @property
-    def place(self) -> tuple[ObjectStore, str]:
-        return self.store, self.name
-
-    @property
-    def prefix_length(self) -> int:
-        return len(f"{self.name}/".lstrip("/"))
-
-    def ask(self, verb: str, *given: Any, upload: bool = False, **options: Any) -> Any:
-        with plain_errors():
-            return getattr(self.store, verb)(self.name, *given, **options)
-
-
 def _place(store: Store) -> RemotePath:
     """MAP/delta."""
-    if store.mirror is not None:
-        return store.mirror.remote / "delta"
-    from obstore.store import LocalStore
-
-    with store_errors(cast("RemotePath", store)), plain_errors():
-        return cast("RemotePath", _Folder(LocalStore(store.root / "delta", mkdir=True)))
+    root = RemotePath(f"file://{quote(str(store.root.resolve()))}") if store.mirror is None else store.mirror.remote
+    return root / "delta"
 
 
 def is_present(store: Store) -> bool:
