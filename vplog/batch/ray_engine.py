@@ -1,7 +1,7 @@
 """A Ray cluster as the engine of a batch: drives as Ray tasks, on machines that share nothing but the logs.
 
-The library goes once into Ray's object store, and from there once to each machine. A drive's run folder is made on the
-worker's own disk; it is sent from there to a map on an object store, and comes back in pieces for one in a folder.
+The library goes once into Ray's object store, and from there once to each machine's. A drive's run folder is made on
+the worker's own disk; it is sent from there to a map on an object store, and comes back in pieces for one in a folder.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vplog.data import Bytes
 from vplog.errors import SettingsError, VplogError, is_of_disk
 from vplog.run.feature_extraction import ExtractionPart, compute_part, missing_parts, parts_of, put_part
 from vplog.storage.remote_path import located, stands_for
-from vplog.storage.scratch import files_in, packed, pieces, scratch, unpacked, write_pieces
+from vplog.storage.scratch import files_in, packed, pieces, scratch, write_pieces
 from vplog.version import __version__
 
 Files = tuple[tuple[str, tuple[Any, ...]], ...]
@@ -32,8 +32,6 @@ _PROBE_S = 60.0
 """Limit of a probe of the machines' versions; a slower machine is checked with each drive."""
 _DRIVE_BYTES = 2**30
 """Memory that Ray reserves for a drive, or what the largest machine has if that is less."""
-_FETCH_S = 5.0
-"""Interval at which the cluster is checked while a piece is fetched from it."""
 
 
 @contextmanager
@@ -103,7 +101,7 @@ class RayEngine:
         places = [(task.folder, remote.files)] + ([(task.cache, remote.cache)] if task.cache is not None else [])
         for folder, files in places:
             for name, parts in files:
-                write_pieces(folder, name, map(self._get, parts))
+                write_pieces(folder, name, (self.executor.follow(part).result() for part in parts))
 
     def executor_for(self, threads: int) -> Executor | None:
         """Tasks over all machines, if each of them sees the map."""
@@ -153,15 +151,6 @@ class RayEngine:
             return self._ray.get(answer, timeout=_PROBE_S)
         except self._ray.exceptions.RayError as error:
             return error
-
-    def _get(self, part: Any) -> Any:
-        while True:
-            try:
-                return self._ray.get(part, timeout=_FETCH_S)
-            except self._ray.exceptions.GetTimeoutError:
-                self._head.check()
-            except self._ray.exceptions.RayError as error:
-                raise translated(error) from None
 
     def _of_nodes(self, resource: str) -> list[float]:
         self._head.check()
@@ -287,7 +276,9 @@ def compute_remote_drive(
         return RemoteOutcome(_OTHER.format(where), "input", worker=where)
     try:
         with scratch("run") as folder:
-            place, made = unpacked(library, f"library-{task.record['library']}"), folder / "run"
+            place, made = folder / "library", folder / "run"
+            for name, data in library.items():
+                write_pieces(place, name, [data])
             cache = task.cache or folder / "cache"
             for part, data in parts:
                 with suppress(exceptions.RayError, VplogError):  # failed, lost or damaged: it is computed here
