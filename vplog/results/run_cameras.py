@@ -31,13 +31,12 @@ def camera_from(values: dict[str, Any], again: str) -> Camera:
         raise ResultError(f"The record of a camera is damaged: {error}. {again}") from None
 
 
-def recorded_camera(record: dict[str, Any], number: int, otherwise: Camera) -> Camera:
+def recorded_camera(record: dict[str, Any], number: int) -> Camera:
     """The camera that a run computed with, by its run.json and the camera's number: its matrix may be assumed, or left
-    out where nothing is known of the motion. `otherwise` that of the log, for records without it."""
+    out where nothing is known of the motion. Raises ResultError."""
     known = record.get("calibrations")
-    if not isinstance(known, list) or not 0 <= number < len(known):
-        return otherwise
-    return camera_from(known[number] if isinstance(known[number], dict) else {}, "Run it again.")
+    values = known[number] if isinstance(known, list) and 0 <= number < len(known) else None
+    return camera_from(values if isinstance(values, dict) else {}, "Run it again.")
 
 
 class CameraPictures(NamedTuple):

@@ -86,7 +86,7 @@ def _cameras(folder: Path, record: dict[str, Any], topics: logs.TopicChoice, log
     """The cameras of a run: the first by the poses of the keyframes, the others by the trajectory at their stamps."""
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     drive, names = reopened(record, log, topics), record.get("cameras") or []
-    first, several = recorded_camera(record, 0, drive.camera()), len(names) > 1
+    first, several = recorded_camera(record, 0), len(names) > 1
     poses, rows = world_from_body @ first.body_from_camera, np.arange(len(keyframes.stamp_ns))
     found = [_PosedCamera(drive, first, _folder(first.name) if several else "", rows, keyframes.stamp_ns, poses)]
     for number, topic in enumerate(names[1:], 1):
@@ -94,7 +94,7 @@ def _cameras(folder: Path, record: dict[str, Any], topics: logs.TopicChoice, log
         other = reopened(record, log, topics.of_camera(topic))
         row, pictures = pictures_at(keyframes, other.stamps(), odometry)
         bodies = se3.interpolate_at(trajectory.stamp_ns, trajectory.world_from_body, pictures.stamp_ns)
-        camera = recorded_camera(record, number, other.camera())
+        camera = recorded_camera(record, number)
         poses = bodies @ camera.body_from_camera
         found.append(_PosedCamera(other, camera, _folder(camera.name), row, pictures.stamp_ns, poses))
     return found
