@@ -21,10 +21,8 @@ def snapshots_of(root: Path) -> dict[str, Any]:
                 f"{root} is a folder, which has no snapshots. Those of a map on an object store are shown."
             )
         names = ("version", "time", "drives", "change")
-        return {
-            "map": str(root),
-            "snapshots": [{name: row[name] for name in names} for row in store.mirror.manifest.log],
-        }
+        rows = [{name: row[name] for name in names} for row in store.mirror.manifest.log]
+        return {"map": str(root), "snapshots": rows}
 
 
 def vacuum_map(root: Path, hours: float) -> dict[str, Any]:

@@ -213,10 +213,7 @@ def _account(found: Condensed, store: Store, new: Store, warnings: list[str]) ->
     return {
         "distance_m": round(found.distance_m, 3),
         "queries": {
-            "places": posed,
-            "by_other_drives": others,
-            "by_own_drive": answered - others,
-            "alone": posed - answered,
+            "places": posed, "by_other_drives": others, "by_own_drive": answered - others, "alone": posed - answered,
         },
         "recall": {"before": recall[0], "after": recall[1], "loss": round(recall[0] - recall[1], 6)},
         "faded": {"found": int(faded.sum()), "removed": int((faded & ~retained).sum())},
@@ -228,7 +225,7 @@ def _account(found: Condensed, store: Store, new: Store, warnings: list[str]) ->
         "references": _ends([state.shape[0] for _, state in ends if isinstance(state, CodedState)]),
         "drives": drives,
         "warnings": warnings,
-    }
+    }  # fmt: skip
 
 
 def _ends(figures: Sequence[int]) -> dict[str, int] | None:

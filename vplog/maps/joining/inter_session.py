@@ -110,13 +110,9 @@ def with_proposals(known: Candidates, number: int, more: Proposals, pipeline: Pi
 
 
 def candidates_among(
-    later: Mapping[int, Sequence[Any]],
-    earlier: Callable[[int], Sequence[Any]],
-    searched: Mapping[int, Collection[int]],
-    state: PlaceState,
-    pipeline: Pipeline,
-    execution: Execution,
-) -> dict[int, Candidates]:
+    later: Mapping[int, Sequence[Any]], earlier: Callable[[int], Sequence[Any]],
+    searched: Mapping[int, Collection[int]], state: PlaceState, pipeline: Pipeline, execution: Execution,
+) -> dict[int, Candidates]:  # fmt: skip
     """The best candidates of the places of each drive of `later`, by number, in those drives of lower numbers that it
     is `searched` in.
 

@@ -54,14 +54,9 @@ class DriveRun:
 
 
 def run_joint(
-    paths: Sequence[Path],
-    out: Path,
-    pipeline: Pipeline,
-    library: Path | None = None,
-    topics: logs.TopicChoice | None = None,
-    execution: Execution = Execution(),
-    cache: CacheOptions = CacheOptions(),
-) -> dict[str, Any]:
+    paths: Sequence[Path], out: Path, pipeline: Pipeline, library: Path | None = None,
+    topics: logs.TopicChoice | None = None, execution: Execution = Execution(), cache: CacheOptions = CacheOptions(),
+) -> dict[str, Any]:  # fmt: skip
     """Run each drive into a folder of its own in `out`, join them, and return the record in its run.json.
 
     What `out` holds stays until all is done; a run that has another log is replaced with `cache.force` only. All drives
