@@ -22,7 +22,7 @@ from vplog.data import Bytes
 from vplog.errors import SettingsError, VplogError, is_of_disk
 from vplog.run.feature_extraction import ExtractionPart, compute_part, missing_parts, parts_of, put_part
 from vplog.storage.remote_path import located, stands_for
-from vplog.storage.scratch import files_in, packed, pieces, scratch, write_pieces
+from vplog.storage.scratch import files_in, pieces, scratch, write_pieces
 from vplog.version import __version__
 
 Files = tuple[tuple[str, tuple[Any, ...]], ...]
@@ -78,7 +78,8 @@ class RayEngine:
         """Begin a drive; one in parts with its frames, on all machines."""
         task = task if self._shares_disk else replace(task, cache=None)
         if self._library is None or self._library[0] != task.library:
-            self._library = task.library, self._ray.put(packed(task.library))
+            library = {name: list(pieces(task.library / name)) for name in files_in(task.library)}
+            self._library = task.library, self._ray.put(library)
         memory = min(_DRIVE_BYTES, int(max(self._of_nodes("memory"))))
         drive = self._drive.options(num_cpus=task.threads, memory=memory, name=f"vplog {task.drive}")
         if self._is_ours:  # no other tasks run there: the system shares the cores, and the last drive has all
@@ -262,7 +263,7 @@ def compute_remote_part(part: ExtractionPart, wanted: dict[str, Any]) -> bytes:
 
 
 def compute_remote_drive(
-    task: Task, library: dict[str, Bytes], parts: list[tuple[ExtractionPart, Any]]
+    task: Task, library: dict[str, list[Bytes]], parts: list[tuple[ExtractionPart, Any]]
 ) -> RemoteOutcome:
     """A drive with everything on this machine's own disk; its run folder goes into the object store.
 
@@ -277,8 +278,8 @@ def compute_remote_drive(
     try:
         with scratch("run") as folder:
             place, made = folder / "library", folder / "run"
-            for name, data in library.items():
-                write_pieces(place, name, [data])
+            for name, content in library.items():
+                write_pieces(place, name, content)
             cache = task.cache or folder / "cache"
             for part, data in parts:
                 with suppress(exceptions.RayError, VplogError):  # failed, lost or damaged: it is computed here

@@ -194,8 +194,3 @@ def write_pieces(folder: Path, name: str, parts: Iterable[Bytes]) -> None:
     with replacing(folder / name, parents=True) as stream:
         for part in parts:
             stream.write(part.data)
-
-
-def packed(folder: Path) -> dict[str, Bytes]:
-    """The files of a folder, whole, by name."""
-    return {name: np.fromfile(folder / name, np.uint8) for name in files_in(folder)}

@@ -21,14 +21,8 @@ import numpy as np
 from vplog.data import Bools, Ints
 from vplog.errors import ResultError, SettingsError
 from vplog.execution.execution import Execution
-from vplog.maps.condensation.own_queries import (
-    OwnAnswers,
-    OwnPlaces,
-    near_another,
-    query_own_places,
-    read_own_places,
-    search_of,
-)
+from vplog.maps.condensation import own_queries
+from vplog.maps.condensation.own_queries import OwnAnswers, OwnPlaces
 from vplog.maps.condensation.redundancy import RemovalCandidates, remove_cross_validated
 from vplog.maps.condensation.references import remove_references
 from vplog.maps.merge import copy_library, copy_run, put_library
@@ -88,10 +82,10 @@ def condense_map(
 
         def attempt() -> tuple[Condensed, list[str]]:
             drives, _, state = open_map(store, execution)
-            places = read_own_places(store, drives, state)
-            search, warnings = search_of(store, drives, places, state, execution)
+            places = own_queries.read_own_places(store, drives, state)
+            search, warnings = own_queries.search_of(store, drives, places, state, execution)
             within = distance_m or _SPACINGS * places.spacing_m
-            answers = query_own_places(places, search, state, within, execution)
+            answers = own_queries.query_own_places(places, search, state, within, execution)
             if not len(answers.place):  # then no loss bounds what is removed
                 raise ResultError(
                     f"No place of {root} finds another within {within:.3g} m, so what it can do without is not known. "
@@ -120,7 +114,8 @@ def condense_places(
             places, answers, state, distance_m, most_lost // 2, execution
         )
     every = np.arange(len(posed))
-    removable, along_m = near_another(places, distance_m) | (posed & answers.faded), np.cumsum(places.steps_m())
+    removable = own_queries.near_another(places, distance_m) | (posed & answers.faded)
+    along_m = np.cumsum(places.steps_m())
     total = int(removable.sum())
     most_lost -= len(whole_answers.place) - len(answers.place)
     _, track = np.unique(np.stack([places.drive, places.frame], 1), axis=0, return_inverse=True)  # drive and camera

@@ -260,14 +260,10 @@ class Store:
 
     def failures(self) -> dict[str, dict[str, Any]]:
         """Log and error of each drive that failed when it was last tried, by ID; none where the record is damaged."""
-        return self._failures()[0]
+        return self.failures_or_damage()[0]
 
-    @property
-    def failures_damage(self) -> str:
-        """Why it is not known what failed; empty where it is."""
-        return self._failures()[1]
-
-    def _failures(self) -> tuple[dict[str, dict[str, Any]], str]:
+    def failures_or_damage(self) -> tuple[dict[str, dict[str, Any]], str]:
+        """`failures`, and why it is not known what failed; empty where it is."""
         if self.mirror is not None:
             return self.mirror.manifest.now["failures"], ""
         path = self.root / "failures.json"
