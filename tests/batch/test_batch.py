@@ -43,6 +43,7 @@ from vplog.pipeline import Pipeline, load_pipeline
 from vplog.places.vectors import VectorsSettings
 from vplog.results.run_record import read_run_json, write_run_json
 from vplog.run.reference_library import build_library
+from vplog.storage.input_hashes import bytes_of
 from vplog.storage.remote_path import RemotePath, located, send
 from vplog.verbs.demo.record import IMAGE
 
@@ -602,7 +603,7 @@ def test_bytes_of_a_bag_in_a_bucket_are_those_of_its_files(tmp_path: Path) -> No
     with serving():
         for name in ("bag_0.mcap", "bag_1.mcap"):
             send(RemotePath(f"s3://bucket/bag/{name}"), tmp_path / "part")
-        assert [dry_run._bytes(located(f"s3://bucket/bag{name}")) for name in ("", "/bag_0.mcap")] == [20, 10]
+        assert [bytes_of(located(f"s3://bucket/bag{name}"), remote=True) for name in ("", "/bag_0.mcap")] == [20, 10]
 
 
 def test_a_file_of_metrics_that_cannot_be_written_is_said_first(tmp_path: Path, verb: Callable[..., Said]) -> None:

@@ -13,7 +13,7 @@ import pytest
 from vplog.batch import log_hashes
 from vplog.batch.log_hashes import known_hashes
 from vplog.batch.plan import DriveInput
-from vplog.batch.worker import fault_of
+from vplog.batch.worker import told
 from vplog.errors import LogError, VplogError
 from vplog.execution.execution import Execution
 from vplog.logs import TopicChoice
@@ -230,7 +230,7 @@ def test_a_server_is_asked_again(retries: int, fault: str, tmp_path: Path, monke
     monkeypatch.setattr(RemotePath, "version", version)
     log = DriveInput(located("s3://bucket/a.mcap"))
     [found] = known_hashes([log], tmp_path / "record", Execution(1), retries)
-    assert (fault_of(log.url, found) if isinstance(found, LogError) else "") == fault
+    assert (told(found, log.url)[1] if isinstance(found, LogError) else "") == fault
 
 
 def test_masks_of_one_name_are_told_apart(tmp_path: Path, logs: dict[str, Path]) -> None:

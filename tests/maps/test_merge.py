@@ -67,30 +67,6 @@ def test_drives_come_as_they_are_and_those_whose_name_is_taken_get_a_number(verb
     assert "0 of 6 drives taken" in verb("map", "merge", a, b, "-o", both).out
 
 
-def test_a_merge_that_was_stopped_goes_on_to_the_same_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    a, b = make_map(tmp_path / "a", {"walk": 1}), make_map(tmp_path / "b", {"walk": 2, "walk-2": 3, "walk-3": 4})
-    whole, part = tmp_path / "whole", tmp_path / "part"
-    merge_maps([a, b], whole)
-    publish, left = map_store.publish, [0]
-
-    def stopping(*arguments: Any) -> str:
-        left[0] -= 1
-        if left[0] == 0:
-            raise KeyboardInterrupt
-        return publish(*arguments)
-
-    monkeypatch.setattr(map_store, "publish", stopping)
-    for stop in (2, 2, 2, 2):
-        left[0] = stop
-        try:
-            merge_maps([a, b], part)
-        except KeyboardInterrupt:
-            assert len(map_store.Store(part).drives()) >= 1
-    drives = list(map_store.Store(whole).drives())
-    assert drives == list(map_store.Store(part).drives()) == ["walk", "walk-2", "walk-3", "walk-4"]
-    assert [digests(part, drive) for drive in drives] == [digests(whole, drive) for drive in drives]
-
-
 def test_a_merge_killed_anywhere_has_each_drive_whole_or_not_at_all(tmp_path: Path) -> None:
     """And goes on to the same end; the drives of the target stay as they were."""
     source, whole, step = make_map(tmp_path / "source", {"walk": 1, "ride": 2}), tmp_path / "whole", 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -11,10 +11,12 @@ import pyarrow.parquet as pq
 
 from vplog.data import Camera, Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Solution, Trajectory, Verdict
 from vplog.geometry import se3
+from vplog.results import places_map
 from vplog.results.places_map import PLACE, read_drives
 from vplog.results.tables import TableMetadata
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from vplog.data import Floats
@@ -38,6 +40,14 @@ def read_map(path: Path, kind: pa.DataType) -> tuple[pa.Table, pa.Array]:
     """The places of a whole map, and their descriptors."""
     descriptors = pa.concat_arrays([places.descriptors for places in read_drives(path, kind)])
     return pq.read_table(path, columns=PLACE.names), descriptors
+
+
+def write_map(path: Path, folders: Sequence[Path]) -> dict[str, Any]:
+    """The places of runs in one file; what was written."""
+    drives = {
+        name: places_map.drive_header(run) for name, run in zip(places_map.names_of(folders), folders, strict=True)
+    }
+    return places_map.write_places(path, drives, map(places_map.read_places, folders))
 
 
 def random_poses(rng: np.random.Generator, count: int) -> Floats:

@@ -11,10 +11,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from tests.results.example import COUNT, METADATA, make_run, read_map
+from tests.results.example import COUNT, METADATA, make_run, read_map, write_map
 from vplog.errors import ResultError
 from vplog.results import tables
-from vplog.results.places_map import write_map
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -16,7 +16,7 @@ import pytest
 
 from tests.benchmarks.scale import made_up_library, write_drive
 from tests.benchmarks.search import make_places
-from tests.results.example import COUNT, METADATA, make_run
+from tests.results.example import COUNT, METADATA, make_run, write_map
 from tests.results.test_tables import write_all
 from vplog.data import Features, Gps, Reference
 from vplog.errors import ResultError, VplogError
@@ -77,7 +77,7 @@ def write_tables(folder: Path) -> dict[Path, list[Read]]:
     tables.write_keyframes(folder / "run" / "keyframes.parquet", RUN.keyframes, RUN.solution.world_from_body, METADATA)
     tables.write_descriptors(folder / "run" / "descriptors.parquet", RUN.keyframes, column, METADATA)
     exported = folder / "map.parquet"
-    places_map.write_map(exported, [folder / "run"])
+    write_map(exported, [folder / "run"])
     kept, joins, answers = folder / "features.parquet", folder / "joins.parquet", folder / "placed.parquet"
     feature_table.write_features(kept, 5, features, 20, "state")
     landmarks, own = folder / "landmarks.parquet", replace(features(0), depth_m=np.linspace(1, 9, 20, dtype=np.float32))

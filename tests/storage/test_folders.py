@@ -15,6 +15,7 @@ import pytest
 import vplog
 from tests.maps.runs import LIBRARY, make_map
 from vplog.errors import LogError, ResultError
+from vplog.maps.storage import map_store
 from vplog.maps.storage.layout import folder_name
 from vplog.results import run_record
 from vplog.storage.folders import check_regular, regular_files
@@ -201,6 +202,8 @@ def test_a_name_that_no_record_can_hold_is_refused(root: Path, verb: Verb, tmp_p
 def test_a_folder_that_is_given_may_be_a_link(root: Path, verb: Verb, tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(root)
     assert verb("map", "info", tmp_path / "link", "--json").json["places"]
+    with map_store.writing(tmp_path / "link") as store:
+        assert store.drives()
     (tmp_path / "run").symlink_to(root / WALK)
     check_regular(tmp_path / "run", "run.json")
 

@@ -1,4 +1,4 @@
-"""Folders that travel arrive as they were, are unpacked once, and leave nothing behind."""
+"""Folders that travel arrive as they were, and leave nothing behind."""
 
 from __future__ import annotations
 
@@ -15,17 +15,7 @@ import pytest
 
 from vplog.errors import ResultError
 from vplog.storage import scratch as scratch_of
-from vplog.storage.scratch import (
-    files_in,
-    own_folder,
-    packed,
-    pieces,
-    put_in_place,
-    replacing,
-    scratch,
-    unpacked,
-    write_pieces,
-)
+from vplog.storage.scratch import files_in, own_folder, pieces, put_in_place, replacing, scratch, write_pieces
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -58,21 +48,6 @@ def test_a_folder_comes_back_from_its_pieces(tmp_path: Path, monkeypatch: pytest
     for name in ("../out", "/out", "below/../../out"):
         with pytest.raises(ResultError, match="not inside"):
             write_pieces(target, name, iter([np.zeros(1, np.uint8)]))
-
-
-def test_it_is_unpacked_once_and_again_where_something_is_missing(tmp_path: Path, machine: Path) -> None:
-    files = packed(make_folder(tmp_path / "source"))
-    place = unpacked(files, "library-1")
-    assert place.is_relative_to(machine)
-    assert {name: data.tobytes() for name, data in packed(place).items()} == {
-        name: data.tobytes() for name, data in files.items()
-    }
-    before = (place / "a.bin").stat().st_ino
-    assert unpacked(files, "library-1") == place
-    assert (place / "a.bin").stat().st_ino == before
-    (place / "below" / "empty").unlink()
-    assert files_in(unpacked(files, "library-1")) == ["a.bin", "below/empty"]
-    assert list(own_folder().iterdir()) == [place]
 
 
 def test_what_a_killed_process_leaves_goes_when_the_next_one_comes(machine: Path) -> None:

@@ -89,9 +89,8 @@ def run_batch(
         done = dict[str, DriveState]()
         for one in plan:
             if one.state != "compute":
-                done[one.drive] = DriveState(
-                    one.drive, one.record["log"], one.state, error=one.error, fault=one.fault
-                )  # fmt: skip
+                log = one.record["log"]
+                done[one.drive] = DriveState(one.drive, log, one.state, error=one.error, fault=one.fault)
             if one.state == "failed":
                 options.on_drive(done[one.drive])
             elif one.state == "unchanged":

@@ -22,7 +22,6 @@ from vplog.pipeline import Pipeline
 from vplog.results import run_record
 from vplog.run.provenance import stat_of
 from vplog.storage.input_hashes import bytes_of, files_of, hash_inputs
-from vplog.storage.remote_path import RemotePath
 from vplog.storage.urls import shown
 
 _CPU_S_PER_IMAGE = 0.35
@@ -94,18 +93,12 @@ def _sizes(one: PlannedDrive) -> dict[str, Any]:
     if one.state == "compute":
         try:
             images, seconds = logs.open(one.given.log, one.given.topics).summary()
-            size = _bytes(one.given.log)
+            size = bytes_of(one.given.log, remote=True)
         except (VplogError, OSError) as problem:
             error = str(problem)
     about = {"bytes": size, "images": images, "seconds": round(seconds, 1), "error": error}
     state = "failed" if error else one.state
     return {"drive": one.drive, "log": one.record["log"], "state": state, "tags": one.record.get("tags", {}), **about}
-
-
-def _bytes(path: Path) -> int:
-    if not isinstance(path, RemotePath):
-        return bytes_of(path)
-    return sum(file.stat().st_size for file in ([path] if path.is_file() else path.rglob()))
 
 
 def _cpu_s_per_image(store: Store) -> tuple[float, int]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
-from vplog.batch.ray_engine import RayEngine
+from vplog.batch.ray_engine import RayEngine, ray_engine
 from vplog.batch.worker import DriveState, Outcome, Task, compute_drive
 from vplog.errors import SettingsError, VplogError, is_of_disk
 from vplog.execution.process_limits import OVER_MEMORY, OVER_TIME
@@ -21,8 +21,6 @@ from vplog.storage.urls import shown
 Engine: TypeAlias = "LocalEngine | RayEngine"
 
 ENGINES = ("local", "ray")
-RETRIES = 2
-"""More attempts at a drive whose worker died: one that dies three times will most likely die again."""
 _KILLED = "Its process was killed, perhaps because memory ran out. Free memory or use fewer --jobs, and run again."
 
 
@@ -35,7 +33,8 @@ class BatchOptions:
     engine: str = "local"
     address: str | None = None
     """HOST:PORT of a Ray cluster; None: one of this machine for the time of the batch."""
-    retries: int = RETRIES
+    retries: int = 2
+    """More attempts at a drive whose worker died: one that dies three times will most likely die again."""
     drive_timeout_s: float | None = None
     """Longest time of an attempt at a drive; it fails, and is not tried again. Of local processes alone."""
     drive_memory_mb: float | None = None
@@ -57,8 +56,6 @@ def open_engine(options: BatchOptions, threads: int, folder: Path | None = None)
     if options.engine == "ray":
         if (options.drive_timeout_s, options.drive_memory_mb) != (None, None):
             raise SettingsError("--drive-timeout and --drive-memory are for --engine local. Leave them out.")
-        from vplog.batch.ray_engine import ray_engine
-
         with ray_engine(options.address, threads, folder) as engine:
             yield engine
         return
@@ -87,7 +84,8 @@ def as_completed(engine: Engine, tasks: Sequence[Task], options: BatchOptions) -
             outcome = _outcome_of(engine, task, future)
             if not outcome.seconds:  # nobody says how long it lived
                 outcome = replace(outcome, seconds=round(time.monotonic() - began_s, 3))
-            if outcome.retryable and attempt <= options.retries:
+            passing = outcome.fault in ("network", "io", "memory", "worker")
+            if passing and attempt <= options.retries:
                 waiting.append((task, attempt + 1))
                 options.on_drive(DriveState.after(task, "retried", attempt, outcome))
             else:

@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 
 from vplog import logs as all_logs
 from vplog.batch.plan import DriveInput, Hashes
-from vplog.batch.worker import fault_of
+from vplog.batch.worker import told
 from vplog.errors import LogError, ResultError, VplogError
 from vplog.results.run_record import read_run_json, write_run_json
 from vplog.storage.input_hashes import bytes_of, changed_s, hash_inputs, stat_signature
@@ -85,11 +85,10 @@ def known_hashes(
         except LogError as error:
             return error
         except OSError as error:
-            if left and fault_of(given.url, error) == "network":
-                return of_log(given, number, left - 1)
             problem = LogError(f"Cannot read {error.filename or given.log}: {error.strerror or error}.")
             problem.__cause__ = error
-            return problem
+            again = left and told(problem, given.url)[1] == "network"
+            return of_log(given, number, left - 1) if again else problem
 
     with ThreadPoolExecutor(execution.threads) as pool:
         waiting = [pool.submit(of_log, log, number) for number, log in enumerate(logs)]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vplog.batch.worker import fault_of
+from vplog.batch.worker import told
 from vplog.errors import ResultError, SettingsError, VplogError
 from vplog.logs import TopicChoice
 from vplog.maps.storage import layout
@@ -101,7 +101,7 @@ def plan_drives(
         about = {name: value for name, value in known.get(drive, {}).items() if name in layout.ABOUT}
         record |= {**about, "key": key_of(record), "log": url, **given.about}
         if isinstance(found, VplogError):
-            plan.append(PlannedDrive(given, record, "failed", str(found), fault_of(given.url, found)))
+            plan.append(PlannedDrive(given, record, "failed", *told(found, given.url)))
             continue
         if drive in known and layout.made_alike(known[drive], record) and not _is_damaged(store, drive):
             state = "unchanged"

@@ -1,8 +1,7 @@
 """A Ray cluster as the engine of a batch: drives as Ray tasks, on machines that share nothing but the logs.
 
-The library goes once into Ray's object store, and from there once to each machine. A drive's run folder is made on the
-worker's own disk; it is sent from there to a map on an object store, and comes back in pieces for one in a folder. This
-module is imported only with `--engine ray`, and by Ray's workers.
+The library goes once into Ray's object store, and from there once to each machine's. A drive's run folder is made on
+the worker's own disk; it is sent from there to a map on an object store, and comes back in pieces for one in a folder.
 """
 
 from __future__ import annotations
@@ -19,10 +18,11 @@ from typing import Any, cast
 
 from vplog.batch.ray_cluster import ClusterHead, connected, watched_head
 from vplog.batch.worker import Outcome, Task, compute_drive, made_by
+from vplog.data import Bytes
 from vplog.errors import SettingsError, VplogError, is_of_disk
 from vplog.run.feature_extraction import ExtractionPart, compute_part, missing_parts, parts_of, put_part
 from vplog.storage.remote_path import located, stands_for
-from vplog.storage.scratch import Bytes, files_in, packed, pieces, scratch, unpacked, write_pieces
+from vplog.storage.scratch import files_in, pieces, scratch, write_pieces
 from vplog.version import __version__
 
 Files = tuple[tuple[str, tuple[Any, ...]], ...]
@@ -32,8 +32,6 @@ _PROBE_S = 60.0
 """Limit of a probe of the machines' versions; a slower machine is checked with each drive."""
 _DRIVE_BYTES = 2**30
 """Memory that Ray reserves for a drive, or what the largest machine has if that is less."""
-_FETCH_S = 5.0
-"""Interval at which the cluster is checked while a piece is fetched from it."""
 
 
 @contextmanager
@@ -80,7 +78,8 @@ class RayEngine:
         """Begin a drive; one in parts with its frames, on all machines."""
         task = task if self._shares_disk else replace(task, cache=None)
         if self._library is None or self._library[0] != task.library:
-            self._library = task.library, self._ray.put(packed(task.library))
+            library = {name: list(pieces(task.library / name)) for name in files_in(task.library)}
+            self._library = task.library, self._ray.put(library)
         memory = min(_DRIVE_BYTES, int(max(self._of_nodes("memory"))))
         drive = self._drive.options(num_cpus=task.threads, memory=memory, name=f"vplog {task.drive}")
         if self._is_ours:  # no other tasks run there: the system shares the cores, and the last drive has all
@@ -103,7 +102,7 @@ class RayEngine:
         places = [(task.folder, remote.files)] + ([(task.cache, remote.cache)] if task.cache is not None else [])
         for folder, files in places:
             for name, parts in files:
-                write_pieces(folder, name, map(self._get, parts))
+                write_pieces(folder, name, (self.executor.follow(part).result() for part in parts))
 
     def executor_for(self, threads: int) -> Executor | None:
         """Tasks over all machines, if each of them sees the map."""
@@ -153,15 +152,6 @@ class RayEngine:
             return self._ray.get(answer, timeout=_PROBE_S)
         except self._ray.exceptions.RayError as error:
             return error
-
-    def _get(self, part: Any) -> Any:
-        while True:
-            try:
-                return self._ray.get(part, timeout=_FETCH_S)
-            except self._ray.exceptions.GetTimeoutError:
-                self._head.check()
-            except self._ray.exceptions.RayError as error:
-                raise translated(error) from None
 
     def _of_nodes(self, resource: str) -> list[float]:
         self._head.check()
@@ -273,7 +263,7 @@ def compute_remote_part(part: ExtractionPart, wanted: dict[str, Any]) -> bytes:
 
 
 def compute_remote_drive(
-    task: Task, library: dict[str, Bytes], parts: list[tuple[ExtractionPart, Any]]
+    task: Task, library: dict[str, list[Bytes]], parts: list[tuple[ExtractionPart, Any]]
 ) -> RemoteOutcome:
     """A drive with everything on this machine's own disk; its run folder goes into the object store.
 
@@ -287,7 +277,9 @@ def compute_remote_drive(
         return RemoteOutcome(_OTHER.format(where), "input", worker=where)
     try:
         with scratch("run") as folder:
-            place, made = unpacked(library, f"library-{task.record['library']}"), folder / "run"
+            place, made = folder / "library", folder / "run"
+            for name, content in library.items():
+                write_pieces(place, name, content)
             cache = task.cache or folder / "cache"
             for part, data in parts:
                 with suppress(exceptions.RayError, VplogError):  # failed, lost or damaged: it is computed here

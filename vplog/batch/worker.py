@@ -89,11 +89,6 @@ class Outcome:
     sent: SentRun | None = None
     """The run folder, where it was sent to a store: the batch commits it."""
 
-    @property
-    def retryable(self) -> bool:
-        """Whether the cause of the error may be gone at another attempt."""
-        return self.fault in ("network", "io", "memory", "worker")
-
 
 @dataclass(frozen=True)
 class DriveState:
@@ -147,30 +142,26 @@ def compute_drive(task: Task) -> Outcome:
             counts = record["counts"]
             found |= {"keyframes": counts["keyframes"], "accepted": counts["verdicts"].get("accepted", 0)}
             found["warnings"] = tuple(record["warnings"])
-    except UnreachableError as problem:
-        error, fault = str(problem), "network"
-    except VplogError as problem:
-        error, fault = str(problem), fault_of(task.log, problem)
-    except MemoryError:
-        error, fault = "Out of memory. Use fewer --jobs, or a machine with more.", "memory"
-    except OSError as problem:
-        # another attempt may be on another machine, and finds what this one had done
-        error, fault = f"Cannot read or write {problem.filename or 'a file'}: {problem.strerror or problem}.", "io"
     except Exception as problem:  # a fault of ours in one drive must not stop the others
-        text = " ".join(str(problem).split())[:200]
-        error = f"Internal error: {type(problem).__name__}: {text}. `vplog run LOG --debug` shows where."
-        fault = "internal"
+        error, fault = told(problem, task.log)
     seconds, worker = round(time.perf_counter() - began, 3), f"{platform.node()}:{os.getpid()}"
     return Outcome(error, fault, seconds, worker, max(peak, round(peak_memory_mb(), 1)), **found)
 
 
-def fault_of(url: str, error: Exception) -> str:
-    """`Outcome.fault` of an error of reading a log: `network` where it is that of the server of a remote one, and not
-    that it has no such file."""
+def told(error: Exception, url: str) -> tuple[str, str]:
+    """An error of computing or reading a log in one line, and the fault as in `Outcome`: `network` where it is that of
+    the server of a remote one, and not that it has no such file."""
+    if isinstance(error, MemoryError):
+        return "Out of memory. Use fewer --jobs, or a machine with more.", "memory"
+    if isinstance(error, OSError):  # another attempt may be on another machine, and finds what this one had done
+        return f"Cannot read or write {error.filename or 'a file'}: {error.strerror or error}.", "io"
+    if not isinstance(error, VplogError):
+        text = f"Internal error: {type(error).__name__}: {' '.join(str(error).split())[:200]}."
+        return f"{text} `vplog run LOG --debug` shows where.", "internal"
     kinds = [type(one) for one in causes(error) if isinstance(one, OSError)] if "://" in url else []
-    if any(not issubclass(kind, FileNotFoundError | PermissionError) for kind in kinds):
-        return "network"
-    return "io" if is_of_disk(error) else "input"
+    remote = any(not issubclass(kind, FileNotFoundError | PermissionError) for kind in kinds)
+    network = remote or isinstance(error, UnreachableError)
+    return str(error), "network" if network else "io" if is_of_disk(error) else "input"
 
 
 def _compute(task: Task, path: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:

@@ -19,7 +19,7 @@ from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.map_store import Store
 from vplog.results import tables
 from vplog.results.geo import Earth, on_earth
-from vplog.results.places_map import DrivePlaces, drive_header, names_of, read_places, write_map, write_places
+from vplog.results.places_map import DrivePlaces, drive_header, names_of, read_places, write_places
 from vplog.results.run_record import read_single_run
 from vplog.storage.remote_path import local_copy
 
@@ -62,8 +62,6 @@ def export_map(
         folders = [stack.enter_context(local_copy(source)) for source in sources]
         for folder in folders:
             read_single_run(folder)
-        if box is None and kind == "parquet":
-            return {**write_map(path, folders), "left_out": []}
         run = dict(zip(names_of(folders), folders, strict=True))
         source = _Source(
             {drive: drive_header(folder) for drive, folder in run.items()}, lambda drive: earth_of_run(run[drive]),

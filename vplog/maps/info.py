@@ -65,7 +65,7 @@ def _describe(store: Store) -> dict[str, Any]:
             f"{len(other)} of {len(drives)} drives were made with other settings than the last batch had, or by "
             f"another version of vplog. `vplog batch` with their logs computes them again; the first is {other[0]}."
         )
-    if damage := store.failures_damage:
+    if damage := store.failures_or_damage()[1]:
         problems.append(damage)
     problems += damage_warnings(store) + _unused_folders(store, [*abouts, *store.damaged])
     places = sum(one["places"] for one in drives)

@@ -59,12 +59,8 @@ def merge_maps(
                 outcomes += [] if taken is None else [taken]
                 execution.progress(f"merge {number} of {len(sources)}", len(outcomes), len(outcomes))
             warnings += damage_warnings(source)
-        return {
-            "map": str(store),
-            "library": library,
-            "drives": outcomes,
-            "warnings": damage_warnings(store) + warnings,
-        }
+        warnings = damage_warnings(store) + warnings
+        return {"map": str(store), "library": library, "drives": outcomes, "warnings": warnings}
 
 
 def _opened(source: Path) -> AbstractContextManager[Store | Path]:

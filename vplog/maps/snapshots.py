@@ -21,17 +21,13 @@ def snapshots_of(root: Path) -> dict[str, Any]:
                 f"{root} is a folder, which has no snapshots. Those of a map on an object store are shown."
             )
         names = ("version", "time", "drives", "change")
-        return {
-            "map": str(root),
-            "snapshots": [{name: row[name] for name in names} for row in store.mirror.manifest.log],
-        }
+        rows = [{name: row[name] for name in names} for row in store.mirror.manifest.log]
+        return {"map": str(root), "snapshots": rows}
 
 
 def vacuum_map(root: Path, hours: float) -> dict[str, Any]:
     """Remove what was replaced in a map more than `hours` ago, and what killed writers left then. Raises VplogError."""
-    with map_store.reading(root) as store:  # not a map: nothing is made
-        store.head()
-    with map_store.writing(root) as store:
+    with map_store.writing(root, there=True) as store:
         has_delta = delta.is_present(store)
         if store.mirror is None and not has_delta:
             raise ResultError(f"{root} is a folder without Delta tables, where nothing that is replaced stays.")
@@ -44,9 +40,7 @@ def compact_map(root: Path) -> dict[str, Any]:
     """Put small files of a map together in files of up to 100 MB: on an object store those of its drives, and those of
     Delta tables, which there take the place of the tables copied by drive. How many files of drives came into how many,
     and the state of the Delta tables. Raises VplogError."""
-    with map_store.reading(root) as store:  # not a map: nothing is made
-        store.head()
-    with map_store.writing(root) as store:
+    with map_store.writing(root, there=True) as store:
         if store.mirror is None and not delta.is_present(store):
             raise ResultError(
                 f"{root} is a folder, where drives stay as they are, and has no Delta tables. To have some: vplog map "
@@ -62,8 +56,6 @@ def compact_map(root: Path) -> dict[str, Any]:
 def write_delta(root: Path) -> dict[str, Any]:
     """Make the tables of a map Delta Lake tables, too, which later changes keep up. Their place, last version, drives
     and files. Raises VplogError."""
-    with map_store.reading(root) as store:  # not a map: nothing is made
-        store.head()
-    with map_store.writing(root) as store:
+    with map_store.writing(root, there=True) as store:
         found = map_store.follow_with_delta(store, begin=True)
         return {"map": str(root), "tables": [f"{root}/delta/{name}" for name in map_store.TABLES], **found}

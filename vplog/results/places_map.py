@@ -87,16 +87,6 @@ def read_places(folder: Path, drive: str | None = None) -> DrivePlaces:
     return DrivePlaces(drive or keyframes.drive, folder, rows, stamps, poses, column, header)
 
 
-def write_map(path: Path, folders: Sequence[Path]) -> dict[str, Any]:
-    """One row for every keyframe of the runs, drives in the order given; what was written.
-
-    Raises ResultError where the descriptors were not made with one library, and so do not compare, or where two
-    drives bear one name.
-    """
-    drives = {name: drive_header(folder) for name, folder in zip(names_of(folders), folders, strict=True)}
-    return write_places(path, drives, (read_places(folder) for folder in folders))
-
-
 def drive_header(folder: Path) -> dict[str, Any]:
     """The entry of a drive in the header: the content of its log, the topics that were requested, and where it is, as
     drive.json has it in a map; of a run elsewhere the first two, by run.json."""
@@ -117,7 +107,8 @@ def write_places(
     known of each, which goes into the header.
 
     With the bounds of their points, (3,) each as `where` has them, the file is GeoParquet 1.1 too, whose header comes
-    first. Raises ResultError as above, where there is no place at all, and where one is beyond the bounds.
+    first. Raises ResultError where descriptors were not made with one library, and so do not compare, where there is no
+    place at all, and where one is beyond the bounds.
     """
     rest = iter(parts)
     first = next(rest, None)

@@ -32,20 +32,18 @@ def camera_from(values: dict[str, Any], again: str) -> Camera:
         raise ResultError(f"The record of a camera is damaged: {error}. {again}") from None
 
 
-def recorded_camera(record: dict[str, Any], number: int, otherwise: Camera) -> Camera:
+def recorded_camera(record: dict[str, Any], number: int) -> Camera:
     """The camera that a run computed with, by its run.json and the camera's number: its matrix may be assumed, or left
-    out where nothing is known of the motion. `otherwise` that of the log, for records without it."""
+    out where nothing is known of the motion. Raises ResultError."""
     known = record.get("calibrations")
-    if not isinstance(known, list) or not 0 <= number < len(known):
-        return otherwise
-    return camera_from(known[number] if isinstance(known[number], dict) else {}, "Run it again.")
+    values = known[number] if isinstance(known, list) and 0 <= number < len(known) else None
+    return camera_from(values if isinstance(values, dict) else {}, "Run it again.")
 
 
 def unit_camera(record: dict[str, Any]) -> Floats | None:
     """body_from_camera (4, 4) of the camera whose path is in the unit of a run without metres, while its place on the
-    body is in metres, the body's own where the record has no cameras. None of a run in metres."""
-    body = Camera("", None, "none", np.zeros(0), 0, 0, np.eye(4))
-    return None if has_metres(record) else recorded_camera(record, 0, body).body_from_camera
+    body is in metres. None of a run in metres."""
+    return None if has_metres(record) else recorded_camera(record, 0).body_from_camera
 
 
 class CameraPictures(NamedTuple):

@@ -33,7 +33,7 @@ def staged(out: Path, begin: Callable[[], Sequence[str]]) -> Iterator[Path]:
     glob patterns of the results that an earlier writer may have left there. Raises SettingsError or ResultError.
     """
     staging = out / _STAGING
-    with _locked(out):
+    with locked(out):
         if (out / _COMMITTED).exists():
             _move(out)
         results = begin()
@@ -60,32 +60,32 @@ def recover(out: Path) -> None:
     """
     for folder in (out, out.absolute().parent):
         if (folder / _COMMITTED).exists():
-            with _locked(folder, wait=True):
+            with locked(folder, wait=True):
                 if (folder / _COMMITTED).exists():
                     _move(folder)
 
 
 @contextmanager
-def _locked(out: Path, wait: bool = False) -> Iterator[None]:
-    """`out` for one process at a time, on file systems that have locks. Raises SettingsError."""
-    path = out / _LOCK
+def locked(out: Path, wait: bool = False, name: str = _LOCK, needed: bool = False) -> Iterator[None]:
+    """`out`, made where it is not there, for one process at a time, on file systems that have locks. Raises
+    SettingsError, also where there are none and they are `needed`."""
+    path = out / name
     while True:
         with ExitStack() as stack:
             try:
                 stack.enter_context(made_folder(out))
                 lock = stack.enter_context(path.open("a"))
             except OSError as error:
-                raise SettingsError(
-                    f"Cannot make the folder {out} or write in it: {error.strerror}. Choose another with -o."
-                ) from None
-            if not _has(lock, path, wait):
+                what = f"Cannot make the folder {out} or write in it: {error.strerror}."
+                raise SettingsError(f"{what} Check its permissions, or choose another.") from None
+            if not _has(lock, path, wait, needed):
                 continue  # another process had it, and has removed it
             stack.callback(path.unlink, missing_ok=True)
             yield
             return
 
 
-def _has(lock: TextIO, path: Path, wait: bool) -> bool:
+def _has(lock: TextIO, path: Path, wait: bool, needed: bool) -> bool:
     """Lock an open file; whether it is still the one at `path`. Raises SettingsError where another process holds the
     lock."""
     try:
@@ -93,11 +93,13 @@ def _has(lock: TextIO, path: Path, wait: bool) -> bool:
         return os.path.samestat(os.fstat(lock.fileno()), path.stat())
     except BlockingIOError:
         raise SettingsError(
-            f"Another vplog process is writing to {path.parent}. Wait for it to end, or choose another folder with -o."
+            f"Another vplog process is writing to {path.parent}. Wait for it to end, or choose another folder."
         ) from None
     except FileNotFoundError:
         return False
-    except OSError:  # a file system without locks
+    except OSError as error:  # a file system without locks
+        if needed:
+            raise SettingsError(f"Cannot lock {path}: {error.strerror}. Choose another folder.") from None
         return True
 
 

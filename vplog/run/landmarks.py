@@ -61,7 +61,7 @@ def run_drive(
         if features is None or not np.array_equal(features.stamp_ns, keyframes.stamp_ns):
             store = stack.enter_context(FeatureStore(stack.enter_context(scratch("features")) / "features"))
             features = ReextractedFeatures(log, keyframes.stamp_ns, settings, store, execution)
-        used = recorded_camera(record, camera, log.camera())
+        used = recorded_camera(record, camera)
         yield drive_of(keyframes, used, features.__getitem__, settings.verify)
 
 

@@ -42,9 +42,9 @@ def hash_inputs(drive: Path | Sequence[Path], progress: Callable[[int], None] = 
     return result
 
 
-def bytes_of(drive: Path | Sequence[Path]) -> int:
-    """Length of the files of a log on this machine. Raises OSError."""
-    return sum(file.stat().st_size for _, file in _named(drive) if not isinstance(file, RemotePath))
+def bytes_of(drive: Path | Sequence[Path], *, remote: bool = False) -> int:
+    """Length of the files of a log on this machine, or with `remote` of all of them. Raises OSError."""
+    return sum(file.stat().st_size for _, file in _named(drive) if remote or not isinstance(file, RemotePath))
 
 
 def stat_signature(drive: Path | Sequence[Path]) -> dict[str, str]:

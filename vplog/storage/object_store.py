@@ -63,8 +63,8 @@ _NO_BUCKET = re.compile("NoSuchBucket|ContainerNotFound|bucket does not exist")
 
 
 def opened(scheme: str, where: str, upload: bool = False) -> ObjectStore:
-    """A bucket or container, or for http and https all of a URL. For an `upload` a server may be silent while it takes
-    what is sent. Raises OSError."""
+    """A bucket or container, for http and https all of a URL, for file this machine. For an `upload` a server may be
+    silent while it takes what is sent. Raises OSError."""
     names = ("AWS_", "GOOGLE_", "AZURE_", "STORAGE_EMULATOR_HOST", "HOME")
     environment = tuple(sorted(one for one in os.environ.items() if one[0].startswith(names)))
     with plain_errors():
@@ -74,7 +74,7 @@ def opened(scheme: str, where: str, upload: bool = False) -> ObjectStore:
 @lru_cache(_OPEN)
 def _opened(scheme: str, where: str, upload: bool, _: tuple[Any, ...]) -> ObjectStore:
     with _IMPORTING:
-        from obstore.store import AzureStore, GCSStore, HTTPStore, S3Store
+        from obstore.store import AzureStore, GCSStore, HTTPStore, LocalStore, S3Store
 
     longest = _REQUEST_S[scheme in STORES]
     client: Any = {
@@ -89,6 +89,8 @@ def _opened(scheme: str, where: str, upload: bool, _: tuple[Any, ...]) -> Object
             return GCSStore(where, config=_google_config(), **how)
         case "az":
             return AzureStore(where, **how)
+        case "file":
+            return LocalStore()
     return HTTPStore(where, **how)
 
 

@@ -180,7 +180,7 @@ class RemotePath:
 
     @property
     def _is_http(self) -> bool:
-        return self.scheme not in STORES
+        return self.scheme in ("http", "https")
 
     @property
     def place(self) -> tuple[ObjectStore, str]:
@@ -249,9 +249,6 @@ class _Ranges(io.RawIOBase):
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         start = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._length}[whence]
         self._at = max(start + offset, 0)
-        return self._at
-
-    def tell(self) -> int:
         return self._at
 
     def readinto(self, buffer: Any) -> int:

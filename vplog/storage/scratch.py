@@ -8,20 +8,17 @@ import re
 import secrets
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vplog.data import Bytes
 from vplog.errors import ResultError
 from vplog.storage.folders import check_replaceable, is_below, regular_files
-
-Bytes = NDArray[np.uint8]
-
 
 _PART = re.compile(r"\d+(-[0-9a-f]{8})?")
 """Number of the process that writes a file, which is not the only one of that number where containers share a disk."""
@@ -190,38 +187,10 @@ def pieces(path: Path) -> Iterator[Bytes]:
         yield np.fromfile(path, np.uint8, _PIECE_BYTES, offset=start)
 
 
-def write_pieces(folder: Path, name: str, parts: Iterator[Bytes]) -> None:
+def write_pieces(folder: Path, name: str, parts: Iterable[Bytes]) -> None:
     """A file of a folder from its pieces. Raises ResultError."""
     if not is_below(name):
         raise ResultError(f"A worker gave back a file named {name!r}, which is not inside its folder.")
     with replacing(folder / name, parents=True) as stream:
         for part in parts:
             stream.write(part.data)
-
-
-def packed(folder: Path) -> dict[str, Bytes]:
-    """The files of a folder, whole, by name."""
-    return {name: np.fromfile(folder / name, np.uint8) for name in files_in(folder)}
-
-
-def unpacked(files: dict[str, Bytes], name: str) -> Path:
-    """A folder of this machine with these files, which are written once for all that use the name, that of the content.
-    A machine may clean up old files one by one, so sizes are looked at. Raises ResultError."""
-    place = own_folder() / name
-    if not _is_whole(place, files):
-        with scratch("unpack") as folder:
-            for file, data in files.items():
-                write_pieces(folder / "new", file, iter([data]))
-            with suppress(OSError):
-                place.rename(folder / "old")
-            with suppress(OSError):  # another worker may have been first
-                (folder / "new").rename(place)
-        if not _is_whole(place, files):
-            raise ResultError(f"Cannot put {len(files)} files into {place}. Set TMPDIR to a folder with room.")
-    return place
-
-
-def _is_whole(place: Path, files: dict[str, Bytes]) -> bool:
-    return place.is_dir() and all(
-        (place / name).is_file() and (place / name).stat().st_size == data.size for name, data in files.items()
-    )

@@ -133,7 +133,7 @@ def _picture(end: str, row: dict[str, Any], opened: _Opened) -> tuple[Bytes, Fea
         stamps = log.stamps()
         stamp_ns = stamps[[np.abs(stamps - stamp_ns).argmin()]]
     [(image, features)] = frames_at(log, stamp_ns, opened.pipeline, otherwise)
-    return image, features, recorded_camera(opened.record, number, log.camera())
+    return image, features, recorded_camera(opened.record, number)
 
 
 def _boxes(row: dict[str, Any], views: tuple[Features, Features], opened: _Opened) -> tuple[list[SharedBoxes], str]:

@@ -109,7 +109,7 @@ def pictures_from(log: Path, folder: Path, record: dict[str, Any], execution: Ex
     found = frames_at(opened, stamps, pipeline, f"is it the log of {folder}?", execution)
     for node, (image, features[node]) in zip(nodes.tolist(), found, strict=True):
         thumbnails[node] = thumbnail(image)
-    camera = recorded_camera(record, 0, opened.camera())
+    camera = recorded_camera(record, 0)
     inputs = ClosureInputs(features.__getitem__, camera, state, state.from_arrow(column))
     views = view_closures(rows, inputs, closures, pipeline.verify, execution)
     references = reference_pictures(state.references, pipeline.pictures.quality) if isinstance(state, BoxState) else {}

@@ -55,9 +55,10 @@ def looked_at(
         assert chosen.features.kind == "sift" or not len(some.query)
         return np.zeros(len(some.query), np.int64)
 
-    monkeypatch.setattr(inter_session, "mirrored_evidence", mirror)
+    monkeypatch.setattr(inter_session.false_rate, "mirrored_evidence", mirror)
     chosen = (pipeline or Pipeline()).model_copy(update={"join": settings or JoinSettings()})
-    return looks, inter_session.closures_between(proposals(), drive, drive, chosen, 0.0, Execution())
+    one = inter_session.CameraDrive(np.arange(0), drive)
+    return looks, inter_session.closures_between(proposals(), one, one, chosen, 0.0, Execution())
 
 
 def test_drives_that_do_not_meet_cost_one_look_at_the_highest_scores(monkeypatch: pytest.MonkeyPatch) -> None:

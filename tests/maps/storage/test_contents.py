@@ -172,7 +172,7 @@ def test_no_flip_in_a_record_is_silent(root: Path, tmp_path: Path, name: str) ->
     def read() -> tuple[Any, ...]:
         with map_store.reading(here) as store:
             drives = {drive: store.read(drive, record_of) for drive in store.drives()}
-            failed = store.failures_damage.partition(",")[0] or store.failures()
+            failed = store.failures_or_damage()[1].partition(",")[0] or store.failures()
             return store.head(), read_joint(here).get("alone"), failed, drives
 
     def record_of(folder: Path) -> Any:

@@ -86,25 +86,6 @@ def test_records_that_say_something_else_are_one_line(root: Path, verb: Verb, tm
             check(verb("map", "merge", here, "-o", tmp_path / f"to-{number}"))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "map.json",
-        "joint.json",
-        "failures.json",
-        *(f"runs/drive=walk/{name}" for name in ("run.json", "descriptors.parquet")),
-    ],
-)
-def test_a_pipe_is_not_waited_for(root: Path, verb: Verb, tmp_path: Path, name: str) -> None:
-    here = tmp_path / "map"
-    shutil.copytree(root, here)
-    (here / name).unlink(missing_ok=True)
-    os.mkfifo(here / name)
-    check(verb("map", "info", here))
-    check(verb("map", "export", here, "-o", tmp_path / "places.parquet"))
-    check(verb("map", "remove", here, "ride"))
-
-
 @pytest.mark.parametrize("kind", ["pipe", "folder", "loop"])
 def test_what_is_no_file_is_no_part_of_an_index(tmp_path: Path, kind: str) -> None:
     settings = BobbSettings(references=4, windows_along=2)

@@ -21,14 +21,8 @@ import numpy as np
 from vplog.data import Bools, Ints
 from vplog.errors import ResultError, SettingsError
 from vplog.execution.execution import Execution
-from vplog.maps.condensation.own_queries import (
-    OwnAnswers,
-    OwnPlaces,
-    near_another,
-    query_own_places,
-    read_own_places,
-    search_of,
-)
+from vplog.maps.condensation import own_queries
+from vplog.maps.condensation.own_queries import OwnAnswers, OwnPlaces
 from vplog.maps.condensation.redundancy import RemovalCandidates, remove_cross_validated
 from vplog.maps.condensation.references import remove_references
 from vplog.maps.merge import copy_library, copy_run, put_library
@@ -40,7 +34,7 @@ from vplog.places.library_files import ReferencesState, name_extractor, read_lib
 from vplog.results import run_record, tables
 from vplog.run.provenance import library_of
 from vplog.stages import CodedState, FrameState, PlaceState
-from vplog.storage.folders import regular_files
+from vplog.storage.input_hashes import bytes_of
 from vplog.storage.scratch import copy_folder
 
 LOSS = 0.01
@@ -88,10 +82,10 @@ def condense_map(
 
         def attempt() -> tuple[Condensed, list[str]]:
             drives, _, state = open_map(store, execution)
-            places = read_own_places(store, drives, state)
-            search, warnings = search_of(store, drives, places, state, execution)
+            places = own_queries.read_own_places(store, drives, state)
+            search, warnings = own_queries.search_of(store, drives, places, state, execution)
             within = distance_m or _SPACINGS * places.spacing_m
-            answers = query_own_places(places, search, state, within, execution)
+            answers = own_queries.query_own_places(places, search, state, within, execution)
             if not len(answers.place):  # then no loss bounds what is removed
                 raise ResultError(
                     f"No place of {root} finds another within {within:.3g} m, so what it can do without is not known. "
@@ -120,7 +114,8 @@ def condense_places(
             places, answers, state, distance_m, most_lost // 2, execution
         )
     every = np.arange(len(posed))
-    removable, along_m = near_another(places, distance_m) | (posed & answers.faded), np.cumsum(places.steps_m())
+    removable = own_queries.near_another(places, distance_m) | (posed & answers.faded)
+    along_m = np.cumsum(places.steps_m())
     total = int(removable.sum())
     most_lost -= len(whole_answers.place) - len(answers.place)
     _, track = np.unique(np.stack([places.drive, places.frame], 1), axis=0, return_inverse=True)  # drive and camera
@@ -213,10 +208,7 @@ def _account(found: Condensed, store: Store, new: Store, warnings: list[str]) ->
     return {
         "distance_m": round(found.distance_m, 3),
         "queries": {
-            "places": posed,
-            "by_other_drives": others,
-            "by_own_drive": answered - others,
-            "alone": posed - answered,
+            "places": posed, "by_other_drives": others, "by_own_drive": answered - others, "alone": posed - answered,
         },
         "recall": {"before": recall[0], "after": recall[1], "loss": round(recall[0] - recall[1], 6)},
         "faded": {"found": int(faded.sum()), "removed": int((faded & ~retained).sum())},
@@ -224,16 +216,12 @@ def _account(found: Condensed, store: Store, new: Store, warnings: list[str]) ->
             name: {end: sum(one[name][end] for one in drives) for end in ("before", "after")}
             for name in ("places", "descriptor_bytes")
         },
-        "library_bytes": _ends([_bytes_in(one.library(state.hash)) for one, state in ends]),
+        "library_bytes": _ends([bytes_of(one.library(state.hash)) for one, state in ends]),
         "references": _ends([state.shape[0] for _, state in ends if isinstance(state, CodedState)]),
         "drives": drives,
         "warnings": warnings,
-    }
+    }  # fmt: skip
 
 
 def _ends(figures: Sequence[int]) -> dict[str, int] | None:
     return dict(zip(("before", "after"), figures, strict=True)) if figures else None
-
-
-def _bytes_in(folder: Path) -> int:
-    return sum((folder / name).stat().st_size for name in regular_files(folder))

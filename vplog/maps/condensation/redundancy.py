@@ -177,12 +177,9 @@ class Gaps:
 
 
 def remove_cross_validated(
-    queries: OwnQueries,
-    fold: Bools,
-    places: RemovalCandidates,
-    most_lost: int,
+    queries: OwnQueries, fold: Bools, places: RemovalCandidates, most_lost: int,
     progress: Callable[[int], None] = lambda _: None,
-) -> tuple[Removal, int]:
+) -> tuple[Removal, int]:  # fmt: skip
     """Remove as many places (N,) as cost at most `most_lost` of the queries (Q,) their right answer; the removal, and
     how many it costs.
 
@@ -203,13 +200,9 @@ def remove_cross_validated(
 
 
 def remove_redundant(
-    queries: OwnQueries,
-    places: RemovalCandidates,
-    most_lost: int,
-    progress: Callable[[int], None] = lambda _: None,
-    judges: OwnQueries | None = None,
-    most: int | None = None,
-) -> Removal:
+    queries: OwnQueries, places: RemovalCandidates, most_lost: int, progress: Callable[[int], None] = lambda _: None,
+    judges: OwnQueries | None = None, most: int | None = None,
+) -> Removal:  # fmt: skip
     """Remove places as long as at most `most_lost` queries lose their right answer: those of `judges`, where given,
     which do not take part in the choice. One place of each drive stays. At most `most` places are removed."""
     drive = places.drive

@@ -30,13 +30,7 @@ from vplog.loops.verify import no_closures
 from vplog.maps.joining.drive_pairs import fetch_inputs
 from vplog.maps.joining.growth import Growth, LostPosesError
 from vplog.maps.joining.join_states import JoinState, PairState, write_states
-from vplog.maps.joining.joint_graph import (
-    pair_record,
-    read_drive,
-    solution_record,
-    solve_drives,
-    write_component,
-)
+from vplog.maps.joining.joint_graph import pair_record, read_drive, solution_record, solve_drives, write_component
 from vplog.maps.joining.joint_record import is_whole, read_joint, write_joint
 from vplog.maps.joining.members import Member
 from vplog.maps.storage.damage import DamagedDriveError

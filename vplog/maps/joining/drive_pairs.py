@@ -160,14 +160,10 @@ def _camera_key(member: Member, pipeline: Pipeline) -> str:
     return key_of({"member": member.key, "verify": verify, "code": code["code"]})
 
 
-def search_code() -> str:
-    """sha256 over the code that chooses what is verified, and verifies it; read once, which takes half a second."""
-    return code_of(*_CODE, _SEARCH)["code"]
-
-
 def search_key(pipeline: Pipeline) -> str:
-    """sha256 over what the joins of every drive depend on, beside the drives."""
-    return key_of({**depends(pipeline), "search": search_code()})
+    """sha256 over what the joins of every drive depend on, beside the drives; the code is read once, which takes half a
+    second."""
+    return key_of({**depends(pipeline), "search": code_of(*_CODE, _SEARCH)["code"]})
 
 
 def remove_stale_ledgers(store: Store, drive: str, but: Collection[str], before: Collection[str] = ()) -> None:

@@ -21,16 +21,8 @@ from vplog.geometry import se3
 from vplog.graph.growth import Anchored, place, solve_again, turned_round
 from vplog.graph.joint import middle
 from vplog.graph.refine import Refined
-from vplog.maps.joining.joint_graph import (
-    SolvedDrive,
-    pair_record,
-    read_drive,
-    solution_record,
-    verified,
-    verified_closures,
-    with_solve,
-    write_component,
-)
+from vplog.maps.joining import joint_graph
+from vplog.maps.joining.joint_graph import SolvedDrive, verified, verified_closures, with_solve
 from vplog.maps.joining.joint_record import fetch_poses, is_whole
 from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.layout import folder_name
@@ -241,15 +233,18 @@ class Growth:
         drives = {drive: known.get(drive) or self._drive(drive) for drive in poses}
         keyframes = {one: self._keyframes(one)[0] for one in set(chain.from_iterable(ledgers))}
         rows = [(keyframes[later], keyframes[earlier], one) for (later, earlier), one in ledgers.items()]
-        record = {"drives": list(poses), "joins": [pair_record(*pair, one) for pair, one in ledgers.items()]}
+        record = {
+            "drives": list(poses),
+            "joins": [joint_graph.pair_record(*pair, one) for pair, one in ledgers.items()],
+        }
         if refined is not None:
-            record = solution_record(list(poses), [], refined)
+            record = joint_graph.solution_record(list(poses), [], refined)
         about = {**record, "made_from": key_of(made_from)}
-        write_component(self._store, name, drives, poses, rows, about, self._header)
+        joint_graph.write_component(self._store, name, drives, poses, rows, about, self._header)
         return name
 
     def _drive(self, drive: str) -> SolvedDrive:
-        return read_drive(drive, self._store.run(drive))
+        return joint_graph.read_drive(drive, self._store.run(drive))
 
     def _keyframes(self, drive: str) -> tuple[Keyframes, Floats]:
         """The keyframes of a drive, and their poses (N, 4, 4) in the frame of its component. Raises LostPosesError."""

@@ -4,23 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vplog.data import Bools, Closures, Int32s, Ints, SharedReferences, Verdict
+from vplog.data import Closures, Int32s, Ints, SharedReferences, Verdict
 from vplog.execution.execution import Execution
-from vplog.loops.false_rate import (
-    FalseRateSettings,
-    are_unrated,
-    at_rate,
-    evidence,
-    mirrored_evidence,
-    null_pairs,
-    with_p_false,
-)
+from vplog.loops import false_rate
 from vplog.loops.propose import Proposals, ProposeSettings, propose
 from vplog.loops.verify import Drive, no_closures, verify_between
 from vplog.places.sequence import rank_places
@@ -119,13 +110,9 @@ def with_proposals(known: Candidates, number: int, more: Proposals, pipeline: Pi
 
 
 def candidates_among(
-    later: Mapping[int, Sequence[Any]],
-    earlier: Callable[[int], Sequence[Any]],
-    searched: Mapping[int, Collection[int]],
-    state: PlaceState,
-    pipeline: Pipeline,
-    execution: Execution,
-) -> dict[int, Candidates]:
+    later: Mapping[int, Sequence[Any]], earlier: Callable[[int], Sequence[Any]],
+    searched: Mapping[int, Collection[int]], state: PlaceState, pipeline: Pipeline, execution: Execution,
+) -> dict[int, Candidates]:  # fmt: skip
     """The best candidates of the places of each drive of `later`, by number, in those drives of lower numbers that it
     is `searched` in.
 
@@ -197,64 +184,6 @@ def likely_pairs(
     return pairs
 
 
-def closures_between(
-    proposals: Proposals,
-    later: Drive,
-    earlier: Drive,
-    pipeline: Pipeline,
-    share: float,
-    execution: Execution,
-    fetch: Callable[[Int32s, Int32s], None] = lambda *_: None,
-) -> Closures:
-    """The ledger of the verified candidates of one drive's keyframes (queries) in another (matches).
-
-    The best candidates of the highest-scoring queries come first. Where geometry confirms none of them, the drives
-    share no place; else the best of each other query follows, and then all candidates of the queries around confirmed
-    ones: these are for the graph, and left out without calibration. `p_false` is by candidates with the query mirrored.
-    `share` is the larger `calibration_share` of the two drives; `fetch` gets queries and matches before they are
-    verified. Progress counts candidates.
-    """
-    settings = pipeline.join
-    _, best = np.unique(proposals.query, return_index=True)
-    by_score = best[np.argsort(-proposals.score[best], kind="stable")]
-    count = max(settings.first_look, -(-len(best) // _FIRST_SHARE))
-    verified: list[tuple[Ints, Closures]] = []
-
-    def verify_rows(rows: Ints) -> None:
-        fetch(np.unique(proposals.query[rows]), np.unique(proposals.match[rows]))
-        ledger = verify_between(proposals.rows(rows), later, earlier, execution, share)
-        verified.append((rows, ledger))
-
-    def confirmed() -> Int32s:
-        """Queries with a geometrically confirmed candidate, increasing."""
-        return np.unique(np.concatenate([one.query[[v not in _NO_POSE for v in one.verdict]] for _, one in verified]))
-
-    verify_rows(np.sort(by_score[:count]))
-    if len(confirmed()):
-        verify_rows(np.sort(by_score[count:]))
-        if later.camera.matrix is not None and earlier.camera.matrix is not None:
-            others = _near_confirmed(proposals.query, confirmed(), settings.around)
-            others[best] = False
-            verify_rows(np.flatnonzero(others))
-    ledger = merged([ledger for _, ledger in verified], [rows for rows, _ in verified])
-    settings, found = pipeline.rating.false_rate, evidence(ledger)
-    if not found.any() or are_unrated(found, 0, settings):
-        return ledger
-    return _with_false_rate(ledger, later, earlier, settings, execution)
-
-
-def _with_false_rate(
-    ledger: Closures, later: Drive, earlier: Drive, settings: FalseRateSettings, execution: Execution
-) -> Closures:
-    """The ledger with `p_false`, and without what is likelier to be false than `settings.rate`."""
-    count = min(null_pairs(evidence(ledger), settings), len(ledger))
-    some = ledger.rows(np.linspace(0, len(ledger) - 1, count).astype(np.int64))
-    proposals = Proposals(some.query, some.match, some.rank, some.score, some.support)
-    mirror = mirrored_evidence(proposals, later, earlier, execution)
-    ledger = with_p_false(ledger, np.zeros(len(ledger), bool), mirror, np.zeros(0, np.int64), np.zeros(0, bool))
-    return ledger if settings.rate is None else at_rate(ledger, settings.rate)
-
-
 class CameraDrive(NamedTuple):
     """The pictures of one camera of a drive, as closures are verified."""
 
@@ -263,6 +192,60 @@ class CameraDrive(NamedTuple):
     drive: Drive
     fetch: Callable[[Int32s | Ints], None] = lambda _: None
     """Gets the pictures before they are verified."""
+
+
+def closures_between(
+    proposals: Proposals, later: CameraDrive, earlier: CameraDrive, pipeline: Pipeline, share: float,
+    execution: Execution,
+) -> Closures:  # fmt: skip
+    """The ledger of the verified candidates of one drive's pictures (queries) in another's (matches).
+
+    The best candidates of the highest-scoring queries come first. Where geometry confirms none of them, the drives
+    share no place; else the best of each other query follows, and then all candidates of the queries around confirmed
+    ones: these are for the graph, and left out without calibration. `p_false` is by candidates with the query mirrored.
+    `share` is the larger `calibration_share` of the two drives. Progress counts candidates.
+    """
+    settings = pipeline.join
+    _, best = np.unique(proposals.query, return_index=True)
+    by_score = best[np.argsort(-proposals.score[best], kind="stable")]
+    count = max(settings.first_look, -(-len(best) // _FIRST_SHARE))
+    verified: list[tuple[Ints, Closures]] = []
+
+    def verify_rows(rows: Ints) -> None:
+        later.fetch(np.unique(proposals.query[rows]))
+        earlier.fetch(np.unique(proposals.match[rows]))
+        verified.append((rows, verify_between(proposals.rows(rows), later.drive, earlier.drive, execution, share)))
+
+    def confirmed() -> Int32s:
+        """Queries with a geometrically confirmed candidate, increasing."""
+        return np.unique(np.concatenate([one.query[[v not in _NO_POSE for v in one.verdict]] for _, one in verified]))
+
+    verify_rows(np.sort(by_score[:count]))
+    if len(confirmed()):
+        verify_rows(np.sort(by_score[count:]))
+        if later.drive.camera.matrix is not None and earlier.drive.camera.matrix is not None:
+            near, at = confirmed(), proposals.query.astype(np.int64)
+            others = np.searchsorted(near, at - settings.around) < np.searchsorted(near, at + settings.around, "right")
+            others[best] = False
+            verify_rows(np.flatnonzero(others))
+    ledger = merged([ledger for _, ledger in verified], [rows for rows, _ in verified])
+    rated, found = pipeline.rating.false_rate, false_rate.evidence(ledger)
+    if not found.any() or false_rate.are_unrated(found, 0, rated):
+        return ledger
+    return _with_false_rate(ledger, later.drive, earlier.drive, rated, execution)
+
+
+def _with_false_rate(
+    ledger: Closures, later: Drive, earlier: Drive, settings: false_rate.FalseRateSettings, execution: Execution
+) -> Closures:
+    """The ledger with `p_false`, and without what is likelier to be false than `settings.rate`."""
+    count = min(false_rate.null_pairs(false_rate.evidence(ledger), settings), len(ledger))
+    some = ledger.rows(np.linspace(0, len(ledger) - 1, count).astype(np.int64))
+    proposals = Proposals(some.query, some.match, some.rank, some.score, some.support)
+    mirror = false_rate.mirrored_evidence(proposals, later, earlier, execution)
+    none = np.zeros(0, bool)
+    ledger = false_rate.with_p_false(ledger, np.zeros(len(ledger), bool), mirror, np.zeros(0, np.int64), none)
+    return ledger if settings.rate is None else false_rate.at_rate(ledger, settings.rate)
 
 
 def closures_by_cameras(
@@ -278,19 +261,18 @@ def closures_by_cameras(
         rows = np.flatnonzero((query_camera == q) & (match_camera == m))
         proposals = replace(pair.proposals, query=query, match=match).rows(rows)
         queries, matches = later[q], earlier[m]
-        fetch = partial(_fetch, queries, matches)
-        ledger = closures_between(proposals, queries.drive, matches.drive, pipeline, share(q, m), execution, fetch)
-        known, chosen = pair.shared, rows.tolist()
-        shared = SharedReferences([known.references[row] for row in chosen], [known.overlap[row] for row in chosen])
-        ledger = with_shared(ledger, proposals, shared)
+        ledger = closures_between(proposals, queries, matches, pipeline, share(q, m), execution)
+        row_of = dict(zip(zip(proposals.query.tolist(), proposals.match.tolist(), strict=True), rows, strict=True))
+        own = [row_of[ends] for ends in zip(ledger.query.tolist(), ledger.match.tolist(), strict=True)]
+        references, overlap = pair.shared.references, pair.shared.overlap
+        shared = {
+            "shared_references": [references[row] for row in own],
+            "shared_overlap": [overlap[row] for row in own],
+        }
+        ledger = replace(ledger, **shared)
         pictures = [CameraPictures(one.row, one.drive.keyframes) for one in (queries, matches)]
         ledgers.append(of_keyframes(ledger, pictures, (q, m), keyframes) if q or m else ledger)
     return once(ledgers)
-
-
-def _fetch(later: CameraDrive, earlier: CameraDrive, queries: Int32s, matches: Int32s) -> None:
-    later.fetch(queries)
-    earlier.fetch(matches)
 
 
 def _pictures(rows: Int32s, cameras: Sequence[CameraDrive]) -> tuple[Ints, Int32s]:
@@ -298,27 +280,3 @@ def _pictures(rows: Int32s, cameras: Sequence[CameraDrive]) -> tuple[Ints, Int32
     first = np.cumsum([0, *(len(one.row) for one in cameras)])
     camera = np.searchsorted(first, rows, side="right") - 1
     return camera, (rows - first[camera]).astype(np.int32)
-
-
-def with_shared(ledger: Closures, proposals: Proposals, shared: SharedReferences) -> Closures:
-    """The ledger of some of the proposals, with what is shared by each."""
-    pairs = zip(proposals.query.tolist(), proposals.match.tolist(), strict=True)
-    row_of = {pair: row for row, pair in enumerate(pairs)}
-    rows = [row_of[pair] for pair in zip(ledger.query.tolist(), ledger.match.tolist(), strict=True)]
-    return replace(
-        ledger,
-        shared_references=[shared.references[row] for row in rows],
-        shared_overlap=[shared.overlap[row] for row in rows],
-    )
-
-
-def _near_confirmed(query: Int32s, confirmed_queries: Int32s, around: int) -> Bools:
-    """(C,) whether a query is at most so many keyframes from one of `confirmed_queries`, which increase."""
-    if len(confirmed_queries) == 0:
-        return np.zeros(len(query), bool)
-    after = np.searchsorted(confirmed_queries, query)
-    left, right = (
-        confirmed_queries[np.maximum(after - 1, 0)],
-        confirmed_queries[np.minimum(after, len(confirmed_queries) - 1)],
-    )
-    return np.minimum(np.abs(query - left), np.abs(query - right)) <= around

@@ -32,7 +32,7 @@ from vplog.maps.joining.members import CameraTrust, Member, member_of
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import damaged_table
 from vplog.maps.storage.layout import PICTURES, PLACES_ONLY, folder_name
-from vplog.maps.storage.map_store import Store, reading, writing
+from vplog.maps.storage.map_store import Store, writing
 from vplog.maps.storage.snapshot import LostRaceError
 from vplog.pipeline import Pipeline
 from vplog.results import tables
@@ -69,8 +69,7 @@ def load_places(library: Path, pipeline: Pipeline, execution: Execution = Execut
 
     The code hashes that joins depend on are read along, once. Raises LibraryError.
     """
-    drive_pairs.depends(pipeline)
-    drive_pairs.search_code()
+    drive_pairs.search_key(pipeline)
     return cast("PlaceState", pipeline.places.load(library, Execution(execution.threads)))
 
 
@@ -114,10 +113,8 @@ def join(
 def join_map(root: Path, execution: Execution = Execution(), *, whole: bool = False) -> dict[str, Any]:
     """`join` of a map as it is, with the settings of its last batch; `whole`: joint graphs to which drives were added
     are solved again as a whole. Raises VplogError."""
-    with reading(root) as store:  # not a map: nothing is made
-        head = store.head()
-    pipeline = Pipeline.read(head.settings, f"{root}/map.json")
-    with writing(root) as store:
+    with writing(root, there=True) as store:
+        pipeline = Pipeline.read(store.head().settings, f"{root}/map.json")
         return {"map": str(root), **join(store, pipeline, execution, whole=whole)}
 
 
@@ -309,7 +306,6 @@ def _record_pairs(work: _Work, wanted: Sequence[DrivePair], reasons: dict[tuple[
                 "candidates": len(verdicts),
                 "verified": sum(verdict in ACCEPTED for verdict in verdicts),
                 "ledger": "" if why else tables.read_metadata(path).get("vplog.made_from", ""),
-                **({"reason": why} if why else {}),
             })  # fmt: skip
         drives.joins[at] = replace(own, made_from=made_from, pairs=tuple(pairs))
         held, before = ({pair["match"] for pair in one.pairs if pair["ledger"]} for one in (drives.joins[at], own))

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Collection, Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Annotated, NotRequired
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import AfterValidator, TypeAdapter
 from typing_extensions import TypedDict  # as pydantic needs it below Python 3.12
@@ -40,8 +40,6 @@ class PairState(TypedDict):
     """Candidates that geometry confirmed."""
     ledger: str
     """Key of the ledger; empty where the pair was left out."""
-    reason: NotRequired[str]
-    """Why it was left out."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 
 from vplog.data import Closures, Floats, Ints, Keyframes, Odometry, PoseGraph, Trajectory, Verdict
 from vplog.graph import joint as graph_joint
-from vplog.graph.build import busier
+from vplog.graph.build import busier, subgraph
 from vplog.graph.correct_trajectory import correct_trajectory
 from vplog.graph.refine import Refined, about_odometry
 from vplog.loops.false_rate import log_odds_false
@@ -59,14 +59,7 @@ def own_drive(graph: PoseGraph, weight: Floats, closures: Closures) -> graph_joi
     metric = np.array([closures.scale[row] != "none" for row in used.tolist()], bool)
     of_odometry = by_odometry(graph, closures, np.concatenate([used[metric], used[~metric]]))
     edges = np.flatnonzero(odometry | (weight > 0.5))
-    own = replace(
-        graph,
-        a=graph.a[edges],
-        b=graph.b[edges],
-        a_from_b=graph.a_from_b[edges],
-        information=graph.information[edges],
-        kind=[graph.kind[edge] for edge in edges.tolist()],
-    )
+    own = subgraph(graph, np.arange(len(graph.world_from_body)), edges)
     return graph_joint.SessionGraph(own, of_odometry[edges])
 
 

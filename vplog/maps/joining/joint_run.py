@@ -17,13 +17,8 @@ from vplog.execution.execution import Execution
 from vplog.execution.timing import StageTimer
 from vplog.geometry import tum
 from vplog.loops.verify import Drive, calibration_share, drive_of, no_closures
-from vplog.maps.joining.inter_session import (
-    CameraDrive,
-    PlacesByCamera,
-    candidates_among,
-    closures_by_cameras,
-    likely_pairs,
-)
+from vplog.maps.joining import inter_session
+from vplog.maps.joining.inter_session import CameraDrive, PlacesByCamera
 from vplog.maps.joining.joint_graph import SolvedDrive, own_drive, pair_record, solve_drives, write_drive
 from vplog.pipeline import Pipeline, Run
 from vplog.pipeline import run as run_alone
@@ -54,14 +49,9 @@ class DriveRun:
 
 
 def run_joint(
-    paths: Sequence[Path],
-    out: Path,
-    pipeline: Pipeline,
-    library: Path | None = None,
-    topics: logs.TopicChoice | None = None,
-    execution: Execution = Execution(),
-    cache: CacheOptions = CacheOptions(),
-) -> dict[str, Any]:
+    paths: Sequence[Path], out: Path, pipeline: Pipeline, library: Path | None = None,
+    topics: logs.TopicChoice | None = None, execution: Execution = Execution(), cache: CacheOptions = CacheOptions(),
+) -> dict[str, Any]:  # fmt: skip
     """Run each drive into a folder of its own in `out`, join them, and return the record in its run.json.
 
     What `out` holds stays until all is done; a run that has another log is replaced with `cache.force` only. All drives
@@ -143,14 +133,15 @@ def _ledgers(drives: Sequence[DriveRun], state: PlaceState, pipeline: Pipeline, 
     ]
     later = {number: places[number] for number in range(1, len(drives))}
     searched = {number: range(number) for number in later}
-    found = candidates_among(later, places.__getitem__, searched, state, pipeline, execution)
-    likely = {(one.later, one.earlier): one for one in likely_pairs(found, places.__getitem__, state, pipeline.join)}
+    found = inter_session.candidates_among(later, places.__getitem__, searched, state, pipeline, execution)
+    pairs = inter_session.likely_pairs(found, places.__getitem__, state, pipeline.join)
+    likely = {(one.later, one.earlier): one for one in pairs}
 
     def verified(later: int, earlier: int) -> Closures:
         pair = likely.get((later, earlier))
         if pair is None:
             return no_closures()
-        return closures_by_cameras(
+        return inter_session.closures_by_cameras(
             pair, cameras[later], cameras[earlier], pipeline,
             lambda query, match: max(shares[later][query], shares[earlier][match]),
             execution.within(f"{drives[later].name} in {drives[earlier].name}"),

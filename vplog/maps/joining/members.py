@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog import logs
-from vplog.data import Camera, Int32s, Ints
+from vplog.data import Int32s, Ints
 from vplog.errors import LogError, ResultError
 from vplog.features.store import FeatureStore
 from vplog.loops.calibration import turning_pairs
@@ -112,21 +112,16 @@ def member_of(store: Store, about: dict[str, Any]) -> Member:
     )  # fmt: skip
 
 
-def opened_log(member: Member, check: bool = False) -> Log:
-    """The log of a drive. Raises LogError where it is not there any more or, with `check`, has changed."""
+def opened_log(member: Member) -> Log:
+    """The log of a drive. Raises LogError where it is not there any more, or has changed."""
     path = stored_log(member.log, f"The log of {member.drive}", "Give it again: vplog batch LOG -o MAP")
     try:
-        log, found = logs.open_drive([path], member.topics), hash_inputs(path) if check else {}
+        log, found = logs.open_drive([path], member.topics), hash_inputs(path)
     except OSError as error:
         raise LogError(f"The log of {member.drive}, {path}, cannot be read: {error.strerror or error}.") from None
     if any(member.inputs.get(name) != text for name, text in found.items()):
         raise LogError(f"The log of {member.drive}, {path}, has changed since. Run `vplog batch` with it again.")
     return log
-
-
-def camera_of(member: Member) -> Camera:
-    """The camera that the drive's run computed with. Raises LogError where its log is gone."""
-    return recorded_camera({"calibrations": member.calibrations}, member.camera, opened_log(member).camera())
 
 
 @dataclass(frozen=True)
@@ -146,11 +141,16 @@ class CameraTrust:
         return self, *self.further
 
 
+def untried_camera(member: Member) -> CameraTrust:
+    """The camera that the drive's run computed with, as calibrated. Raises ResultError."""
+    camera = recorded_camera({"calibrations": member.calibrations}, member.camera)
+    return CameraTrust(plain(dict(vars(camera))), 0.0)
+
+
 def camera_trust(member: Member, verify: VerifySettings, execution: Execution) -> CameraTrust:
-    """The camera of the log, its rotations compared with the odometry's. Raises LogError where the log is gone."""
-    camera = camera_of(member)
-    unknown = CameraTrust(plain(dict(vars(camera))), 0.0)
-    if camera.matrix is None:
+    """The camera of the drive's run, its rotations compared with the odometry's. Raises VplogError."""
+    unknown = untried_camera(member)
+    if unknown.camera["matrix"] is None:
         return unknown
     with opened_drive(member, unknown, verify, execution) as (drive, fetch):
         pairs, around = turning_pairs(drive.keyframes, verify.calibration), verify.landmarks.neighbours
@@ -203,7 +203,7 @@ def opened_drive(
         if features is not None:
             stack.enter_context(closing(features))
         elif (features := _from_run(member)) is None:
-            log = opened_log(member, check=True)
+            log = opened_log(member)
             store = stack.enter_context(FeatureStore(stack.enter_context(scratch("features")) / "features"))
             features = ReextractedFeatures(log, keyframes.stamp_ns, member.pipeline, store, execution)
         yield drive_of(keyframes, camera, features.__getitem__, verify), getattr(features, "fetch", lambda _: None)

@@ -24,7 +24,7 @@ from vplog.loops.verify import VerifySettings
 from vplog.maps.geo_bounds import earth_of_run
 from vplog.maps.joining.drive_pairs import known_camera
 from vplog.maps.joining.joint_record import Component, joint_components, keyframe_poses
-from vplog.maps.joining.members import CameraTrust, camera_of, member_of, opened_drive
+from vplog.maps.joining.members import member_of, opened_drive, untried_camera
 from vplog.maps.search.exact import NO_SCORE, best_places
 from vplog.maps.search.index import SegmentView, pictures_of, update_index
 from vplog.maps.search.query import open_map
@@ -42,7 +42,7 @@ from vplog.results.run_cameras import camera_pictures
 from vplog.run.landmarks import landmark_key, landmarks_file, run_drive, write_drive_landmarks
 from vplog.run.provenance import library_at
 from vplog.stages import CodedState, PlaceState
-from vplog.storage.json_records import key_of, plain
+from vplog.storage.json_records import key_of
 from vplog.storage.remote_path import RemotePath, original
 from vplog.storage.scratch import scratch
 
@@ -285,8 +285,7 @@ def _map_landmarks(
     @contextmanager
     def drive() -> Iterator[Drive]:
         trust = known_camera(store, of_drive, pipeline)
-        known = None if trust is None else trust.each[camera]
-        known = known or CameraTrust(plain(dict(vars(camera_of(member)))), 0.0)
+        known = untried_camera(member) if trust is None else trust.each[camera]
         with opened_drive(member, known, member.pipeline.verify, execution) as (found, fetch):
             fetch(np.arange(len(found.keyframes.stamp_ns)))
             yield found

@@ -34,7 +34,10 @@ def localize_paths(
 
     `out` is a table (.parquet) or a trajectory (.tum): of the cameras of pictures, or of the body of a log.
     """
-    _check_out(out)
+    if out is not None:
+        if out.suffix not in (".parquet", ".tum"):
+            raise ResultError(f"Cannot write {out}: poses are a table or a trajectory. Name FILE.parquet or FILE.tum.")
+        check_file_output(out)
     is_log = len(paths) == 1 and not logs.is_image_file(paths[0])
     log = logs.open(paths[0], topics) if is_log else logs.open_images(paths, topics)
     with opened(root, execution) as places:
@@ -61,14 +64,6 @@ def localize_paths(
             "warnings": log.warnings + warnings + places.warnings,
             "answers": records,
         }
-
-
-def _check_out(out: Path | None) -> None:
-    if out is None:
-        return
-    if out.suffix not in (".parquet", ".tum"):
-        raise ResultError(f"Cannot write {out}: poses are a table or a trajectory. Name FILE.parquet or FILE.tum.")
-    check_file_output(out)
 
 
 def _joined(

@@ -25,7 +25,7 @@ from vplog.execution.execution import Execution
 from vplog.maps.search.segment import SUFFIX, Content, Segment, open_segment, write_segment
 from vplog.maps.storage.contents import library_mismatch
 from vplog.maps.storage.damage import DamagedDriveError, files_of, reading_drive
-from vplog.maps.storage.layout import ADD_AGAIN
+from vplog.maps.storage.layout import ADD_AGAIN, grouped
 from vplog.results import tables
 
 if TYPE_CHECKING:
@@ -166,14 +166,7 @@ def _plan_compaction(
             counts = np.diff(part.segment.first).tolist()
             alive = zip(part.segment.contents, counts, part.numbers.tolist(), strict=True)
             places |= {one: count for one, count, number in alive if number >= 0}
-    groups, held = list[list[Content]](), 0
-    for one in sorted(places):
-        if not groups or held + places[one] > CAPACITY:
-            groups.append([])
-            held = 0
-        groups[-1].append(one)
-        held += places[one]
-    return absorbed, groups
+    return absorbed, list(grouped(sorted(places), places.__getitem__, CAPACITY))
 
 
 def _build(store: Store, group: Sequence[Content], state: CodedState, execution: Execution) -> Segment:

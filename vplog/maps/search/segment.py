@@ -13,12 +13,11 @@ hash of its header: drives of the same content make the same file under the same
 from __future__ import annotations
 
 import hashlib
-import json
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
@@ -32,7 +31,6 @@ from vplog.storage.scratch import replacing
 
 SUFFIX = ".lists"
 _MAGIC = b"vplists\n"
-_FORMAT = 2
 _CRC_BYTES = 4
 _ALIGNED = 64
 """Bytes; a line of the cache, and more than any number needs."""
@@ -69,7 +67,7 @@ class Segment:
     def header(self) -> bytes:
         places = np.diff(self.first).tolist()
         record = {
-            "format": _FORMAT,
+            "format": 2,
             "library": self.library,
             "block": self.lists.block,
             "references": self.lists.start.shape[0],
@@ -119,6 +117,7 @@ class _Drive(BaseModel, strict=True):
 
 
 class _Header(BaseModel, strict=True):
+    format: Literal[2]
     library: str
     block: Annotated[int, Field(gt=0, le=MOST_ROWS)]
     references: Annotated[int, Field(ge=0, le=65_535)]
@@ -127,10 +126,6 @@ class _Header(BaseModel, strict=True):
     """16 windows along each side, as the settings have it."""
     entries: Annotated[int, Field(ge=0, le=2**48)]
     drives: list[_Drive]
-
-
-class _OtherVersionError(Exception):
-    """The format of a segment is not _FORMAT."""
 
 
 def open_segment(path: Path) -> Segment:
@@ -150,9 +145,8 @@ def open_segment(path: Path) -> Segment:
     except OSError as error:
         raise ResultError(f"{path} cannot be read: {error.strerror or error}.") from None
     except ResultError as error:
-        raise ResultError(f"{path} is damaged. {error} Remove it: the next query builds it again.") from None
-    except _OtherVersionError:
-        raise ResultError(f"{path} is of another version of vplog. The index is built again without it.") from None
+        what = f"{path} is damaged, or of another version of vplog. {error}"
+        raise ResultError(f"{what} Remove it: the next query builds it again.") from None
 
 
 def _parsed(whole: Bytes) -> Segment:
@@ -183,15 +177,9 @@ def _parsed(whole: Bytes) -> Segment:
 def _header(text: bytes) -> _Header:
     """The header, every value within its limits. Raises ResultError."""
     try:
-        header = json.loads(text)
-    except (ValueError, RecursionError):
-        raise ResultError("Its header is not JSON.") from None
-    if isinstance(header, dict) and type(header.get("format")) is int and header["format"] != _FORMAT:
-        raise _OtherVersionError
-    try:
-        return _Header.model_validate(header)
+        return _Header.model_validate_json(text)
     except ValidationError:
-        raise ResultError("Its header lacks a value, or has an impossible one.") from None
+        raise ResultError("Its header is not JSON, lacks a value, or has an impossible one.") from None
 
 
 def _shapes(header: _Header, places: int) -> Sequence[tuple[str, tuple[int, ...]]]:

@@ -149,7 +149,7 @@ class NewestState:
         """What differs where the map does: of a folder, times of what is replaced and of what is renamed into it."""
         if isinstance(self.root, RemotePath):
             found = objects.get_with_version(self.root / "map.json")
-            return None if found is None else found.version
+            return found and found[1]
         names = ("map.json", "runs", "removed.json", "joint.json")
         return [(self.root / name).stat().st_mtime_ns for name in names if (self.root / name).exists()]
 

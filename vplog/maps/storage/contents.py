@@ -14,15 +14,9 @@ from urllib.parse import unquote
 
 from vplog.errors import LibraryError, NewerError, ResultError, nearest_path
 from vplog.maps.geo_bounds import earth_from_record
+from vplog.maps.storage import damage
 from vplog.maps.storage.catalogue import Entry, read_catalogue, state_of, write_catalogue
-from vplog.maps.storage.damage import (
-    DamagedDriveError,
-    UnreachableError,
-    check_run_tables,
-    damaged_files,
-    reading_drive,
-    rows_of,
-)
+from vplog.maps.storage.damage import DamagedDriveError, UnreachableError, reading_drive
 from vplog.maps.storage.layout import FORMAT, HASH, RUN_TABLES, drive_record, folder_name, write_changed
 from vplog.maps.storage.remote_map import Mirror
 from vplog.maps.storage.upload import send_rest, update_failures, write_head
@@ -112,18 +106,14 @@ class Store:
     def damaged_files(self, drive: str) -> list[str]:
         """A line for each file of a drive that is not as it was written; of a map on a store, by what the store says of
         them. Raises UnreachableError."""
-        return damaged_files(self.run(drive)) if self.mirror is None else self.mirror.damaged_files(drive)
-
-    def is_present(self, drive: str) -> bool:
-        """Whether nothing of a drive of a folder is removed yet. Of one that failed there is its failure alone."""
-        return (self.root / "runs" / folder_name(drive)).is_dir() or drive in self.failures()
+        return damage.damaged_files(self.run(drive)) if self.mirror is None else self.mirror.damaged_files(drive)
 
     def rows(self, name: str, drive: str) -> int:
         """Rows of a table of a drive, by its footer. Raises DamagedDriveError."""
         if self.mirror is not None:
             return int(self.mirror.drives[drive]["files"].get(f"{name}.parquet", {}).get("rows", 0))
         with reading_drive(drive):
-            return rows_of(self.run(drive) / f"{name}.parquet")
+            return damage.rows_of(self.run(drive) / f"{name}.parquet")
 
     def earth(self, drive: str) -> Earth | None:
         """The georeference of a drive, None where it has none. Raises DamagedDriveError."""
@@ -190,25 +180,22 @@ class Store:
             if name in removed or not name.startswith("drive="):
                 continue
             state, (known, record) = state_of(f"{self.root}/runs/{name}"), self._catalogue.get(name, (None, {}))
-            if state is not None and state == known:
-                if record["drive"] not in self.damaged:
-                    found[record["drive"]] = record
-                continue
-            folder = self.root / "runs" / name
-            if not any((folder / one).exists() for one in ("drive.json", *RUN_TABLES)):
-                continue
-            try:
-                record = self._checked_record(folder)
-            except NewerError:
-                raise
-            except ResultError as error:
-                self.damaged.setdefault(_drive_of(folder), str(error))
-            else:
+            if state is None or state != known:
+                folder = self.root / "runs" / name
+                if not any((folder / one).exists() for one in ("drive.json", *RUN_TABLES)):
+                    continue
+                try:
+                    record = self._checked_record(folder)
+                except NewerError:
+                    raise
+                except ResultError as error:
+                    self.damaged.setdefault(_drive_of(folder), str(error))
+                    continue
                 self.uncatalogued.add(name)
                 if state is not None:
                     self._catalogue[name] = [state, record]
-                if record["drive"] not in self.damaged:
-                    found[record["drive"]] = record
+            if record["drive"] not in self.damaged:
+                found[record["drive"]] = record
         return dict(sorted(found.items()))
 
     @cached_property
@@ -228,12 +215,12 @@ class Store:
         """drive.json of a run folder whose tables are there. Raises ResultError."""
         record = drive_record(folder)
         try:
-            check_run_tables(folder, record)
+            damage.check_run_tables(folder, record)
         except ResultError:
             if _identity(folder) is None:
                 raise
             record = drive_record(folder)  # of a folder that was replaced meanwhile
-            check_run_tables(folder, record)
+            damage.check_run_tables(folder, record)
         return record
 
     def read(self, drive: str, reader: Callable[[Path], T], names: Iterable[str] = RUN_TABLES) -> T:
@@ -273,14 +260,10 @@ class Store:
 
     def failures(self) -> dict[str, dict[str, Any]]:
         """Log and error of each drive that failed when it was last tried, by ID; none where the record is damaged."""
-        return self._failures()[0]
+        return self.failures_or_damage()[0]
 
-    @property
-    def failures_damage(self) -> str:
-        """Why it is not known what failed; empty where it is."""
-        return self._failures()[1]
-
-    def _failures(self) -> tuple[dict[str, dict[str, Any]], str]:
+    def failures_or_damage(self) -> tuple[dict[str, dict[str, Any]], str]:
+        """`failures`, and why it is not known what failed; empty where it is."""
         if self.mirror is not None:
             return self.mirror.manifest.now["failures"], ""
         path = self.root / "failures.json"

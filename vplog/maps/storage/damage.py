@@ -7,8 +7,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-
 from vplog.errors import LibraryError, NewerError, ResultError
 from vplog.maps.geo_bounds import earth_of_run, earth_record
 from vplog.maps.storage.layout import ADD_AGAIN, FORMAT, RUN_TABLES, drive_record, sha256_of
@@ -63,19 +61,17 @@ def damaged_files(folder: Path) -> list[str]:
 def damaged_table(path: Path) -> str:
     """Why a table cannot be read or is not as it was written, in one line; empty where it is sound."""
     try:
-        open_table(path).close()
-    except (OSError, ValueError, pa.ArrowException, ResultError) as error:
-        return f"{path}: {str(error).splitlines()[0]}"
+        with tables.reading(path, "", ""):
+            open_table(path).close()
+    except ResultError as error:
+        return str(error)
     return ""
 
 
 def rows_of(path: Path) -> int:
     """Rows of a table, by its footer. Raises ResultError."""
-    try:
+    with tables.reading(path, again := f"Check its permissions, or {ADD_AGAIN}", again):
         return read_footer(path).num_rows
-    except (OSError, ValueError, pa.ArrowException) as error:
-        why = str(error).splitlines()[0]
-        raise ResultError(f"{path} cannot be read: {why} Check its permissions, or {ADD_AGAIN}") from None
 
 
 def complete_record(made: Path, hashed: bool) -> None:

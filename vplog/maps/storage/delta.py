@@ -15,32 +15,30 @@ import json
 import secrets
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
+from urllib.parse import quote
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from vplog.data import Ints
 from vplog.errors import ResultError
 from vplog.maps.storage import delta_log, objects
 from vplog.maps.storage.contents import Store, skip_damaged
 from vplog.maps.storage.damage import files_of, reading_drive
-from vplog.maps.storage.layout import TABLES
+from vplog.maps.storage.layout import TABLES, grouped
 from vplog.maps.storage.snapshot import store_errors
 from vplog.results import tables
 from vplog.storage import remote_path
 from vplog.storage.json_records import has_checksum, key_of, with_checksum
-from vplog.storage.object_store import plain_errors
 from vplog.storage.parquet_limits import check_version
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.scratch import scratch
-
-if TYPE_CHECKING:
-    from obstore.store import ObjectStore
 
 _FORMAT = 1
 """Version of the commits."""
@@ -57,37 +55,10 @@ PATIENCE_S = 60.0
 """Time from one commit of a batch to the next."""
 
 
-@dataclass(frozen=True)
-class _Folder:
-    """A local folder as objects of a store, as a RemotePath is."""
-
-    store: ObjectStore
-    name: str = ""
-
-    def __truediv__(self, name: str) -> _Folder:
-        return _Folder(self.store, f"{self.name}/{name}".lstrip("/"))
-
-    @property
-    def place(self) -> tuple[ObjectStore, str]:
-        return self.store, self.name
-
-    @property
-    def prefix_length(self) -> int:
-        return len(f"{self.name}/".lstrip("/"))
-
-    def ask(self, verb: str, *given: Any, upload: bool = False, **options: Any) -> Any:
-        with plain_errors():
-            return getattr(self.store, verb)(self.name, *given, **options)
-
-
 def _place(store: Store) -> RemotePath:
     """MAP/delta."""
-    if store.mirror is not None:
-        return store.mirror.remote / "delta"
-    from obstore.store import LocalStore
-
-    with store_errors(cast("RemotePath", store)), plain_errors():
-        return cast("RemotePath", _Folder(LocalStore(store.root / "delta", mkdir=True)))
+    root = RemotePath(f"file://{quote(str(store.root.resolve()))}") if store.mirror is None else store.mirror.remote
+    return root / "delta"
 
 
 def is_present(store: Store) -> bool:
@@ -246,31 +217,21 @@ def _write_files(
 ) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
     """Write drives as files: these by name, and the schemas of the tables."""
     found, schemas = dict[str, dict[str, Any]](), dict[str, str]()
-    for group in _groups(store, drives):
+
+    def sizes(drive: str) -> Ints:
+        held = store.sizes(drive)
+        return np.array([held.get(f"{name}.parquet", 0) for name in TABLES])
+
+    for group in grouped(drives, sizes, _FILE_BYTES):
         name = f"part-{secrets.token_hex(16)}"
         with scratch("delta") as folder:
             counts, plain = _write_drives(store, folder, group)
             schemas = {table: delta_log.schema_string(schema) for table, schema in plain.items()}
-            sizes = {table: ((folder / table).stat().st_size, rows) for table, rows in counts.items() if rows}
-            for table in sizes:
+            written = {table: ((folder / table).stat().st_size, rows) for table, rows in counts.items() if rows}
+            for table in written:
                 remote_path.send(place / f"{table}/{name}.parquet", folder / table)
-        found[name] = {"drives": {drive: drives[drive] for drive in group}, "tables": sizes}
+        found[name] = {"drives": {drive: drives[drive] for drive in group}, "tables": written}
     return found, schemas
-
-
-def _groups(store: Store, drives: Iterable[str]) -> Iterator[list[str]]:
-    """Drives that come into one file."""
-    group, held = list[str](), dict.fromkeys(TABLES, 0)
-    for drive in drives:
-        sizes = store.sizes(drive)
-        more = {name: held[name] + sizes.get(f"{name}.parquet", 0) for name in TABLES}
-        if group and max(more.values()) > _FILE_BYTES:
-            yield group
-            group, more = [], {name: more[name] - held[name] for name in TABLES}
-        group.append(drive)
-        held = more
-    if group:
-        yield group
 
 
 def _write_drives(store: Store, folder: Path, drives: Sequence[str]) -> tuple[dict[str, int], dict[str, pa.Schema]]:
@@ -284,8 +245,11 @@ def _write_drives(store: Store, folder: Path, drives: Sequence[str]) -> tuple[di
             writers[name].write_table(rows, max(len(rows), 1))
             held[name].clear()
 
+        def read_all(run: Path) -> dict[str, pa.Table]:
+            return {name: tables.read_arrow(run / f"{name}.parquet") for name in TABLES}
+
         for drive in drives:
-            for name, table in store.read(drive, _read_all, [f"{name}.parquet" for name in TABLES]).items():
+            for name, table in store.read(drive, read_all, [f"{name}.parquet" for name in TABLES]).items():
                 schema = delta_log.plain_schema(table.schema)
                 if name not in writers:
                     options: Any = {"compression": "zstd", "store_schema": False, "write_page_checksum": True}
@@ -304,10 +268,6 @@ def _write_drives(store: Store, folder: Path, drives: Sequence[str]) -> tuple[di
         for name in filter(held.get, TABLES):
             write(name)
     return counts, {name: writer.schema for name, writer in writers.items()}
-
-
-def _read_all(folder: Path) -> dict[str, pa.Table]:
-    return {name: tables.read_arrow(folder / f"{name}.parquet") for name in TABLES}
 
 
 def _write_logs(place: RemotePath, commits: Sequence[delta_log.Commit]) -> None:

@@ -141,7 +141,7 @@ def log_entry(commit: Commit, table: str) -> bytes:
     actions += [
         {"remove": {"path": f"{name}.parquet", **removed}}
         for name, file in commit["removed"].items()
-        if _in(file, table)
+        if table in file["tables"]
     ]
     actions += [{"add": add} for add in _adds(commit["added"], table, commit)]
     return "".join(json.dumps(action, ensure_ascii=False) + "\n" for action in actions).encode()
@@ -166,16 +166,11 @@ def _metadata(commit: Commit, table: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _in(file: dict[str, Any], table: str) -> bool:
-    """Whether a table has rows in a file."""
-    return table in file["tables"]
-
-
 def _adds(files: dict[str, Any], table: str, commit: Commit) -> list[dict[str, Any]]:
     """Files of a table, with the least and greatest drive of each, by which readers pass files over."""
     found = []
     for name, file in files.items():
-        if _in(file, table):
+        if table in file["tables"]:
             size, rows = file["tables"][table]
             stats = {"numRecords": rows, "minValues": {"drive": min(file["drives"])}}
             stats |= {"maxValues": {"drive": max(file["drives"])}, "nullCount": {"drive": 0}}

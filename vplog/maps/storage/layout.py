@@ -6,12 +6,13 @@ import hashlib
 import os
 import re
 import shutil
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path, PurePath
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 from urllib.parse import quote
 
+import numpy as np
 from pydantic import AfterValidator
 
 from vplog.errors import NewerError, ResultError
@@ -20,6 +21,7 @@ from vplog.run.cache.code_hash import code_of
 from vplog.storage.folders import is_below, numbered
 from vplog.storage.json_records import CHECKSUM, canonical_json, key_of, plain
 
+T = TypeVar("T")
 FORMAT = run_record.FORMAT
 """Version of this layout. A reader refuses a newer one."""
 TABLES = ("keyframes", "descriptors", "closures", "edges", "trajectory")
@@ -108,11 +110,26 @@ def link(source: str | Path, target: str | Path) -> str | Path:
     changes a file, each replaces it. Raises OSError."""
     try:
         os.link(source, target)
-    except FileNotFoundError:
-        raise
     except OSError:
         shutil.copyfile(source, target)
     return target
+
+
+def grouped(
+    items: Iterable[T], size: Callable[[T], Any], most: int, alike: Callable[[T], Any] = lambda _: None
+) -> Iterator[list[T]]:
+    """The items for one file after the other, in their order: alike ones whose sizes, or arrays of sizes, add up to
+    `most` or less. A larger one has a group of its own."""
+    group, held = list[T](), 0
+    for one in items:
+        more = size(one)
+        if group and (np.max(held + more) > most or alike(one) != alike(group[0])):
+            yield group
+            group, held = [], 0
+        group.append(one)
+        held = held + more
+    if group:
+        yield group
 
 
 def sha256_of(path: Path) -> str:

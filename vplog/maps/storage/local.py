@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import ctypes
-import fcntl
 import os
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
 from vplog.errors import ResultError, SettingsError
 from vplog.maps.storage.contents import Store
 from vplog.maps.storage.damage import complete_record
 from vplog.maps.storage.layout import ADD_AGAIN, TABLES, drive_record, folder_name, sha256_of
+from vplog.results import staging
 from vplog.storage.folders import check_regular, regular_files
-from vplog.storage.scratch import made_folder, replacing, sync, sync_all
+from vplog.storage.scratch import replacing, sync, sync_all
 
 _HERE, _EXCHANGE = -100, 2
 """AT_FDCWD and RENAME_EXCHANGE of renameat2(2)."""
@@ -29,26 +29,12 @@ def locked(root: Path) -> Iterator[None]:
         if others:
             raise SettingsError(f"{root} holds other things ({others[0]}), not a map. Choose another folder with -o.")
     check_regular(root)
-    with ExitStack() as stack:
-        try:
-            stack.enter_context(made_folder(root))
-            lock = stack.enter_context((root / ".lock").open("a"))
-        except OSError as error:
-            raise SettingsError(
-                f"Cannot write to {root}: {error.strerror}. Check its permissions, or choose another folder."
-            ) from None
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise SettingsError(f"Another vplog process is writing to {root}. Wait for it to end.") from None
-        except OSError as error:  # file systems without locks
-            raise SettingsError(f"Cannot lock {root}/.lock: {error.strerror}. Choose another folder with -o.") from None
+    with staging.locked(root, name=".lock", needed=True):
         try:
             yield
         finally:
             if not (root / "map.json").exists():  # nothing came of it
                 shutil.rmtree(root / ".staging", ignore_errors=True)
-                (root / ".lock").unlink(missing_ok=True)
 
 
 def recover(store: Store) -> None:

@@ -65,12 +65,16 @@ def reading(root: Path, cache: Cache | None = None, as_of: str | None = None) ->
 
 
 @contextmanager
-def writing(root: Path) -> Iterator[Store]:
+def writing(root: Path, *, there: bool = False) -> Iterator[Store]:
     """The map for a writer, made where it is not there yet; drives that a killed writer had finished are put in.
 
     A folder has one writer at a time, an object store any number. Raises SettingsError where the folder holds other
-    things, or where another process writes.
+    things, or where another process writes, and ResultError, with nothing made, where the map is to be `there` and is
+    not.
     """
+    if there:
+        with reading(root) as store:
+            store.head()
     if isinstance(root, RemotePath):
         with _writing_remote(root) as store:
             yield store
@@ -160,7 +164,8 @@ def remove(store: Store, drives: Sequence[str]) -> None:
         _finish_removals(store)
     except ResultError as error:
         out = f"{error} {named} removed from {store}; the next command that writes to it deletes the rest of the files."
-        if all(map(store.is_present, drives)):
+        # of a drive that failed there is its failure alone
+        if all((store.root / "runs" / folder_name(one)).is_dir() or one in store.failures() for one in drives):
             with suppress(ResultError):  # where that cannot be taken back they are out
                 store.write_removed([])
                 out = f"{error} {named} in {store} as before."

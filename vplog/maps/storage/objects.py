@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, cast
 
 from vplog.maps.storage.layout import sha256_of
 from vplog.storage import remote_path
@@ -22,13 +22,6 @@ AT_ONCE = 16
 """Requests at once: a store answers each in some 20 to 50 ms, whatever its size."""
 Version = dict[str, str]
 """State of an object: its ETag, on gs:// its generation."""
-
-
-class Versioned(NamedTuple):
-    """An object in one of its states."""
-
-    data: bytes
-    version: Version
 
 
 def put_if(path: RemotePath, data: bytes, version: Version | None) -> Version | None:
@@ -50,14 +43,14 @@ def _version(about: ObjectMeta | PutResult) -> Version:
 def get(path: RemotePath) -> bytes | None:
     """The bytes of an object, None where there is none. Raises OSError."""
     found = get_with_version(path)
-    return None if found is None else found.data
+    return found and found[0]
 
 
-def get_with_version(path: RemotePath) -> Versioned | None:
-    """An object, all of one state also while it is replaced; None where there is none. Raises OSError."""
+def get_with_version(path: RemotePath) -> tuple[bytes, Version] | None:
+    """An object and its state, of one moment also while it is replaced; None where there is none. Raises OSError."""
     with suppress(FileNotFoundError), plain_errors():
         found = path.ask("get")
-        return Versioned(bytes(found.bytes()), _version(found.meta))
+        return bytes(found.bytes()), _version(found.meta)
     return None
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from itertools import compress
@@ -23,6 +23,7 @@ import zstandard
 
 from vplog.maps.storage import objects
 from vplog.maps.storage.damage import DamagedDriveError
+from vplog.maps.storage.layout import grouped
 from vplog.maps.storage.remote_map import MOST_SECTION, Mirror, tag_of
 from vplog.maps.storage.snapshot import Snapshot, now, store_errors
 from vplog.maps.storage.upload import check_recent
@@ -79,14 +80,8 @@ def _plan(mirror: Mirror) -> list[list[_Member]]:
     poor = unused | {token for token in used if used[token] < _PACK_BYTES / 2}
     if len(poor) == 1 and all("pack" in about for _, _, about in small):
         poor = unused
-    groups, held = list[list[_Member]](), _PACK_BYTES
-    for member in small:
-        if "pack" not in member[2] or member[2]["pack"]["token"] in poor:
-            held += member[2]["bytes"]
-            if held > _PACK_BYTES:
-                groups.append([])
-                held = member[2]["bytes"]
-            groups[-1].append(member)
+    again = [one for one in small if "pack" not in one[2] or one[2]["pack"]["token"] in poor]
+    groups = grouped(again, lambda one: one[2]["bytes"], _PACK_BYTES)
     return [sorted(group, key=lambda member: (member[1], member[0])) for group in groups]
 
 
@@ -107,7 +102,7 @@ def _write(mirror: Mirror, path: Path, members: Sequence[_Member]) -> list[dict[
     """Write a pack; the place of each file in it, but for its token."""
     places = list[dict[str, Any]]()
     with path.open("wb") as stream:
-        for section in _sections(members):
+        for section in grouped(members, lambda one: one[2]["bytes"], MOST_SECTION, lambda one: one[1]):
             parts = [(mirror.run(drive) / name).read_bytes() for drive, name, _ in section]
             start = stream.tell()
             stop = start + stream.write(zstandard.ZstdCompressor(level=_LEVEL).compress(b"".join(parts)))
@@ -116,19 +111,6 @@ def _write(mirror: Mirror, path: Path, members: Sequence[_Member]) -> list[dict[
                 places.append({"section": [start, stop], "at": at})
                 at += len(part)
     return places
-
-
-def _sections(members: Sequence[_Member]) -> Iterator[list[_Member]]:
-    """Files of one name, of up to MOST_SECTION bytes."""
-    section, held = list[_Member](), 0
-    for member in members:
-        if section and (member[1] != section[0][1] or held + member[2]["bytes"] > MOST_SECTION):
-            yield section
-            section, held = [], 0
-        section.append(member)
-        held += member[2]["bytes"]
-    if section:
-        yield section
 
 
 def _replace(

@@ -108,9 +108,7 @@ class Mirror:
         return self.manifest.version is not None
 
     def commit(self, what: str, change: Callable[[Snapshot], object]) -> None:
-        """Make a change to the map. Raises ResultError where it is open for reading alone, or the change does."""
-        if not self.writable:
-            raise ResultError(f"{self.remote} is open for reading alone.")
+        """Make a change to a map that is open for writing. Raises ResultError where the change does."""
 
         def changed(snapshot: Snapshot) -> None:
             snapshot["copies"] = {

@@ -113,8 +113,6 @@ class _Drive(TypedDict):
     """Figures of its run.json."""
     packed: NotRequired[str]
     """When files of its folder were put into a pack, in UTC: from then on they are replaced."""
-    component: NotRequired[str | None]
-    """Folder of its joint graph."""
 
 
 class _Layer(TypedDict):
@@ -185,11 +183,11 @@ class Manifest:
         place = self.remote / "map.json"
         with store_errors(self.remote):
             found = objects.get_with_version(place)
-            self.version = None if found is None else found.version
+            data, self.version = found or (b"", None)
             if found is None:
                 self.log, self.now, self.layers = [], empty(), []
                 return
-            head = _json(found.data, place)
+            head = _json(data, place)
             check_version(cast("Path", place), head.get("format"), PACKED_FORMAT, head.get("vplog"))
             try:
                 rows = _ROWS.validate_python(head.get("snapshots", []))

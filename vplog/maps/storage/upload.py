@@ -14,18 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from vplog.errors import ResultError, SettingsError
-from vplog.maps.storage import objects
+from vplog.maps.storage import layout, objects
 from vplog.maps.storage.damage import UnreachableError, complete_record, rows_of
-from vplog.maps.storage.layout import (
-    RUN_TABLES,
-    TABLES,
-    drive_record,
-    folder_name,
-    free_name,
-    renamed,
-    set_drive_id,
-    sha256_of,
-)
+from vplog.maps.storage.layout import TABLES, folder_name
 from vplog.maps.storage.remote_map import Copies, Mirror, drives_in, is_join_state, tag_of
 from vplog.maps.storage.snapshot import LostRaceError, Snapshot, now, store_errors
 from vplog.results import run_record
@@ -114,7 +105,7 @@ def send_run(remote: RemotePath, made: Path, began: float) -> SentRun:
     rows = {f"{name}.parquet": {"rows": rows_of(made / f"{name}.parquet")} for name in TABLES}
     run = run_record.read_run_json(made / "run.json")
     entry = {
-        "record": drive_record(made),
+        "record": layout.drive_record(made),
         "generation": secrets.token_hex(8),
         "files": {},
         "run": {name: run[name] for name in _FIGURES if name in run},
@@ -147,7 +138,7 @@ def publish(mirror: Mirror, drive: str, sent: SentRun, made: Path) -> str:
         mirror.commit(f"{drive} {'replaced' if drive in mirror.drives else 'added'}", change)
     except TakenError:
         shutil.rmtree(made, ignore_errors=True)
-        free = free_name(drive, entry["record"]["log"], mirror.manifest.now["drives"])
+        free = layout.free_name(drive, entry["record"]["log"], mirror.manifest.now["drives"])
         return publish(mirror, free, _renamed(mirror.remote, sent, free), made)
     except LostRaceError:
         _remove_quietly(mirror.remote / sent.place)
@@ -158,7 +149,7 @@ def publish(mirror: Mirror, drive: str, sent: SentRun, made: Path) -> str:
         shutil.rmtree(made, ignore_errors=True)
         return found[0]
     for name in entry["files"]:
-        if name not in RUN_TABLES:  # a batch would fill the disk
+        if name not in layout.RUN_TABLES:  # a batch would fill the disk
             (made / name).unlink(missing_ok=True)
     mirror.adopt(drive, entry, made)
     _copy_committed(mirror, copies.__contains__)
@@ -167,13 +158,13 @@ def publish(mirror: Mirror, drive: str, sent: SentRun, made: Path) -> str:
 
 def _renamed(remote: RemotePath, sent: SentRun, drive: str) -> SentRun:
     """Copy of a run folder under another ID, made within the store. Raises ResultError."""
-    files, name, record = sent.entry["files"], "keyframes.parquet", renamed(sent.entry["record"], drive)
+    files, name, record = sent.entry["files"], "keyframes.parquet", layout.renamed(sent.entry["record"], drive)
     new = SentRun({**sent.entry, "record": record, "generation": secrets.token_hex(8)}, sent.began)
     with scratch("renamed") as folder, store_errors(remote):
         for one in files.keys() - {name}:
             objects.copy(remote / sent.place / one, remote / new.place / one)
         objects.fetch(remote / sent.place / name, folder / name, files[name]["bytes"])
-        set_drive_id(folder / name, drive)
+        layout.set_drive_id(folder / name, drive)
         about = {**files[name], **_send_all([name], folder, remote / new.place)[name]}
     _remove_quietly(remote / sent.place)
     return SentRun({**new.entry, "files": {**files, name: about}}, sent.began)
@@ -189,7 +180,7 @@ def _same_drive(mirror: Mirror, drives: dict[str, Any], record: dict[str, Any]) 
     """The ID of a drive that is made from the same and that another writer has put in since this one looked."""
     known = {drive: entry["generation"] for drive, entry in mirror.drives.items()}
     new = [drive for drive, entry in drives.items() if entry["generation"] != known.get(drive)]
-    return [drive for drive in new if renamed(record, drive)["key"] == drives[drive]["record"]["key"]][:1]
+    return [drive for drive in new if layout.renamed(record, drive)["key"] == drives[drive]["record"]["key"]][:1]
 
 
 def _check_untouched(mirror: Mirror, snapshot: Snapshot, drive: str) -> None:
@@ -300,7 +291,7 @@ def send_rest(mirror: Mirror) -> None:
     known, hashes = mirror.held, dict[str, str]()
     for name in mirror.local_rest():  # parts of the index are named by what is in them
         same = name in known and name.endswith(".lists")
-        hashes[name] = known[name]["sha256"] if same else sha256_of(mirror.local / name)
+        hashes[name] = known[name]["sha256"] if same else layout.sha256_of(mirror.local / name)
     new = [name for name in hashes if hashes[name] != known.get(name, {}).get("sha256")]
     gone = [name for name in known if name not in hashes]
     if not new and not gone:
@@ -308,7 +299,6 @@ def send_rest(mirror: Mirror) -> None:
     generation, began = secrets.token_hex(8), time.time()
     sent = _send_all(new, mirror.local, mirror.remote / "rest" / generation)
     changes = {**{name: {**about, "generation": generation} for name, about in sent.items()}, **dict.fromkeys(gone)}
-    components = _components(mirror.local / "joint.json") if "joint.json" in changes else None
 
     def change(snapshot: Snapshot) -> None:
         check_recent(began)
@@ -321,10 +311,6 @@ def send_rest(mirror: Mirror) -> None:
                 raise LostRaceError(f"Another writer has joined drives of {mirror.remote} at the same time. Run again.")
         there = set(map(folder_name, snapshot["drives"]))
         _replace_rest(snapshot, {name: about for name, about in changes.items() if not drives_in(name) - there})
-        if components is not None:
-            for drive, entry in list(snapshot["drives"].items()):
-                if entry.get("component") != (found := components.get(drive)):
-                    snapshot["drives"][drive] = {**entry, "component": found}
 
     try:
         mirror.commit("joins", change)
@@ -344,15 +330,6 @@ def _replace_rest(snapshot: Snapshot, changes: dict[str, Any]) -> None:
             snapshot["rest"][name] = about
         if name.endswith((".parquet", ".json")):
             snapshot["copies"][name] = None if about is None else f"rest/{about['generation']}/{name}"
-
-
-def _components(path: Path) -> dict[str, str]:
-    """Folder of the joint graph of each drive that is in one."""
-    with suppress(ResultError, KeyError, TypeError):
-        groups = run_record.read_run_json(path)["groups"] if path.exists() else []
-        found = [component for group in groups for component in group["components"]]
-        return {drive: str(component["folder"]) for component in found for drive in component["drives"]}
-    return {}
 
 
 def drop_copies(mirror: Mirror) -> None:
