@@ -21,7 +21,7 @@ import pytest
 
 from tests.batch.test_batch import OPTIONS, QUICK, tables
 from tests.conftest import TINY
-from vplog.batch import ray_cluster, ray_engine
+from vplog.batch import batch, ray_cluster, ray_engine
 from vplog.batch.batch import run_batch
 from vplog.batch.engine import BatchOptions
 from vplog.batch.ray_cluster import ClusterHead
@@ -137,10 +137,11 @@ def test_two_nodes_that_share_nothing_make_the_same_map_though_one_worker_is_kil
             assert not list(folder.glob("run-*"))
     assert not list(root.glob(".cache"))
 
-    monkeypatch.setattr(ray_engine, "_PROBE_S", 600.0)  # a machine that is slow to tell is not refused here
-    monkeypatch.setattr(ray_engine, "made_by", lambda: {"code": "other", "versions": {}})
-    with pytest.raises(SettingsError, match="has vplog's code"):
-        run_batch(logs, root, pipeline, options=BatchOptions(engine="ray", address=cluster.address))
+    monkeypatch.setattr(batch, "made_by", lambda: {"code": "other", "versions": {}})
+    told = run_batch([first_log], root, pipeline, options=BatchOptions(engine="ray", address=cluster.address))
+    [refused] = told["drives"]
+    assert (refused["state"], refused["attempts"]) == ("failed", 1)
+    assert "has another vplog, or other packages" in refused["error"]
 
 
 def test_segments_are_searched_by_the_node_that_has_them(

@@ -23,13 +23,12 @@ from vplog.errors import SettingsError, VplogError, is_of_disk
 from vplog.run.feature_extraction import ExtractionPart, compute_part, missing_parts, parts_of, put_part
 from vplog.storage.remote_path import located, stands_for
 from vplog.storage.scratch import files_in, pieces, scratch, write_pieces
-from vplog.version import __version__
 
 Files = tuple[tuple[str, tuple[Any, ...]], ...]
 
 _OTHER = "{} has another vplog, or other packages, than the machine of the batch. Install the same there."
 _PROBE_S = 60.0
-"""Limit of a probe of the machines' versions; a slower machine is checked with each drive."""
+"""Limit of a probe of the machines' disks; with a slower machine none is taken to be shared."""
 _DRIVE_BYTES = 2**30
 """Memory that Ray reserves for a drive, or what the largest machine has if that is less."""
 
@@ -39,11 +38,11 @@ def ray_engine(address: str | None, threads: int, folder: Path | None) -> Iterat
     """The cluster at `address`, or one of this machine with so many cores that ends with the block.
 
     If its machines see `folder`, of the map, they do more with it. Raises SettingsError where there is no such cluster,
-    or where its machines do not run what this one does.
+    or none of its machines has CPUs.
     """
     with connected(address, threads) as ray, watched_head(ray) as head:
         engine = RayEngine(ray, head, address is None)
-        engine.check_nodes()
+        engine.check_cpus()
         if folder is not None:
             engine.probe_shared_disk(folder)
         yield engine
@@ -114,44 +113,20 @@ class RayEngine:
         """Whether all machines see a folder of this one."""
         sign, content = folder / "visible", secrets.token_hex(16)
         sign.write_text(content, encoding="utf-8")
-        answers = self._on_every_node(sees_file, str(sign), content)
-        self._shares_disk = all(self._answer(answer) is True for answer in answers)
+        affinity = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy
+        nodes = [affinity(node["NodeID"], soft=False) for node in self._ray.nodes() if node["Alive"]]
+        task = self._ray.remote(num_cpus=0, max_retries=0)(sees_file)
+        answers = [task.options(scheduling_strategy=node).remote(str(sign), content) for node in nodes]
+        with suppress(self._ray.exceptions.RayError):  # one has just left, or is slow
+            self._shares_disk = all(self._ray.get(answers, timeout=_PROBE_S))
         sign.unlink()
 
-    def check_nodes(self) -> None:
-        """Raises SettingsError where no machine computes, or one would do so with something else than this one."""
+    def check_cpus(self) -> None:
+        """Raises SettingsError where no machine computes."""
         if max(self._of_nodes("CPU")) < 1:
             raise SettingsError(
                 "No machine of the Ray cluster has CPUs, as with `ray start --num-cpus 0`. Add one that has some."
             )
-        own, answers = made_by(), self._on_every_node(about_node)
-        for answer in self._ray.wait(list(answers), num_returns=len(answers), timeout=_PROBE_S)[0]:
-            found, same = self._answer(answer), f"Install the same there: vplog {__version__}."
-            if isinstance(found, self._ray.exceptions.RayTaskError):
-                raise SettingsError(f"{answers[answer]} cannot run vplog: {found.cause}. {same}")
-            if isinstance(found, BaseException):  # it has just left
-                continue
-            where, other = found
-            for name, ours in {**own["versions"], "vplog's code": own["code"]}.items():
-                theirs = {**other["versions"], "vplog's code": other["code"]}[name]
-                if theirs != ours:
-                    raise SettingsError(f"{where} has {name} {theirs[:12]}, and this machine {ours[:12]}. {same}")
-
-    def _on_every_node(self, function: Callable[..., Any], *args: Any) -> dict[Any, str]:
-        """A task on every machine, whatever else it does; each with the machine's name."""
-        affinity = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy
-        task = self._ray.remote(num_cpus=0, max_retries=0)(function)
-        return {
-            task.options(scheduling_strategy=affinity(node["NodeID"], soft=False)).remote(*args): node["NodeName"]
-            for node in self._ray.nodes()
-            if node["Alive"]
-        }
-
-    def _answer(self, answer: Any) -> Any:
-        try:
-            return self._ray.get(answer, timeout=_PROBE_S)
-        except self._ray.exceptions.RayError as error:
-            return error
 
     def _of_nodes(self, resource: str) -> list[float]:
         self._head.check()
@@ -233,11 +208,6 @@ class RemoteOutcome(Outcome):
 def call(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
     """Any function of a module as a Ray task."""
     return function(*args, **kwargs)
-
-
-def about_node() -> tuple[str, dict[str, Any]]:
-    """The name of this machine, and the code and packages that it would compute with."""
-    return node_name(), made_by()
 
 
 def sees_file(file: str, content: str) -> bool:
