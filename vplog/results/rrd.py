@@ -3,7 +3,6 @@ way on earth and the truth where they are known, and the blueprint that lays the
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from vplog.geometry import se3
 from vplog.results.geo import on_earth
 from vplog.results.mcap_read import read_camera_poses, read_images, read_topics
 from vplog.results.report.page import Tracks, TruthComparison
-from vplog.storage.scratch import put_in_place
+from vplog.storage.scratch import replacing
 
 _GREY, _BLUE, _GREEN, _RED = (150, 150, 150), (60, 130, 240), (40, 200, 80), (230, 50, 50)
 _AMBER, _VIOLET = (240, 180, 30), (170, 90, 220)
@@ -37,24 +36,18 @@ def write_rrd(
         raise ResultError(
             "The .rrd format is written by rerun's SDK, which is not installed: pip install 'vplog[rerun]'"
         ) from None
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     recording = rr.RecordingStream(_APPLICATION, recording_id=f"vplog-{tracks.keyframes.drive}")
-    try:
-        recording.save(part, default_blueprint=_blueprint(tracks, read_topics(result)))
+    with replacing(path) as file:  # rerun's own writer hides a full disk
+        stream = recording.binary_stream()
+        recording.send_blueprint(_blueprint(tracks, read_topics(result)))
         _log(recording, rr, tracks, closures)
         _log_errors(recording, rr, tracks, closures, judged)
         _log_camera(recording, rr, result)
         for row, picture in tracks.found.pictures.items():
             recording.set_time(_TIMELINE, timestamp=_time(tracks.keyframes.stamp_ns[closures.query[row]]))
             recording.log(_PICTURES, rr.EncodedImage(contents=picture, media_type="image/jpeg"))
-        recording.flush()  # raises where the disk is full, which the rest does not
+        file.write(stream.read() or b"")
         recording.disconnect()
-        put_in_place(part, path)
-    except (OSError, RuntimeError) as error:  # rerun's own are the latter
-        reason = getattr(error, "strerror", None) or error
-        raise ResultError(f"Cannot write {path}: {reason}. Free space or choose another folder with -o.") from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _log(recording: Any, rr: Any, tracks: Tracks, closures: Closures) -> None:
