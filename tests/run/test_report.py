@@ -141,7 +141,8 @@ def test_the_page_holds_views_of_the_solution_first(finished: Path, monkeypatch:
 
 
 def test_a_run_without_metres_has_no_length_in_metres(finished: Path) -> None:
-    text = write_page(gather(finished, {"scale": "unknown"}))
+    calibrations = read_run_json(finished / "run.json")["calibrations"]
+    text = write_page(gather(finished, {"scale": "unknown", "calibrations": calibrations}))
     assert "<figcaption>Speed in units of the run/s</figcaption>" in text
     assert ledger(text)["unit"] == "units of the run"
     assert not re.search(r"[0-9.] m\b|in m\b", re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL))

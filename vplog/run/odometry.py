@@ -59,11 +59,12 @@ def read(
     Raises LogError where there is no odometry, or, with `use_gps`, no fix."""
     if use_gps and log.gps() is None:
         raise LogError(NO_FIXES)
+    source = source_of(log, topics)
     camera = camera_of(log, topics, steps)
     odometry = odometry_of(log, topics, camera, steps)
-    if source_of(log, topics) == "visual" and (imu := log.imu()) is not None and not _is_unknown(odometry):
+    if source == "visual" and (imu := log.imu()) is not None and not _is_unknown(odometry):
         odometry = _with_imu(odometry, imu, camera)
-    if topics.camera_height_m is not None and (is_metric(log) or source_of(log, topics) != "visual"):
+    if topics.camera_height_m is not None and (is_metric(log) or source != "visual"):
         _log.warning("--camera-height-m has no effect: the odometry is no single camera's.")
     if not odometry.metric:
         odometry = _with_scale(odometry, log, camera, use_gps)
