@@ -78,7 +78,7 @@ def test_a_folder_comes_back_as_it_went(server: str, tmp_path: Path) -> None:
 
 
 def test_a_map_grows_and_shrinks(server: str) -> None:
-    root: Any = located("gs://bucket/map")
+    root: Any = located("gs://bucket/grows")
     make_map(root, {"one": 1, "two/3 %": 2})
     with map_store.writing(root) as store:
         map_store.remove(store, ["one"])
