@@ -24,7 +24,7 @@ _KNOWN = 6, 1e-3
 """Levenberg-Marquardt steps, and the relative decrease of the error that ends them, far below a sigma of the newest
 pose: a window starts from the last one's result, and two or three converge."""
 _UNKNOWN = 60, 1e-5
-"""The same where the lens is not known: along the valley of focal lengths and depths many steps gain little each."""
+"""Steps and decrease with an unknown lens: along the valley of focal lengths and depths many steps gain little each."""
 _FIXED = 1e-4
 """Sigma of the distance of the two oldest views without depths, as a share of it: nothing else tells it, so it stays as
 it is; a stiffer one has steps rejected that turn the views."""
@@ -111,11 +111,14 @@ def adjust(
 
 
 class _State(NamedTuple):
-    """What is adjusted."""
+    """Variables of the adjustment."""
 
     poses: Floats
+    """(W, 4, 4) world_from_camera."""
     points: Floats
+    """(P, 3)."""
     lens: Floats
+    """(2,) s and k."""
 
 
 @dataclass(frozen=True, eq=False)

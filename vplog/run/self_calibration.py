@@ -1,4 +1,4 @@
-"""The camera that a run computes its motion with: the log's, or one with a lens that its own images tell."""
+"""Self-calibration of a run's camera where nothing calibrates it, by excerpts of the drive, or an assumed lens."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def assumed(camera: Camera) -> Lens:
 
 
 def about_uncalibrated(camera: Camera) -> str:
-    """What a run does about a camera that is not calibrated."""
+    """Remark on an uncalibrated camera before a run: self-calibration, else assumptions."""
     return (
         f"Camera {camera.name} is not calibrated: where the motion of its images does not tell its focal length, "
         f"{_about_assumed(camera)}"
@@ -70,6 +70,7 @@ def self_calibrated(log: Log, inputs: Inputs, images: dict[str, Any], *, executi
 
 
 def _excerpts(log: Log, execution: Execution) -> Iterator[Callable[[], Iterator[Frame]]]:
+    """Readers of excerpts that are spread over the drive; of one shorter than an excerpt the whole, twice."""
     stamp_ns = log.stamps()
     if len(stamp_ns) < 2:
         return
