@@ -413,7 +413,7 @@ def test_a_drive_is_sent_by_one_machine_and_committed_by_another(root: Any, tmp_
     with map_store.writing(root) as a, map_store.writing(root) as b:
         made = {seed: write_run(tmp_path / f"{seed}", "drive", seed, LIBRARY) for seed in (5, 6, 7)}
         sent = {seed: upload.send_run(root, folder, time.time()) for seed, folder in made.items()}
-        old = upload.SentRun(sent[7].entry, time.time() - upload.VACUUM_S)
+        old = upload.SentRun(sent[7].entry, time.time() - upload.VACUUM_S + 3600)  # a day by a clock an hour ahead
         assert same_state(root) == {"one": {1}}
         for folder in made.values():
             shutil.rmtree(folder)

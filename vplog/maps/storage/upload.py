@@ -27,6 +27,8 @@ _SENT_AT_ONCE = 4
 """Files: each holds a part of some MB in memory, and more do not fill the line any better."""
 VACUUM_S = 86_400
 """Age below which nothing is removed: no upload of a drive takes a day."""
+_CLOCKS_S = 7200
+"""Most that the clock of who removes may be ahead of the store's."""
 _PROBE = ".conditional-writes"
 """An empty object that no write may replace, for the store itself to show that it heeds conditions."""
 _OWN = ("runs", "packs", "rest", "libraries", "snapshots", "joins", "joint", *TABLES)
@@ -172,7 +174,7 @@ def _renamed(remote: RemotePath, sent: SentRun, drive: str) -> SentRun:
 
 def check_recent(began: float) -> None:
     """Raises ResultError where what was sent may be removed as that of a killed writer."""
-    if not 0 <= time.time() - began < VACUUM_S:
+    if not 0 <= time.time() - began < VACUUM_S - _CLOCKS_S:
         raise ResultError("This writer was stopped for too long, so what it sent may be gone. Run again.")
 
 
