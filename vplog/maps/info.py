@@ -113,7 +113,7 @@ def _drive(store: Store, drive: str, about: dict[str, Any]) -> dict[str, Any]:
             "warnings": record.get("warnings", []),
         }
 
-    return store.read(drive, read, ())
+    return store.read(drive, read, ()) if store.mirror is None else read(Path())  # by the manifest
 
 
 def _figure(record: Any, *names: str) -> float | None:

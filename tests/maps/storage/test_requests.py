@@ -12,6 +12,7 @@ from tests.maps.runs import put_rows
 from tests.maps.storage.test_download_cache import fill
 from vplog.maps.storage import map_store
 from vplog.maps.storage.layout import folder_name
+from vplog.maps.storage.remote_map import Mirror
 from vplog.storage.remote_path import located
 
 if TYPE_CHECKING:
@@ -49,10 +50,11 @@ def root(server: None, finished: Path, request: pytest.FixtureRequest) -> Any:
 
 
 def test_a_reader_asks_as_often_of_a_large_map(
-    root: Any, verb: Callable[..., Said], tiny_drives: list[Path], tmp_path: Path
+    root: Any, verb: Callable[..., Said], tiny_drives: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The manifest, and what is wanted of what it names."""
-    with counting() as asked:
+    with counting() as asked, monkeypatch.context() as patch:
+        patch.setattr(Mirror, "fetch", None)  # no folder of a drive is made to tell of it
         assert verb("map", "info", root, "--json").json["places"] > 0
     assert asked.keys() == {"GET"}
     assert asked["GET"] <= 5, "map.json, the snapshot, its layers, and library.json"
