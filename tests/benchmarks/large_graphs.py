@@ -41,7 +41,7 @@ def _solved(kind: str, poses: int, name: str) -> dict[str, Any]:
     false = np.zeros(len(graph.a), bool)
     if name != "lm":
         graph, false = spoiled(graph, FALSE_SHARE, 0)
-    method("lm")(drives(1000, 1000 // DRIVES))  # what is compiled is not counted
+    method("lm")(drives(1000, 1000))  # what is compiled is not counted
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     began, busy = time.perf_counter(), time.process_time()
     solution = method(name)(graph)

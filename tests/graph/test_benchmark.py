@@ -9,7 +9,7 @@ import numpy as np
 
 from tests.benchmarks import graphs as benchmark
 from tests.benchmarks.ask import WAYS, Case, coarse, compared
-from tests.benchmarks.large_graphs import drives
+from tests.benchmarks.large_graphs import _solved, drives
 from vplog.graph.build import parts
 from vplog.graph.consistency import is_loop
 from vplog.results.g2o import write_g2o
@@ -77,6 +77,10 @@ def test_drives_are_joined_by_closures_alone() -> None:
     assert (graph.a[odometry] // 300 == graph.b[odometry] // 300).all()
     assert (graph.a // 300 != graph.b // 300).any()
     assert not parts(900, graph.a, graph.b).any()
+
+
+def test_a_large_solve_is_told_of() -> None:
+    assert _solved("city", 120, "lm")["loops"] == is_loop(benchmark.city(120)).sum()
 
 
 def test_a_call_is_ended_at_its_limit() -> None:
