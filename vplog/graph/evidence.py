@@ -14,11 +14,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
 
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed, parts, subgraph
 from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, residual_sigma
+from vplog.graph.displacements import Displacements, log_common
 from vplog.graph.least_squares import GAUGE_SIGMA, Objective
 from vplog.graph.leave_one_out import tension
 
@@ -32,10 +32,6 @@ _BESIDE = 3
 """Keyframes between neighbours of a run, at both ends: they see the same things."""
 _LONGEST = 20
 """Closures of a run that count as one accident; beyond that the view has changed."""
-_EARLIER = 200
-"""Runs before one that may share its displacement: bounds the pairs of graphs with thousands of false closures."""
-_PAIRS = 1 << 12
-"""Pairs of runs compared at once: some megabytes."""
 _RECENT = 10
 """Last members of a family by which the next one is predicted."""
 _SAMPLE = 200
@@ -50,7 +46,6 @@ _TAIL_SHARES = np.array([0.0, 0.01, 0.02, 0.05, 0.1, 0.2])[:, None]
 """Shares of them among the true ones, as likely as each other."""
 _MULTIPLES = 2.0 ** np.arange(-5.0, 6.5, 0.5)
 """Noise of single closures as multiples of the sigma that they have on average."""
-_POTRF, _POTRS, _TRTRS = get_lapack_funcs(("potrf", "potrs", "trtrs"), dtype=np.float64)
 _LOG_2PI = math.log(2.0 * math.pi)
 _LEAST_SIDE = 0.1
 """Shortest side of the box of places as a share of its longest: a flat drive still has false closures off its plane."""
@@ -171,7 +166,10 @@ class Accidents:
 
     def families(self, together: list[_Run]) -> tuple[list[Ints], float]:
         """See `families`; of sets that differ in a few runs, most families are the same."""
-        return families(Displacements.of(together, self.chain, self._joint), self.room)
+        a, b = np.array([run.a for run in together]), np.array([run.b for run in together])
+        measured, noise = np.array([run.a_from_b for run in together]), np.array([run.covariance for run in together])
+        names = [id(run) for run in together]  # which stay in memory
+        return families(Displacements(self.chain, a, b, measured, noise, names, self._joint), self.room)
 
 
 def log_evidence(factors: Factors, weight: Floats, poses: Floats, accidents: Accidents) -> float:
@@ -370,36 +368,13 @@ def _as_one(graph: PoseGraph, run: Ints, chain: OdometryChain) -> tuple[float, _
         covariance[k, :, j, :] += side[shared][:, None, None] * legs[shared]
     Ad = se3.adjoint(se3.between(X[to][None], X[b]))[:, axes][:, :, axes]
     covariance[range(size), :, range(size), :] += Ad @ noise @ np.swapaxes(Ad, 1, 2)
-    try:
-        inner, displaced, information = _log_common(error, covariance)
-    except np.linalg.LinAlgError:
+    inner, displaced, information = log_common(error, covariance.reshape(size * d, size * d))
+    if not math.isfinite(inner):
         return 0.0, None
     twist = np.zeros(6)
     twist[axes] = displaced
     noise = np.asarray(np.linalg.inv(information), np.float64)
     return inner, _Run(at, to, measured[middle] @ se3.exp(twist[None])[0], noise)
-
-
-def _log_common(error: Floats, covariance: Floats) -> tuple[float, Floats, Floats]:
-    """Log density of errors (K, d) of `covariance` (K, d, K, d) about a common mean that may be anything; the mean (d,)
-    and its information (d, d). Raises LinAlgError where the covariance is not positive definite."""
-    size, d = error.shape
-    side = np.zeros((size, d, d + 1))
-    side[:, range(d), range(d)], side[:, :, d] = 1.0, error
-    # LAPACK itself: there are tens of thousands, so small that numpy.linalg would take longer to call it
-    root, failed = _POTRF(covariance.reshape(size * d, size * d), lower=1)
-    if failed:
-        raise np.linalg.LinAlgError
-    whitened = _TRTRS(root, side.reshape(size * d, d + 1), lower=1)[0]
-    moments = whitened.T @ whitened
-    information, gradient = moments[:d, :d], moments[:d, d]
-    low, failed = _POTRF(information, lower=1)
-    if failed:
-        raise np.linalg.LinAlgError
-    mean = _POTRS(low, gradient, lower=1)[0]
-    volume = np.log(root.diagonal()).sum() + np.log(low.diagonal()).sum()
-    density = -0.5 * (moments[d, d] - gradient @ mean) - volume - 0.5 * (size - 1) * d * _LOG_2PI
-    return float(density), mean, information
 
 
 def forward(graph: PoseGraph, edges: Ints) -> tuple[Ints, Ints, Floats, Floats]:
@@ -467,94 +442,3 @@ def log_partition(sizes: list[int]) -> float:
         len(sizes) * math.log(alpha) + math.lgamma(alpha) - math.lgamma(alpha + count) for alpha in _CONCENTRATIONS
     )
     return within + likeliest
-
-
-class Displacements:
-    """Displacements D = X_a z X_b^-1 of the world between two visits that K closures claim, X the odometry.
-
-    Two agree where D_i^-1 D_j is the identity but for the noise of both and of the odometry from a_i to a_j and from
-    b_i to b_j (Mangelson et al., Pairwise Consistent Measurement Set Maximization, ICRA 2018, eq. 3).
-    """
-
-    def __init__(self, chain: OdometryChain, a: Ints, b: Ints, measured: Floats, noise: Floats) -> None:
-        """Closures z `measured` (K, 4, 4) from earlier poses a to later ones b with `noise` (K, d, d) in b's frame."""
-        self._chain, self._a, self._b = chain, a, b
-        at_a, at_b = (se3.between(chain.poses[:1], chain.poses[end]) for end in (a, b))
-        self._displaced = at_a @ measured @ se3.inverse(at_b)
-        Ad = self._adjoint(at_b)
-        self._own = Ad @ noise @ np.swapaxes(Ad, 1, 2)
-        self._after = self._adjoint(se3.inverse(self._displaced))
-        self._names = list(range(len(a)))
-        self._joint: dict[tuple[int, ...], float] = {}
-
-    @classmethod
-    def of(cls, together: list[_Run], chain: OdometryChain, joint: dict[tuple[int, ...], float]) -> Displacements:
-        """The claims of runs that stay in memory; `joint` holds densities by their identities, and gets new ones."""
-        a, b = np.array([run.a for run in together]), np.array([run.b for run in together])
-        measured = np.array([run.a_from_b for run in together])
-        found = cls(chain, a, b, measured, np.array([run.covariance for run in together]))
-        found._names, found._joint = [id(run) for run in together], joint
-        return found
-
-    @property
-    def count(self) -> int:
-        return len(self._a)
-
-    def near(self, room: float) -> list[list[int]]:
-        """Earlier claims with which each agrees more likely than it is anywhere in the room."""
-        part, near = self._chain.part, [[] for _ in range(self.count)]
-        each = np.minimum(np.arange(self.count), _EARLIER)
-        two = np.repeat(np.arange(self.count), each)
-        one = np.arange(len(two)) - np.repeat(np.cumsum(each) - np.arange(self.count), each)
-        comparable = (part[self._a[one]] == part[self._a[two]]) & (part[self._b[one]] == part[self._b[two]])
-        one, two = one[comparable], two[comparable]
-        for start in range(0, len(one), _PAIRS):
-            rows = slice(start, start + _PAIRS)
-            error, covariance = self.apart(one[rows], two[rows])
-            log_volume = np.linalg.slogdet(covariance)[1] + error.shape[1] * _LOG_2PI
-            alike = -0.5 * (se3.mahalanobis2(error, covariance) + log_volume) > -room
-            for earlier, later in zip(one[rows][alike].tolist(), two[rows][alike].tolist(), strict=True):
-                near[later].append(earlier)
-        return near
-
-    def log_joint(self, members: list[int]) -> float:
-        """Log density of these given that all claim one displacement, whatever it is.
-
-        An error of D is Ad(D)^-1 W_a - W_b, W the random walk of the odometry's error about the first pose.
-        """
-        if len(members) == 1:
-            return 0.0
-        key = tuple(self._names[member] for member in members)
-        if key not in self._joint:
-            self._joint[key] = self._log_joint(members)
-        return self._joint[key]
-
-    def _log_joint(self, members: list[int]) -> float:
-        total, a, b = self._chain.total, self._a[members], self._b[members]
-        middle = members[len(members) // 2]
-        after = self._after[middle]
-
-        def shared(one: Ints, other: Ints) -> Floats:
-            return total[np.minimum(one[:, None], other)]
-
-        mixed = after @ shared(a, b)
-        covariance = after @ shared(a, a) @ after.T + shared(b, b) - mixed - mixed.transpose(1, 0, 3, 2)
-        covariance[range(len(a)), range(len(a))] += self._own[members]
-        try:
-            twists = se3.log(se3.between(self._displaced[middle][None], self._displaced[members]))
-            return _log_common(twists[:, self._chain.axes], np.swapaxes(covariance, 1, 2))[0]
-        except np.linalg.LinAlgError:
-            return -np.inf
-
-    def _adjoint(self, poses: Floats) -> Floats:
-        return se3.adjoint(poses)[:, self._chain.axes][:, :, self._chain.axes]
-
-    def apart(self, one: Ints, other: Ints) -> tuple[Floats, Floats]:
-        """Twist (P, d) from the displacements `one` (P,) to `other`, about the first pose, and its covariance."""
-        total, after = self._chain.total, self._after[one]
-        of_a, of_b = (
-            np.where(end[other] >= end[one], 1.0, -1.0)[:, None, None] * (total[end[other]] - total[end[one]])
-            for end in (self._a, self._b)
-        )
-        covariance = self._own[one] + self._own[other] + of_b + after @ of_a @ np.swapaxes(after, 1, 2)
-        return se3.log(se3.between(self._displaced[one], self._displaced[other]))[:, self._chain.axes], covariance

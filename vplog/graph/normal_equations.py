@@ -159,7 +159,7 @@ def _spatial(edges: Ints, low: int, high: int, given: _Edges, poses: Floats, sum
                 shift[i] += z[k, i] * (x[k] - z[k, 3])
             for j in range(3):
                 rest[i, j] = z[0, i] * turned[0, j] + z[1, i] * turned[1, j] + z[2, i] * turned[2, j]
-        _logarithm(rest, shift, error)
+        logarithm(rest, shift, error)
         # -Ad(b_from_a): R^T and -R^T [x] with a_from_b = (R, x)
         for i in range(3):
             r0, r1, r2 = turned[0, i], turned[1, i], turned[2, i]
@@ -176,7 +176,7 @@ def _spatial(edges: Ints, low: int, high: int, given: _Edges, poses: Floats, sum
 
 
 @numba.njit(cache=True, nogil=True)
-def _logarithm(rotation: Floats, shift: Floats, error: Floats) -> None:
+def logarithm(rotation: Floats, shift: Floats, error: Floats) -> None:
     """The twist of a motion, as geometry.log: through the quaternion, stable up to half a turn."""
     m = rotation
     trace = m[0, 0] + m[1, 1] + m[2, 2]

@@ -16,7 +16,8 @@ from vplog.geometry import se3
 from vplog.graph.build import checked
 from vplog.graph.clique import largest_clique
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, far_from_odometry, is_loop
-from vplog.graph.evidence import Displacements, forward
+from vplog.graph.displacements import Displacements
+from vplog.graph.evidence import forward
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.graph.lm import solve_weighted
