@@ -7,7 +7,7 @@ import re
 import numpy as np
 from pydantic import Field
 
-from vplog.data import Floats, Ints, Keyframes, Odometry
+from vplog.data import Bools, Floats, Ints, Keyframes, Odometry
 from vplog.errors import LogError, plural
 from vplog.geometry import se3
 from vplog.logs.stamps import longest_gap_ns
@@ -47,7 +47,7 @@ def select_keyframes(
     warnings = []
     longest_s = settings.max_odometry_gap_s
     gap_ns = longest_gap_ns(odometry.stamp_ns) if longest_s is None else int(longest_s * 1e9)
-    covered = _has_odometry(stamp_ns, odometry.stamp_ns, gap_ns)
+    covered = has_odometry(stamp_ns, odometry.stamp_ns, gap_ns)
     if missing := int((~covered).sum()):
         warnings.append(f"{missing} of {plural(len(stamp_ns), 'frame')} without odometry at its stamp left out.")
     stamp_ns = np.unique(stamp_ns[covered])
@@ -72,7 +72,8 @@ def row_of(keyframes: Keyframes, name: int | str) -> int | None:
     return row if row == number or (row < count and keyframes.stamp_ns[row] == number) else None
 
 
-def _has_odometry(stamp_ns: Ints, odometry_ns: Ints, gap_ns: int) -> np.ndarray:
+def has_odometry(stamp_ns: Ints, odometry_ns: Ints, gap_ns: int) -> Bools:
+    """(F,) whether odometry has a sample at each stamp, or samples at most `gap_ns` apart about it."""
     right = np.searchsorted(odometry_ns, stamp_ns)
     inside = (right > 0) & (right < len(odometry_ns))
     right = np.minimum(right, len(odometry_ns) - 1)

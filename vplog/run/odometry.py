@@ -19,12 +19,12 @@ from vplog.run.cache.codecs import json_codec
 from vplog.run.cache.stage_cache import Inputs
 from vplog.run.cache.steps import Steps, step
 from vplog.run.feature_extraction import image_topics
-from vplog.run.keyframes import KeyframeSettings, select_keyframes
+from vplog.run.keyframes import KeyframeSettings, has_odometry, select_keyframes
 from vplog.run.lidar_odometry import lidar_odometry, range_of
 from vplog.run.self_calibration import decoded, self_calibrated
 from vplog.run.visual_odometry.inertial import SURE, with_imu
 from vplog.run.visual_odometry.metres import in_metres
-from vplog.run.visual_odometry.visual import visual_odometry
+from vplog.run.visual_odometry.visual import PERIOD_NS, visual_odometry
 from vplog.stages import Log
 
 _log = logging.getLogger(__name__)
@@ -257,7 +257,7 @@ def _is_unknown(odometry: Odometry) -> bool:
 
 def _log_breaks(what: str, odometry: Odometry, stamp_ns: np.ndarray, of: str) -> None:
     """Warn of lost frames or scans, whose stamps are given, and of breaks."""
-    if lost := len(stamp_ns) - len(odometry.stamp_ns):
+    if lost := int((~has_odometry(stamp_ns, odometry.stamp_ns, PERIOD_NS)).sum()):
         _log.warning("%s lost its track in %d of %d %s.", what, lost, len(stamp_ns), of)
     breaks = odometry.breaks
     if not len(breaks):
