@@ -22,6 +22,9 @@ _CORNERS = 300
 """Points of a frame: RTAB-Map's and VINS' 150 to 1000; more cost time, and hardly sharpen a pose."""
 _QUALITY = 0.005
 """Least corner response as a share of the image's best: a low bound, as their distance limits their number."""
+_LARGE = 1 << 20
+"""px of an image from which on its corners are those of half of it: they are followed as patches, so that a pixel
+does not matter, and looking for them in a full HD image takes longer than following them."""
 _SPREAD = 0.6
 """Corners are no closer than this share of the distance at which they would cover the image evenly."""
 _SETTINGS = MetricSettings()
@@ -76,15 +79,19 @@ class Motion:
 
 def corners(frame: Frame, taken: Float32s) -> Float32s:
     """(K, 2) px of corners at a distance from those `taken`, the strongest first: as many as are left to _CORNERS."""
-    image = frame.image
-    height, width = image.shape
-    apart = _SPREAD * np.sqrt(width * height / _CORNERS)
+    image, times = frame.image, 1
     mask = np.full(image.shape, 255, np.uint8) * (True if frame.mask is None else frame.mask)
-    for x, y in np.rint(taken).astype(int).tolist():
+    while image.size > _LARGE:
+        image, times = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 2 * times
+        mask = cv2.resize(mask, image.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    apart = _SPREAD * np.sqrt(image.size / _CORNERS)
+    for x, y in np.rint(taken / times).astype(int).tolist():
         cv2.circle(mask, (x, y), round(apart), 0, -1)
     left = _CORNERS - len(taken)
     found = cv2.goodFeaturesToTrack(image, left, _QUALITY, apart, mask=mask) if left > 0 else None
-    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2)
+    if found is None:
+        return np.zeros((0, 2), np.float32)
+    return (np.asarray(found, np.float32).reshape(-1, 2) + np.float32(0.5)) * times - np.float32(0.5)
 
 
 def track(

@@ -107,7 +107,10 @@ class Tracker:
     start: _Start | None = None
     passed: list[Frame] = field(default_factory=list)
     """Frames since the last that was followed."""
+    with_depth: bool = True
+    """Whether the last that was followed has depth, or a right image."""
     arrived_ns: int = 0
+    """Stamp of the last frame."""
     window: deque[tuple[int, np.ndarray, Points]] = field(default_factory=lambda: deque(maxlen=_WINDOW))
     """View, landmarks and measurements of the last references of this piece."""
     world: dict[int, Floats] = field(default_factory=dict)
@@ -117,7 +120,9 @@ class Tracker:
         """Take the next frame."""
         period_ns, self.arrived_ns = frame.stamp_ns - self.arrived_ns, frame.stamp_ns
         following = self.reference is not None and self.start is None
-        if following and frame.stamp_ns + period_ns - self.stamp_ns[-1] <= PERIOD_NS:
+        # depth at a lower rate: never all of the frames without
+        is_needed = self.sensor.metric and _has_depth(frame) and not self.with_depth
+        if following and not is_needed and frame.stamp_ns + period_ns - self.stamp_ns[-1] <= PERIOD_NS:
             self.passed.append(frame)
             return
         passed, self.passed = self.passed, []
@@ -129,16 +134,18 @@ class Tracker:
     def _take(self, frame: Frame) -> None:
         if self.start is not None:
             self._follow_start(self.start, frame)
-        elif self.reference is None:
-            self._start(frame)
-        elif not self._is_followed(frame) and frame.stamp_ns - self.stamp_ns[-1] > _PATIENCE_NS:
-            self._start(frame)
+        elif not self._is_followed(frame):
+            if not self.stamp_ns or frame.stamp_ns - self.stamp_ns[-1] > _PATIENCE_NS:
+                self._start(frame)
 
     def _is_followed(self, frame: Frame) -> bool:
         """Whether the frame can be followed from the reference; it is added then."""
+        if self.reference is None:
+            return False
         tracked = track(self.reference, frame, self._guess(frame.stamp_ns), self.sensor)
         if tracked is None:
             return False
+        self.with_depth = _has_depth(frame)
         extended, motion = tracked
         if extended is self.reference and not self._is_far(extended, motion):
             self._add_frame(frame.stamp_ns, motion)
@@ -407,6 +414,10 @@ class Tracker:
             if end > view.row:
                 result[view.row + 1 : end + 1] = covariance / (end - view.row)
         return result
+
+
+def _has_depth(frame: Frame) -> bool:
+    return frame.depth is not None or frame.right is not None
 
 
 def visual_odometry(
