@@ -9,6 +9,7 @@ of the window make its depth sure.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -132,11 +133,11 @@ class Tracker:
             self._take(one)
 
     def _take(self, frame: Frame) -> None:
+        followed_ns = self.stamp_ns[-1] if self.stamp_ns else -math.inf
         if self.start is not None:
             self._follow_start(self.start, frame)
-        elif not self._is_followed(frame):
-            if not self.stamp_ns or frame.stamp_ns - self.stamp_ns[-1] > _PATIENCE_NS:
-                self._start(frame)
+        elif not self._is_followed(frame) and frame.stamp_ns - followed_ns > _PATIENCE_NS:
+            self._start(frame)
 
     def _is_followed(self, frame: Frame) -> bool:
         """Whether the frame can be followed from the reference; it is added then."""
