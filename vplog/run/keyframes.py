@@ -13,8 +13,6 @@ from vplog.geometry import se3
 from vplog.logs.stamps import longest_gap_ns
 from vplog.settings import Settings
 
-_PAPER_SPACING_M = 1.0
-"""m; the paper takes views 1-5 m apart (section IV): the near end."""
 _LEAST_SPACING_M = 0.05
 """m; closer views, even indoors, hardly differ (at 2 m distance 5 cm is 1.4 degrees of parallax)."""
 
@@ -23,7 +21,9 @@ class KeyframeSettings(Settings):
     """A frame becomes a keyframe when the odometry has moved or turned far enough since the last one."""
 
     distance_m: float | None = Field(default=None, ge=0)
-    """Spacing in m; None takes 1 m, or a thousandth of the path where that is shorter (at least 5 cm)."""
+    """Spacing in m; None takes a thousandth of the path, at least 5 cm, at most `most_distance_m`."""
+    most_distance_m: float = Field(default=1.0, ge=_LEAST_SPACING_M, le=1e6)
+    """m; the paper takes views 1-5 m apart (section IV): the near end."""
     sparseness: float = Field(default=1.0, gt=0, le=1000)
     """Times the spacing that is taken where `distance_m` is None: 2 makes half as many keyframes."""
     rotation_deg: float = Field(default=10.0, ge=0)
@@ -58,8 +58,7 @@ def select_keyframes(
             "Compare the clocks with `vplog info`, or choose another topic with --odometry-topic."
         )
     poses = se3.interpolate_at(odometry.stamp_ns, odometry.odom_from_body, stamp_ns)
-    spacing = settings.distance_m if settings.distance_m is not None else settings.sparseness * _spacing(poses)
-    rows = _far_enough(poses, spacing, np.deg2rad(settings.rotation_deg))
+    rows = _far_enough(poses, _spacing(poses, settings), np.deg2rad(settings.rotation_deg))
     return Keyframes(drive, stamp_ns[rows], poses[rows]), warnings
 
 
@@ -81,9 +80,11 @@ def has_odometry(stamp_ns: Ints, odometry_ns: Ints, gap_ns: int) -> Bools:
     return sampled | (inside & (odometry_ns[right] - odometry_ns[right - 1] <= gap_ns))
 
 
-def _spacing(poses: Floats) -> float:
+def _spacing(poses: Floats, settings: KeyframeSettings) -> float:
+    if settings.distance_m is not None:
+        return settings.distance_m
     path_m = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
-    return float(np.clip(path_m / 1000.0, _LEAST_SPACING_M, _PAPER_SPACING_M))
+    return settings.sparseness * float(np.clip(path_m / 1000.0, _LEAST_SPACING_M, settings.most_distance_m))
 
 
 def _far_enough(poses: Floats, distance_m: float, rotation_rad: float) -> list[int]:
