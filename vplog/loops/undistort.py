@@ -38,7 +38,10 @@ def rays(camera: Camera, points: np.ndarray) -> Floats:
             step = (_ray_from_px(camera, result) @ error[..., None])[..., 0]
             result += np.where(np.isfinite(step).all(axis=1, keepdims=True), step, 0.0)
         error = pixels[:, 0] - _project_rays(camera, result)
-    result[~(np.abs(error).max(axis=1) < _ROUND_TRIP_PX)] = np.nan
+        J = px_from_ray(camera, result)
+        # beyond the fold of a polynomial it leads back to pixels that other rays have
+        unfolded = (J[:, 0, 0] * J[:, 1, 1] > J[:, 0, 1] * J[:, 1, 0]) & (J[:, 0, 0] + J[:, 1, 1] > 0)
+    result[~unfolded | ~(np.abs(error).max(axis=1) < _ROUND_TRIP_PX)] = np.nan
     return result
 
 

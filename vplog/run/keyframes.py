@@ -58,7 +58,9 @@ def select_keyframes(
             "Compare the clocks with `vplog info`, or choose another topic with --odometry-topic."
         )
     poses = se3.interpolate_at(odometry.stamp_ns, odometry.odom_from_body, stamp_ns)
-    rows = _far_enough(poses, _spacing(poses, settings), np.deg2rad(settings.rotation_deg))
+    # the first of each piece: else closures may not find a short one
+    begins = np.searchsorted(stamp_ns, odometry.stamp_ns[odometry.breaks])
+    rows = _far_enough(poses, _spacing(poses, settings), np.deg2rad(settings.rotation_deg), begins)
     return Keyframes(drive, stamp_ns[rows], poses[rows]), warnings
 
 
@@ -83,14 +85,18 @@ def has_odometry(stamp_ns: Ints, odometry_ns: Ints, gap_ns: int) -> Bools:
 def _spacing(poses: Floats, settings: KeyframeSettings) -> float:
     if settings.distance_m is not None:
         return settings.distance_m
-    path_m = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
+    apart = poses[_far_enough(poses, _LEAST_SPACING_M, np.pi)]  # noise of a robot that stands is no way
+    path_m = float(np.linalg.norm(np.diff(apart[:, :3, 3], axis=0), axis=1).sum())
     return settings.sparseness * float(np.clip(path_m / 1000.0, _LEAST_SPACING_M, settings.most_distance_m))
 
 
-def _far_enough(poses: Floats, distance_m: float, rotation_rad: float) -> list[int]:
-    rows = [0]
+def _far_enough(poses: Floats, distance_m: float, rotation_rad: float, always: Ints | None = None) -> list[int]:
+    """Rows of poses that have moved or turned so far since the one before; rows `always` are among them."""
+    least_trace = 1.0 + 2.0 * np.cos(min(rotation_rad, np.pi)) + 1e-12
+    rows, chosen = [0], set() if always is None else set(always.tolist())
     for row in range(1, len(poses)):
-        step = se3.between(poses[rows[-1]], poses[row])
-        if np.linalg.norm(step[:3, 3]) >= distance_m or se3.angle(step) >= rotation_rad:
+        last, this = poses[rows[-1]], poses[row]
+        turned = (last[:3, :3] * this[:3, :3]).sum() <= least_trace  # the trace of the rotation between them
+        if turned or row in chosen or np.linalg.norm(this[:3, 3] - last[:3, 3]) >= distance_m:
             rows.append(row)
     return rows

@@ -68,7 +68,8 @@ def read(
         _log.warning("--camera-height-m has no effect: the odometry is no single camera's.")
     if not odometry.metric:
         odometry = _with_scale(odometry, log, camera, use_gps)
-    selected, warnings = select_keyframes(log.name, log.stamps(), odometry, settings)
+    stamp_ns = odometry.stamp_ns if odometry.of_images else log.stamps()  # frames that were followed
+    selected, warnings = select_keyframes(log.name, stamp_ns, odometry, settings)
     for warning in warnings:
         _log.warning(warning)
     if _is_unknown(odometry):

@@ -85,8 +85,11 @@ def in_one_scale(
     if not len(ratios):
         return odometry, keyframes
     log_scale = _log_scale(odometry, keyframes, ratios)
-    since_ns = odometry.stamp_ns - keyframes.stamp_ns[0]
-    every = np.interp(since_ns, keyframes.stamp_ns - keyframes.stamp_ns[0], log_scale)
+    since_ns, at_ns = odometry.stamp_ns - keyframes.stamp_ns[0], keyframes.stamp_ns - keyframes.stamp_ns[0]
+    begin_ns, every = since_ns[odometry.breaks], np.zeros(len(since_ns))
+    piece, piece_of = (np.searchsorted(begin_ns, one, "right") for one in (since_ns, at_ns))
+    for one in np.unique(piece_of):  # each has its own unit
+        every[piece == one] = np.interp(since_ns[piece == one], at_ns[piece_of == one], log_scale[piece_of == one])
     odometry = scaled(odometry, np.exp(every), camera)
     poses = se3.interpolate_at(odometry.stamp_ns, odometry.odom_from_body, keyframes.stamp_ns)
     return odometry, replace(keyframes, odom_from_body=poses)

@@ -25,6 +25,8 @@ _FOCAL_LENGTH = 1.2
 it: COLMAP's, a field of view of 45 degrees; phones have some 0.7 to 1.2."""
 _RATE_HZ = 15.0
 """Frames a second of an excerpt, at most: 5 s, in which a car passes a bend."""
+_MOST_APART = 8
+"""One of so many frames at least, as at 120 Hz: stamps may run faster than the camera did."""
 _EXCERPTS = 6
 """Excerpts that are tried until two agree."""
 _GOLDEN = 0.618034
@@ -74,7 +76,7 @@ def _excerpts(log: Log, execution: Execution) -> Iterator[Callable[[], Iterator[
     stamp_ns = log.stamps()
     if len(stamp_ns) < 2:
         return
-    every = max(round(1e9 / _RATE_HZ / float(np.median(np.diff(stamp_ns)))), 1)
+    every = min(max(round(1e9 / _RATE_HZ / float(np.median(np.diff(stamp_ns)))), 1), _MOST_APART)
     last = max(len(stamp_ns) - EXCERPT * every, 0)
     for number in range(_EXCERPTS if last else 2):
         first = round(last * ((number + 1) * _GOLDEN % 1.0))

@@ -25,6 +25,8 @@ _ROUNDS = 15
 """Gauss-Newton steps; from the median ratio some five converge."""
 _ANY_SCALE = 1.0
 """Sigma of the log of a scale that was not measured: each piece has a unit of its own."""
+_STRAIGHT_NS = 2_500_000_000
+"""ns over which the way is taken for straight: three fixes at 1 Hz."""
 _NAMED = 3
 """Pieces that are named."""
 _LEAST = 3
@@ -109,9 +111,16 @@ def random_walk(sigma: Floats) -> sparse.csr_array:
 
 
 def _sigma_m(gps: Gps) -> float:
+    """Standard deviation of a fix per axis in the plane: that claimed, or that of fixes about the line between their
+    neighbours where it is larger."""
     variance = np.trace(gps.covariance[:, :2, :2], axis1=1, axis2=2) / 2.0  # the altitude may not be known
     known = variance[np.isfinite(variance) & (variance > 0)]
-    return float(np.sqrt(np.median(known))) if len(known) else RECEIVER_SIGMA_M
+    claimed = float(np.sqrt(np.median(known))) if len(known) else RECEIVER_SIGMA_M
+    stamp_ns, enu_m = (fixes := local_enu(gps)).stamp_ns, fixes.enu_m
+    share = ((stamp_ns[1:-1] - stamp_ns[:-2]) / (stamp_ns[2:] - stamp_ns[:-2]))[:, None]
+    off = (enu_m[1:-1] - (1.0 - share) * enu_m[:-2] - share * enu_m[2:])[stamp_ns[2:] - stamp_ns[:-2] <= _STRAIGHT_NS]
+    spread = 1.4826 * float(np.median(np.abs(off[:, :2]))) if len(off) else 0.0
+    return max(claimed, spread / 1.5**0.5)
 
 
 def _way(stamp_ns: Ints, poses: Floats, gps: Gps, sigma_m: float) -> _Way:

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from vplog.run.visual_odometry.sensor import Points
 
 UNIT_DEPTH = 10.0
-"""Units of the median depth at the start: that of a street in m, so that spacings of keyframes and bounds of closures,
-which are set in m, suit any scene."""
+"""Units of the median depth, of two views and of a piece: that of a street in m, so that spacings of keyframes and
+bounds of closures, which are set in m, suit any scene."""
 _RADIUS_PX = 1.0
 """Distance to the epipolar line that RANSAC calls an agreement; corners are followed to some tenths of a px."""
 _CONFIDENCE = 0.9999

@@ -20,9 +20,10 @@ from vplog.data import Camera, Float32s, Floats, Frame, Odometry
 from vplog.geometry import se3
 from vplog.graph.bundle import Observations, adjust
 from vplog.run.visual_odometry.ground import Below, below, by_height
+from vplog.run.visual_odometry.metres import scaled
 from vplog.run.visual_odometry.sensor import Points, Sensor, follow
 from vplog.run.visual_odometry.tracking import Motion, ReferenceFrame, cloud, corners, solve, track
-from vplog.run.visual_odometry.two_views import CERTAINTY, rho_of, rho_variance, two_views
+from vplog.run.visual_odometry.two_views import CERTAINTY, UNIT_DEPTH, rho_of, rho_variance, two_views
 
 _WINDOW = 8
 """References that are adjusted together: as libviso's and VINS' 5 to 10; what is older hardly shares a landmark."""
@@ -39,6 +40,8 @@ _MOST_BETWEEN = 256
 PERIOD_NS = 70_000_000
 """ns between frames that are followed, at most, where the rate is higher: at 15 Hz the same references are made as at
 30 Hz, for two thirds of the time. A frame between them is followed only where the next is lost."""
+_MOST_PASSED = 3
+"""Frames between them, at most: three at 60 Hz. Stamps may run faster than the camera did."""
 _PATIENCE_NS = 10**9
 """ns for which a frame that is lost is passed over, as a blurred one; then the next piece begins."""
 
@@ -55,6 +58,8 @@ class _View:
     """Row of its frame among those with a pose."""
     motion: Floats
     """(6, 6) covariance of the motion since the reference before it."""
+    depth: float = math.nan
+    """Median of its landmarks'."""
 
 
 @dataclass(eq=False)
@@ -108,8 +113,6 @@ class Tracker:
     start: _Start | None = None
     passed: list[Frame] = field(default_factory=list)
     """Frames since the last that was followed."""
-    with_depth: bool = True
-    """Whether the last that was followed has depth, or a right image."""
     arrived_ns: int = 0
     """Stamp of the last frame."""
     window: deque[tuple[int, np.ndarray, Points]] = field(default_factory=lambda: deque(maxlen=_WINDOW))
@@ -121,16 +124,24 @@ class Tracker:
         """Take the next frame."""
         period_ns, self.arrived_ns = frame.stamp_ns - self.arrived_ns, frame.stamp_ns
         following = self.reference is not None and self.start is None
-        # depth at a lower rate: never all of the frames without
-        is_needed = self.sensor.metric and _has_depth(frame) and not self.with_depth
-        if following and not is_needed and frame.stamp_ns + period_ns - self.stamp_ns[-1] <= PERIOD_NS:
+        since_ns = frame.stamp_ns - self.stamp_ns[-1] if self.stamp_ns else 0
+        if following and not self._is_needed(frame) and since_ns + period_ns <= PERIOD_NS:
             self.passed.append(frame)
             return
         passed, self.passed = self.passed, []
-        if passed and self._is_followed(frame):
+        if passed and since_ns <= PERIOD_NS and self._is_followed(frame):
             return
         for one in (*passed, frame):
             self._take(one)
+
+    def _is_needed(self, frame: Frame) -> bool:
+        """Whether the frame must not be passed over: after some that were, or with depth where the reference has none,
+        as with depth at a lower rate."""
+        return len(self.passed) == _MOST_PASSED or self._gives_depth(frame)
+
+    def _gives_depth(self, frame: Frame) -> bool:
+        reference = self.reference
+        return self.sensor.metric and reference is not None and _has_depth(frame) and not _has_depth(reference.frame)
 
     def _take(self, frame: Frame) -> None:
         followed_ns = self.stamp_ns[-1] if self.stamp_ns else -math.inf
@@ -146,9 +157,8 @@ class Tracker:
         tracked = track(self.reference, frame, self._guess(frame.stamp_ns), self.sensor)
         if tracked is None:
             return False
-        self.with_depth = _has_depth(frame)
         extended, motion = tracked
-        if extended is self.reference and not self._is_far(extended, motion):
+        if extended is self.reference and not self._is_far(extended, motion) and not self._gives_depth(frame):
             self._add_frame(frame.stamp_ns, motion)
         else:
             self.stamp_ns.append(frame.stamp_ns)
@@ -334,6 +344,8 @@ class Tracker:
         at, ids, points = at[front], ids[front], points.rows(front)
         if not self.sensor.metric:
             estimated = self._estimated(ids, points, at)
+            if len(known := at[np.isfinite(at[:, 2]), 2]):
+                self.views[view].depth = float(np.median(known))
             if self.height_m is not None:
                 sure = estimated.rho > CERTAINTY * np.sqrt(estimated.variance)
                 found = below(self.views[view].row, cloud(estimated.rows(np.flatnonzero(sure))), self.sensor.camera)
@@ -379,8 +391,10 @@ class Tracker:
 
     def odometry(self) -> Odometry | None:
         """None where fewer than two frames have a pose."""
-        for frame in self.passed[-1:]:
-            self._take(frame)
+        passed, self.passed = self.passed, []
+        if passed and not self._is_followed(passed[-1]):
+            for frame in passed:
+                self._take(frame)
         if len(self.stamp_ns) < 2:
             return None
         camera = self.sensor.camera
@@ -399,7 +413,19 @@ class Tracker:
             increments=True,
         )
         metres = None if self.height_m is None else by_height(found, self.below, self.height_m, camera)
-        return metres or found
+        if self.sensor.metric or metres is not None:
+            return metres or found
+        return scaled(found, self._typical_unit(), camera)
+
+    def _typical_unit(self) -> Floats:
+        """(T,) by which steps without metres are multiplied, so that references of a piece show landmarks at
+        UNIT_DEPTH: its first two views may have looked at the ground before the camera."""
+        depth, row = np.array([view.depth for view in self.views]), np.array([view.row for view in self.views])
+        piece, of_view = (np.searchsorted(self.breaks, one, "right") for one in (np.arange(len(self.stamp_ns)), row))
+        known, scale = np.isfinite(depth), np.ones(len(piece))
+        for one in np.unique(of_view[known]):
+            scale[piece == one] = UNIT_DEPTH / np.median(depth[known & (of_view == one)])
+        return scale
 
     def _increments(self) -> Floats:
         """(T, 6, 6) of the motion since the frame before, in the camera: that between two references in equal parts,
@@ -418,7 +444,7 @@ class Tracker:
 
 
 def _has_depth(frame: Frame) -> bool:
-    return frame.depth is not None or frame.right is not None
+    return frame.right is not None or (frame.depth is not None and bool(np.isfinite(frame.depth).any()))
 
 
 def visual_odometry(
