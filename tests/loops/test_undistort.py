@@ -102,6 +102,17 @@ def test_where_the_lens_has_no_inverse_there_is_no_ray() -> None:
     assert np.isnan(found[1]).all()
 
 
+def test_beyond_the_fold_of_a_polynomial_there_is_no_ray() -> None:
+    lens = camera("plumb_bob", [-0.35, 0.0, 0.0, 0.0])
+    px = np.stack(np.meshgrid(np.arange(-400.0, 1040.0, 20.0), np.arange(-400.0, 880.0, 20.0)), axis=-1).reshape(-1, 2)
+    found = undistort.rays(lens, px)
+    radius = np.linalg.norm(found, axis=1)
+    assert np.nanmax(radius) < (3 * 0.35) ** -0.5  # where r (1 - 0.35 r^2) is largest
+    known = np.isfinite(radius) & (radius > 0)
+    assert ((found * (px - px[radius == 0])).sum(axis=1)[known] > 0).all()
+    assert known.mean() > 0.1
+
+
 def test_nothing_in_nothing_out() -> None:
     assert undistort.rays(camera("equidistant"), np.empty((0, 2))).shape == (0, 2)
     assert undistort.project(camera(), np.empty((0, 3))).shape == (0, 2)

@@ -110,6 +110,22 @@ def test_keyframes_of_a_long_drive_are_as_far_apart_as_is_set() -> None:
     )
 
 
+def test_noise_of_a_robot_that_stands_makes_no_path() -> None:
+    odometry, rng = _drive(1.0, seconds=60.0), np.random.default_rng(1)
+    poses = np.concatenate([odometry.odom_from_body, np.tile(odometry.odom_from_body[-1], (12_000, 1, 1))])
+    poses[:, :3, 3] += rng.normal(0.0, 0.01, (len(poses), 3))
+    stamps = START + np.arange(len(poses)) * 50 * MS
+    keyframes, _ = _select(stamps, Odometry(stamps, poses, None))
+    assert len(keyframes.stamp_ns) > 500  # of 60 m, with the least spacing
+
+
+def test_a_short_piece_has_a_keyframe() -> None:
+    odometry = _drive(1.0, seconds=10.0)
+    pieces = Odometry(odometry.stamp_ns, odometry.odom_from_body, None, breaks=np.array([103, 109]))
+    keyframes, _ = _select(odometry.stamp_ns, pieces, distance_m=1.0)
+    assert np.isin(odometry.stamp_ns[[103, 109]], keyframes.stamp_ns).all()
+
+
 def test_frames_before_and_after_the_odometry_are_left_out() -> None:
     odometry = _drive(2.0, seconds=10.0)
     stamps = _frames(seconds=20.0, start_s=-5.0)

@@ -123,6 +123,17 @@ def test_a_street_is_followed_in_a_unit_of_its_own() -> None:
     assert again.odom_from_body.tobytes() == odometry.odom_from_body.tobytes()
 
 
+def test_the_unit_is_that_of_all_that_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not of the first two views, which may look at the ground before the camera."""
+    frames, truth = street()
+    lengths = []
+    for unit in (UNIT_DEPTH, UNIT_DEPTH / 5):
+        monkeypatch.setitem(two_views.__globals__, "UNIT_DEPTH", unit)
+        lengths.append(np.linalg.norm(np.diff(followed(frames).odom_from_body[:, :3, 3], axis=0), axis=1).sum())
+    assert lengths[0] == pytest.approx(lengths[1], rel=0.02)
+    assert 0.5 < lengths[0] / np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum() < 2.0
+
+
 def test_a_camera_that_turns_has_no_motion_and_one_that_goes_on_has() -> None:
     """The first picture turned about the camera, by which nothing begins; then the street."""
     frames, _ = street()
@@ -155,7 +166,8 @@ def fixes_at(stamp_ns: np.ndarray, enu_m: Floats) -> Gps:
     return Gps(stamp_ns, latitude, longitude, altitude, np.tile(np.eye(3), (len(stamp_ns), 1, 1)))
 
 
-def test_fixes_give_metres_to_a_scale_that_wanders() -> None:
+@pytest.mark.parametrize("claimed_m", [1.0, 0.02])
+def test_fixes_give_metres_to_a_scale_that_wanders(claimed_m: float) -> None:
     """A bend of 600 m whose steps come out at a third of a metre at first, and at two thirds in the end."""
     rng, count = np.random.default_rng(5), 601
     heading = np.linspace(0.0, 2.5, count)
@@ -167,6 +179,7 @@ def test_fixes_give_metres_to_a_scale_that_wanders() -> None:
     odometry = Odometry(stamp_ns, own, np.tile(np.eye(6), (count, 1, 1)), breaks=np.zeros(0, np.int64), metric=False)
     rows = np.arange(0, count, 10)
     fixes = fixes_at(stamp_ns[rows], poses[rows, :3, 3] + rng.normal(0.0, 1.0, (len(rows), 3)))
+    fixes = replace(fixes, covariance=fixes.covariance * claimed_m**2)
     found = in_metres(odometry, fixes, SENSOR.camera)
     assert found is not None and found.metric and found.covariance is not None
     steps = np.linalg.norm(np.diff(found.odom_from_body[:, :3, 3], axis=0), axis=1)
@@ -221,6 +234,21 @@ def test_the_ratios_of_closures_give_one_scale() -> None:
     steps = np.linalg.norm(np.diff(found.odom_from_body[:, :3, 3], axis=0), axis=1)
     assert steps[-10:].mean() / steps[:10].mean() == pytest.approx(1.0, abs=0.1)
     np.testing.assert_allclose(keyframes.odom_from_body, found.odom_from_body, atol=1e-9)
+
+
+def test_each_piece_keeps_its_own_scale_to_its_ends() -> None:
+    """Two visits of a lane, the second in a unit half as long; no keyframe near the break."""
+    poses = np.tile(np.eye(4), (200, 1, 1))
+    poses[1:, 0, 3] = np.cumsum(np.where(np.arange(1, 200) < 100, 1.0, 2.0))
+    stamp_ns = np.arange(200, dtype=np.int64) * 10**8
+    odometry = Odometry(stamp_ns, poses, None, breaks=np.array([100]), metric=False)
+    rows = np.concatenate([np.arange(0, 95, 5), np.arange(110, 200, 5)])
+    match, query = np.arange(18), np.arange(19, 37)
+    ratios = np.column_stack([query, match, np.full(18, -np.log(2.0)), np.full(18, 0.02)])
+    keyframes = Keyframes("drive", stamp_ns[rows], poses[rows])
+    found, _ = in_one_scale(odometry, keyframes, SENSOR.camera, ratios)
+    steps = np.delete(np.linalg.norm(np.diff(found.odom_from_body[:, :3, 3], axis=0), axis=1), 99)
+    assert steps.max() / steps.min() < 1.1
 
 
 def test_a_run_without_metres_is_evaluated_with_a_scale(finished: Path, drive: Demo, tmp_path: Path) -> None:

@@ -109,6 +109,15 @@ def test_of_frames_that_come_fast_those_between_are_followed_where_the_next_is_l
     assert np.isin(street.stamp_ns[:13], odometry_of(drive).stamp_ns).nonzero()[0].tolist() == [0, 2, 3, 7, 9, 11, 12]
 
 
+def test_stamps_that_run_faster_than_the_camera_lose_no_frame_that_is_needed() -> None:
+    drive = [replace(frame, stamp_ns=500_000 * row) for row, frame in enumerate(frames(stereo=False))]
+    found = odometry_of(drive)
+    assert not len(found.breaks)
+    rows = found.stamp_ns // 500_000
+    assert rows[-1] == FRAMES - 1 and np.diff(rows).max() <= 4
+    assert np.abs(steps_off(found, rows)[:, 3:]).max() < 0.1
+
+
 def test_the_drive_goes_on_as_another_piece() -> None:
     """Two seconds without a picture, after which the street looks otherwise: the pose is held there."""
     drive = [blank(frame) if 4 <= row < 16 else frame for row, frame in enumerate(frames(stereo=False))]
@@ -150,6 +159,20 @@ def test_closures_do_not_make_odometry_of_the_same_images_surer_than_it_claims()
     assert own is not None and shared is not None
     ratio = np.sqrt(np.trace(shared[5, 3:, 3:]) / np.trace(own[5, 3:, 3:]))
     assert ratio > 3.0
+
+
+def test_depth_at_a_fifth_of_the_rate_is_enough() -> None:
+    """At moments that are not those of references, and none but NaN at others."""
+    street, drive = slow(), list[Frame]()
+    for row in range(50):
+        image, depth = take_picture(street, row)
+        depth = depth if row % 6 == 1 else np.full_like(depth, np.nan) if row % 2 else None
+        drive.append(Frame(int(street.stamp_ns[row]), street.camera, image, depth))
+    odometry = odometry_of(drive)
+    assert not len(odometry.breaks)
+    truth = street.world_from_body[np.searchsorted(street.stamp_ns, odometry.stamp_ns)]
+    off = se3.between(se3.between(truth[0], truth[-1]), se3.between(*odometry.odom_from_body[[0, -1]]))
+    assert np.linalg.norm(off[:3, 3]) < 0.02 * np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()
 
 
 @pytest.mark.parametrize("without", [slice(0, None, 2), slice(1, None, 2), slice(3, 7)])
