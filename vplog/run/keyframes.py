@@ -58,8 +58,9 @@ def select_keyframes(
             "Compare the clocks with `vplog info`, or choose another topic with --odometry-topic."
         )
     poses = se3.interpolate_at(odometry.stamp_ns, odometry.odom_from_body, stamp_ns)
-    # the first of each piece: else closures may not find a short one
-    begins = np.searchsorted(stamp_ns, odometry.stamp_ns[odometry.breaks])
+    # the first of each piece of two samples or more: else closures may not find a short one
+    begin = odometry.breaks[np.diff(odometry.breaks, append=len(odometry.stamp_ns)) > 1]
+    begins = np.searchsorted(stamp_ns, odometry.stamp_ns[begin])
     rows = _far_enough(poses, _spacing(poses, settings), np.deg2rad(settings.rotation_deg), begins)
     return Keyframes(drive, stamp_ns[rows], poses[rows]), warnings
 
