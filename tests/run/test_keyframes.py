@@ -125,7 +125,7 @@ def test_a_short_piece_has_a_keyframe() -> None:
     keyframes, _ = _select(odometry.stamp_ns, pieces, distance_m=1.0)
     assert np.isin(odometry.stamp_ns[[103, 109]], keyframes.stamp_ns).all()
     unknown = Odometry(odometry.stamp_ns, odometry.odom_from_body, None, breaks=np.arange(1, 201))
-    assert len(_select(odometry.stamp_ns, unknown, distance_m=1.0)[0].stamp_ns) == 11
+    assert len(_select(odometry.stamp_ns, unknown, distance_m=1.0)[0].stamp_ns) == 10
 
 
 def test_frames_before_and_after_the_odometry_are_left_out() -> None:
