@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.logs.drives import store
+from vplog.logs.calibrations.camera import pinhole
 from vplog.logs.cameras import camera_of
 from vplog.logs.formats.container import Channel, Message, Notes
 from vplog.logs.gather import TopicCollector
@@ -114,3 +115,14 @@ def test_one_calibration_for_both_cameras_of_a_pair_is_that_of_each() -> None:
     for part in ("image", "right"):
         (found,) = read.calibrations(info, part, Notes())
         np.testing.assert_array_equal(found.matrix, K)
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 1.1, 2.0])
+def test_a_calibration_without_a_size_is_that_of_images_with_its_centre(scale: float) -> None:
+    """KITTI's calib.txt beside images of other sizes."""
+    notes, size = Notes(), (round(1241 * scale), round(376 * scale))
+    camera = camera_of("image_0", pinhole(np.full(2, 718.9), np.array([607.2, 185.2])), size, notes)
+    assert (camera.matrix is not None) == (abs(scale - 1) < 0.2)
+    assert (f"(607.2, 185.2) px is far from that of images of {size[0]} x {size[1]} px" in " ".join(notes.lines)) == (
+        camera.matrix is None
+    )

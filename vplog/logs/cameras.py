@@ -34,6 +34,9 @@ _LARGEST_PX = 1e7
 """px; a longer focal length is damage: telescopes have 1e6."""
 _SAME_PX = 1.0
 """px that a calibration that came later may move the image's corners without being another: focus moves them."""
+_CENTRED = 0.2
+"""Share of an image that its principal point may lie off the middle: lenses are a few % off, cropped images a tenth; of
+images of half or twice the size it lies by 0.5 or 0.25."""
 _SAME_SHAPE = 0.01
 """Relative difference of the scales in x and y below which a resized image still fits its calibration: rounding."""
 
@@ -117,15 +120,23 @@ def _model(name: str, coefficients: Floats) -> tuple[str, Floats] | None:
 
 def _fit(camera: Camera, matrix: Floats, calibration: CalibrationMessage, notes: Notes) -> Camera:
     """The camera for the size its images really have."""
-    width, height = calibration.width, calibration.height
-    if not (width and height) or (camera.width, camera.height) in ((width, height), (0, 0)):
+    width, height, images = calibration.width, calibration.height, (camera.width, camera.height)
+    unknown = replace(camera, distortion_model="none", distortion=np.zeros(0))
+    if not (width and height) and all(images) and np.abs(matrix[:2, 2] / images - 0.5).max() > _CENTRED:
+        notes.add(
+            f"{camera.name} is uncalibrated: the centre of its calibration, which has no size, at "
+            f"({matrix[0, 2]:.1f}, {matrix[1, 2]:.1f}) px is far from that of images of {images[0]} x {images[1]} px. Is "
+            "it of images of another size? Give one with its size with --calibration."
+        )
+        return unknown
+    if not (width and height) or images in ((width, height), (0, 0)):
         size = (camera.width or width, camera.height or height)
         return replace(camera, matrix=matrix, width=size[0], height=size[1])
     x, y = camera.width / width, camera.height / height
     sizes = f"{camera.width} x {camera.height} px, its calibration {width} x {height}"
     if abs(x - y) > _SAME_SHAPE * max(x, y):
         notes.add(f"{camera.name} is uncalibrated: its images have {sizes}. Give another with --calibration.")
-        return replace(camera, distortion_model="none", distortion=np.zeros(0))
+        return unknown
     notes.add(f"The images of {camera.name} have {sizes}; the matrix is scaled to the images.")
     return replace(camera, matrix=resized(x, y) @ matrix)
 
