@@ -10,6 +10,7 @@ import pytest
 
 from vplog import logs
 from vplog.errors import LogError
+from vplog.logs.image_folder import stamps_of
 from vplog.logs.topic_selection import TopicChoice
 
 if TYPE_CHECKING:
@@ -148,6 +149,26 @@ def test_times_in_names_are_read_beside_words(name: str, tmp_path: Path) -> None
     np.testing.assert_array_equal(logs.open(tmp_path / "s").stamps(), stamps // 1000 * 1000)
     write(tmp_path / "counted", [name.format(f"{10 * number:06}") for number in range(5)])
     np.testing.assert_array_equal(logs.open(tmp_path / "counted").stamps(), 100_000_000 * np.arange(5))
+
+
+DOTS = {
+    "behind a camera": ("cam0.{}", range(1, 25), False),
+    "behind a camera, padded": ("cam0.{:03}", range(1, 25), False),
+    "behind a shot": ("shot1.{:04}", range(1, 25), False),
+    "in two shots": ("{}", [f"{shot}.{number}" for shot in (1, 2) for number in range(1, 13)], False),
+    "since a start": ("frame_{:.6f}", np.arange(24) / 30, False),
+    "of a drive since a start": ("frame_{:.6f}", np.arange(60) / 30, True),
+    "of a second since 1970": ("{:.6f}", 1_403_715_273 + np.arange(6) / 30, True),
+}
+
+
+@pytest.mark.parametrize("kind", DOTS)
+def test_numbers_behind_a_dot_are_counters_or_times(kind: str) -> None:
+    pattern, values, timed = DOTS[kind]
+    found = stamps_of([pattern.format(value) for value in values])
+    assert (found is not None) == timed
+    if found is not None:
+        np.testing.assert_allclose(np.diff(found), 1e9 / 30, atol=1001)
 
 
 def test_what_the_system_hides_beside_images_is_none(tmp_path: Path) -> None:

@@ -74,28 +74,30 @@ def stamps_of(names: list[str]) -> list[int] | None:
     """ns from file stems that are times, or hold one beside words that all have (`frame_1403715273262142976`); None
     where they count the images.
 
-    Times are decimal seconds, whole s, ms, us or ns that all lie between 1990 and 2100, or a date and a time of day to
-    the ms (`PXL_20230512_143015123`). Others are us or ns since some start, as of a machine's boot, where their median
-    step is the period of a camera in one of the two: counters go in steps of a few, with leading zeros or without.
+    Times are decimal seconds, or whole s, ms, us or ns, that all lie between 1990 and 2100, or a date and a time of day
+    to the ms (`PXL_20230512_143015123`). Others are decimal seconds, us or ns since some start, as of a machine's boot,
+    where all differ and their median step is the period of a camera: counters go in steps of a few, with leading zeros
+    or without, also behind the number of a camera and a dot (`cam0.17`).
     """
     dates = [_DATE.search(name) for name in names]
     with suppress(ValueError):  # no such day
         found = [datetime.strptime(f"{one[1]}{one[2]}Z", "%Y%m%d%H%M%S%f%z") for one in dates if one]
         if 2 * len({*found}) > len(found):  # else of a burst, or of the clip that they are the frames of
             return [round(at.timestamp() * 1e3) * 10**6 for at in found] if len(found) == len(names) else None
-    names = _changing(names)
+    names, units = _changing(names), (10**9, 10**6, 10**3, 1)
     if all(re.fullmatch(r"[0-9]{1,10}\.[0-9]{1,9}", name) for name in names):
-        parts = [name.split(".") for name in names]
-        return [int(whole) * 10**9 + int(fraction.ljust(9, "0")) for whole, fraction in parts]
-    if not all(re.fullmatch(r"[0-9]{1,30}", name) for name in names):
+        parts, units = [name.split(".") for name in names], (1,)
+        if len({whole for whole, _ in parts}) == 1 and int(parts[0][0]) < _SINCE_1970_S[0]:
+            return None  # a camera's number before a counter, rather than a drive of less than a second
+        names = [whole + fraction.ljust(9, "0") for whole, fraction in parts]
+    if not (names and all(re.fullmatch(r"[0-9]{1,30}", name) for name in names)):
         return None
     values = sorted({int(name) for name in names})
     low_ns, high_ns = (bound * 10**9 for bound in _SINCE_1970_S)
-    units = (10**9, 10**6, 10**3, 1)
     unit = next((ns for ns in units if low_ns <= values[0] * ns and values[-1] * ns < high_ns), 0)
-    if not unit and len(values) > 1:
+    if not unit and 1 < len(values) == len(names):
         step = statistics.median(b - a for a, b in pairwise(values))
-        unit = next((ns for ns in (10**3, 1) if _PERIODS_NS[0] <= step * ns < _PERIODS_NS[1]), 0)
+        unit = next((ns for ns in units[-2:] if _PERIODS_NS[0] <= step * ns < _PERIODS_NS[1]), 0)
     return [int(name) * unit for name in names] if unit and values[-1] * unit < 2**63 else None
 
 
