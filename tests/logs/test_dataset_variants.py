@@ -196,3 +196,62 @@ def test_an_imu_that_nothing_places_is_not_taken_to_be_the_camera(tmp_path: Path
     log = logs.open(tmp_path)
     assert log.imu() is None
     assert "imu_0: the static transforms do not place it" in " ".join(log.warnings)
+
+
+def test_the_largest_of_several_colmap_models_is_used(tmp_path: Path) -> None:
+    """The mapper begins another model where it can add no image to the first."""
+    colmap(tmp_path)
+    shutil.copytree(tmp_path / "sparse" / "0", tmp_path / "sparse" / "1")
+    table = tmp_path / "sparse" / "1" / "images.txt"
+    text(table, *table.read_text().splitlines()[: 1 + 2 * (COUNT - 2)])
+    for model, count in (("0", COUNT), ("1", COUNT - 2)):
+        log = logs.open(tmp_path)
+        assert len(log.stamps()) == count
+        remark = f"sparse/{model}, the largest of 2 models, has {count} of the {COUNT} images"
+        assert (remark in " ".join(log.warnings)) == (count < COUNT)
+        table = tmp_path / "sparse" / "0" / "images.txt"
+        text(table, *table.read_text().splitlines()[:3])  # one image
+
+
+@pytest.mark.parametrize("folders", [("100MEDIA", "101MEDIA"), ("left", "right")])
+def test_folders_of_a_colmap_models_images_are_cameras_where_they_run_side_by_side(
+    folders: tuple[str, str], tmp_path: Path
+) -> None:
+    names = [f"{folders[row // 3]}/{row % (3 if folders[0] == 'left' else COUNT)}.png" for row in range(COUNT)]
+    colmap(tmp_path)
+    table = tmp_path / "sparse" / "0" / "images.txt"
+    text(table, re.sub(r"frame (\d)\.png", lambda found: names[int(found[1])], table.read_text()))
+    for folder in folders:
+        (tmp_path / "images" / folder).mkdir()
+    for row, name in enumerate(names):
+        (tmp_path / "images" / f"frame {row}.png").rename(tmp_path / "images" / name)
+    log = logs.open(tmp_path)
+    if folders[0] == "left":
+        assert len(log.stamps()) == 3
+        assert "several cameras by the folders of their images: left (3), right (3)" in " ".join(log.warnings)
+    else:
+        check_frames(log, np.arange(COUNT) * 100_000_000, images())
+        check_truth(log, log.stamps(), poses())
+
+
+@pytest.mark.parametrize(
+    ("write", "file", "known", "other"),
+    [
+        (colmap, "sparse/0/cameras.txt", "PINHOLE", "FOV"),
+        (euroc, "mav0/cam*/sensor.yaml", "pinhole", "omni"),
+        (vslam_lab, "calibration.yaml", "radtan5", "eucm"),
+    ],
+    ids=["colmap", "euroc", "vslam-lab"],
+)
+def test_a_data_sets_camera_of_another_kind_is_uncalibrated(
+    write: Callable[[Path], None], file: str, known: str, other: str, tmp_path: Path
+) -> None:
+    write(tmp_path / "drive")
+    for one in (tmp_path / "drive").glob(file):
+        one.write_text(one.read_text().replace(known, other))
+    text(tmp_path / "orb.yaml", *ORB)
+    for chosen in (None, tmp_path / "orb.yaml"):
+        log = logs.open(tmp_path / "drive", TopicChoice(calibration_file=chosen))
+        assert (log.camera().matrix is None) == (chosen is None)
+        assert len(log.stamps()) == COUNT
+        assert "The calibration of the data set is not used" in " ".join(log.warnings)

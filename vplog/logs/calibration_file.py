@@ -43,6 +43,16 @@ def read_calibrations(path: Path) -> list[CalibratedCamera]:
         raise LogError(f"{path} is not YAML: {str(error).splitlines()[0]}. {_KINDS}.") from None
 
 
+def calibrations_beside(path: Path, remarks: list[str]) -> list[CalibratedCamera]:
+    """The cameras of the calibration that a data set has; none without one, or, with a remark, where it is of a kind
+    that is not read: --calibration may give another."""
+    try:
+        return read_calibrations(path) if path.is_file() else []
+    except LogError as error:
+        remarks.append(f"The calibration of the data set is not used; --calibration takes another. {error}")
+        return []
+
+
 def _cameras(name: str, data: bytes) -> list[CalibratedCamera]:
     """By the first line that is no comment, except COLMAP's binary file, which nothing marks but its name."""
     if name == "cameras.bin":

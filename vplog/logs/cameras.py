@@ -125,8 +125,8 @@ def _fit(camera: Camera, matrix: Floats, calibration: CalibrationMessage, notes:
     if not (width and height) and all(images) and np.abs(matrix[:2, 2] / images - 0.5).max() > _CENTRED:
         notes.add(
             f"{camera.name} is uncalibrated: the centre of its calibration, which has no size, at "
-            f"({matrix[0, 2]:.1f}, {matrix[1, 2]:.1f}) px is far from that of images of {images[0]} x {images[1]} px. Is "
-            "it of images of another size? Give one with its size with --calibration."
+            f"({matrix[0, 2]:.1f}, {matrix[1, 2]:.1f}) px is far from that of images of {images[0]} x {images[1]} px. "
+            "Is it of images of another size? Give one with its size with --calibration."
         )
         return unknown
     if not (width and height) or images in ((width, height), (0, 0)):

@@ -118,7 +118,7 @@ _NUMBER = re.compile(r"((?:cam(?:era)?|infra|fisheye)[_-]?\d(?!\d))|(\d+)", re.I
 def select_camera(folder: Path, files: list[Path], choice: str | None) -> list[Path]:
     """The files in order, of one camera, by names, bits or size: of several, that which `choice` names, as
     `left_*.png`. Raises LogError where none of them is chosen."""
-    splits = (partial(_by_folder, folder), _by_name, _by_bits, _by_size)
+    splits = (partial(by_folder, folder), _by_name, _by_bits, _by_size)
     groups = next((found for split in splits if len(found := split(files)) > 1), {})
     if not groups:
         return files
@@ -140,7 +140,7 @@ def _grouped(files: list[Path], name: Callable[[Path], str]) -> Group:
     return groups
 
 
-def _by_folder(root: Path, files: list[Path]) -> Group:
+def by_folder(root: Path, files: list[Path]) -> Group:
     """Groups by the folder below `root`, where these are fewer than the images of each and run side by side. Empty
     where they follow each other, or hold a few views of a place each."""
     groups = _grouped(files, lambda file: file.relative_to(root).parent.as_posix())

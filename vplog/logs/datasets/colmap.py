@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections import Counter, defaultdict
+from collections import Counter
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -12,14 +12,16 @@ import numpy as np
 from vplog.data import Floats, Trajectory
 from vplog.errors import LogError
 from vplog.geometry import se3
-from vplog.logs.calibration_file import read_calibrations
+from vplog.logs.calibration_file import calibrations_beside
 from vplog.logs.datasets.streams import DataSet, calibration_stream, camera_streams, mount_stream
 from vplog.logs.datasets.text_tables import lines_of
-from vplog.logs.image_folder import named_stamps, natural_order
+from vplog.logs.image_folder import by_folder, image_files, named_stamps, natural_order
 from vplog.logs.tf_odometry import are_usable
 
-_MODELS = (".", "sparse", "sparse/0", "colmap/sparse/0", "dslr_calibration_undistorted")
-"""Paths of a model below the folder of a reconstruction: COLMAP's own, its automatic one, NeRF's, ETH3D's."""
+_MODELS = (".", "sparse", "sparse/*", "colmap/sparse/*", "dslr_calibration_undistorted")
+"""Paths of models below the folder of a reconstruction: COLMAP's own, its automatic ones, NeRF's, ETH3D's."""
+_ENDINGS = (".txt", ".bin")
+"""Endings of the tables of a model, the best last."""
 _LARGEST = 2**31
 """Bytes of images.bin; 100,000 images of 1000 points take a third of it."""
 _UNITS = (
@@ -37,45 +39,61 @@ class _Image(NamedTuple):
     """Quaternion w x y z and translation of camera_from_world."""
 
 
-def _model_of(path: Path) -> Path | None:
-    for folder in (path / name for name in _MODELS):
-        for ending in (".bin", ".txt"):
-            if all((folder / f"{name}{ending}").is_file() for name in ("cameras", "images")):
-                return folder / f"images{ending}"
-    return None
+def _models_of(path: Path) -> list[Path]:
+    """Tables of images of the models at the first of the places that has one: the mapper writes one for each part of
+    the images that it cannot join to the others."""
+    for place in _MODELS:
+        folders = sorted(path.glob(place)) if "*" in place else [path / place]
+        each = ([folder / f"{name}{end}" for name in ("images", "cameras")] for folder in folders for end in _ENDINGS)
+        found = {table.parent: table for table, cameras in each if table.is_file() and cameras.is_file()}
+        if found:
+            return [*found.values()]
+    return []
 
 
 def roots(path: Path) -> list[Path]:
-    return [path] if _model_of(path) is not None else []
+    return [path] if _models_of(path) else []
 
 
 def read(path: Path) -> DataSet:
-    """The body is the camera of most images, whose poses are the truth. Raises LogError."""
-    table = _model_of(path)
-    if table is None:
+    """The largest model. The body is the camera of most images, whose poses are the truth. Raises LogError."""
+    if not (tables := _models_of(path)):
         raise LogError(f"{path} holds no COLMAP model. Give the folder with cameras and images.")
+    table, remarks = max(tables, key=lambda table: table.stat().st_size), [_UNITS]
     images = _binary(table) if table.suffix == ".bin" else _text(table)
+    images.sort(key=lambda one: [natural_order(part) for part in PurePosixPath(one.name).parts])
     folder = _folder_of(images, [path, *table.resolve().parents[:3]], table)
-    cameras = {one.name: one for one in read_calibrations(table.with_name(f"cameras{table.suffix}"))}
-    groups: defaultdict[str, list[_Image]] = defaultdict(list)
-    for one in sorted(images, key=lambda image: natural_order(Path(image.name).name)):
-        groups[str(PurePosixPath(one.name).parent)].append(one)
+    at = {folder / one.name: one for one in images}
+    if len(at) < (count := sum(len(image_files(one)) for one in {file.parent for file in at})):
+        which = f", the largest of {len(tables)} models," if len(tables) > 1 else ""
+        remarks.append(
+            f"{table.parent}{which} has {len(at)} of the {count} images in {folder}; the others are left out. "
+            f"Give {folder} to take all, without a calibration and poses."
+        )
+    cameras = {one.name: one for one in calibrations_beside(table.with_name(f"cameras{table.suffix}"), remarks)}
+    groups = by_folder(folder, [*at]) or {".": [*at]}
     streams, main = [], max(sorted(groups), key=lambda name: len(groups[name]))
-    for name, group in groups.items():
-        files = [folder / one.name for one in group]
+    if len(groups) > 1:
+        found = ", ".join(f"{name} ({len(group)})" for name, group in sorted(groups.items()))
+        remarks.append(
+            f"The model has several cameras by the folders of their images: {found}. Its poses are taken of {main}; "
+            "choose a camera with --image-topic."
+        )
+    for name, files in groups.items():
         topic = folder.name if name == "." else name
         stamp_ns, _ = named_stamps(files)
-        if missing := next((one for one in group if one.camera not in cameras), None):
+        streams += camera_streams(topic, stamp_ns, files, None)
+        if missing := next((at[one] for one in files if cameras and at[one].camera not in cameras), None):
             raise LogError(f"The COLMAP model has no camera {missing.camera} of {missing.name[:60]}. Copy it again.")
-        known = [cameras[one.camera].calibration for one in group]  # COLMAP may have a camera for every image
-        streams += [*camera_streams(topic, stamp_ns, files, None), calibration_stream(topic, stamp_ns, known)]
-    stamp_ns, timed = named_stamps([folder / one.name for one in groups[main]])
+        if cameras:  # COLMAP may have one for every image
+            streams.append(calibration_stream(topic, stamp_ns, [cameras[at[one].camera].calibration for one in files]))
+    stamp_ns, timed = named_stamps(groups[main])
     stamp_ns, rows = np.unique(stamp_ns, return_index=True)
     streams.append(mount_stream(folder.name if main == "." else main, stamp_ns[:1], np.eye(4)))
-    values = np.array([groups[main][row].pose for row in rows], np.float64)
+    values = np.array([at[groups[main][row]].pose for row in rows], np.float64)
     camera_from_world: Floats = se3.pose(se3.rotation(values[:, [1, 2, 3, 0]]), values[:, 4:])
     truth = Trajectory(stamp_ns, se3.inverse(camera_from_world))
-    return DataSet("colmap", streams, truth, [_UNITS], assumed_times=not timed)
+    return DataSet("colmap", streams, truth, remarks, assumed_times=not timed)
 
 
 def _folder_of(images: list[_Image], near: list[Path], table: Path) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from vplog.logs.calibration_file import read_calibrations
+from vplog.logs.calibration_file import calibrations_beside
 from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, imu_stream
 from vplog.logs.datasets.text_tables import listed_images, poses_of
 from vplog.logs.image_folder import below, image_files, named_stamps
@@ -20,23 +20,23 @@ def roots(path: Path) -> list[Path]:
 
 def read(path: Path) -> DataSet:
     """The body is that of T_BS, EuRoC's IMU. Raises LogError."""
-    streams: list[Stream] = []
+    streams, remarks = list[Stream](), list[str]()
     for folder in below(path):
         if folder.name.startswith("cam"):
-            streams += _camera(folder)
+            streams += _camera(folder, remarks)
         elif folder.name.startswith("imu") and (folder / "data.csv").is_file():
             streams.append(imu_stream(folder.name, folder / "data.csv"))
     truths = [path / name / "data.csv" for name in _POSES]
     found = next((file for file in truths if file.is_file()), None)
-    return DataSet("euroc", streams, None if found is None else poses_of(found, 1, scalar_first=True))
+    truth = None if found is None else poses_of(found, 1, scalar_first=True)
+    return DataSet("euroc", streams, truth, remarks)
 
 
-def _camera(folder: Path) -> list[Stream]:
-    table, sensor = folder / "data.csv", folder / "sensor.yaml"
-    if table.is_file():
+def _camera(folder: Path, remarks: list[str]) -> list[Stream]:
+    if (table := folder / "data.csv").is_file():
         stamp_ns, files = listed_images(table, folder / "data", 1)
     else:
         files = image_files(folder / "data")
         stamp_ns, _ = named_stamps(files)
-    camera = read_calibrations(sensor)[0] if sensor.is_file() else None
+    camera = next(iter(calibrations_beside(folder / "sensor.yaml", remarks)), None)
     return camera_streams(folder.name, stamp_ns, files, camera)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from vplog.errors import LogError
-from vplog.logs.calibration_file import read_calibrations
+from vplog.logs.calibration_file import calibrations_beside
 from vplog.logs.calibrations.camera import CalibratedCamera
 from vplog.logs.datasets import tum_rgbd
 from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, depth_stream, imu_stream, mount_stream
@@ -22,13 +22,13 @@ def roots(path: Path) -> list[Path]:
 def read(path: Path, depth_per_m: float | None = None) -> DataSet:
     """The body is that of T_BS; without one the IMU, or else the first camera. `depth_per_m` are counts of a
     metre in the depth images, None as calibration.yaml has them. Raises LogError."""
-    calibration = path / "calibration.yaml"
-    cameras = {one.name: one for one in read_calibrations(calibration)} if calibration.is_file() else {}
+    remarks = list[str]()
+    cameras = {one.name: one for one in calibrations_beside(path / "calibration.yaml", remarks)}
     if (path / "rgb.csv").is_file():
-        remarks: list[str] = []
         streams = _columns(path, cameras, depth_per_m, remarks)
     else:  # before 2025: one camera, in the lists of TUM RGB-D
-        streams, remarks = tum_rgbd.listed_streams(path, next(iter(cameras.values()), None), depth_per_m)
+        streams, more = tum_rgbd.listed_streams(path, next(iter(cameras.values()), None), depth_per_m)
+        remarks += more
     if (imu := path / "imu_0.csv").is_file():
         streams.append(imu_stream("imu_0", imu))  # of the body, so that only T_BS places a camera
     elif all(one.body_from_camera is None for one in cameras.values()):
