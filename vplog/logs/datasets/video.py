@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from vplog.data import Bytes, Ints
-from vplog.errors import LogError
+from vplog.errors import LogError, plural
 from vplog.logs.datasets.streams import DataSet, Stream, raw_image
 from vplog.logs.formats.container import Channel
 from vplog.logs.image_folder import first_bytes
@@ -41,6 +41,13 @@ _FILTERS = {"h264": "h264_mp4toannexb,dump_extra", "hevc": "hevc_mp4toannexb,dum
 """FFmpeg's filters that make packets of files like those of messages, each key frame with its parameter sets."""
 _MOST_FRAMES = 10_000_000
 """Frames of a file: two days at 60 Hz."""
+_FEW = 10
+"""Packets of another stream that are no camera's: thumbnails."""
+_CUT_S, _CUT = 1.0, 0.1
+"""s, and share of the duration that a file names, without which at its end it is noted to be cut short: audio may go
+on a little longer."""
+_SQUARE = 0.01
+"""Most that the width of a pixel may differ from its height: rounding."""
 
 
 class _Packet(NamedTuple):
@@ -77,17 +84,28 @@ class VideoFrames:
         """Reads the packets once; `note` takes what the decoder cannot. Raises LogError."""
         self._av, self._path, self._note = pyav(f"{path} is a video"), path, note
         with self._opened() as container:
-            stream = self._stream(container)
+            streams = self._streams(container)
+            found = {one.index: list[_Packet]() for one in streams}
+            for one in container.demux(streams):
+                if one.size:
+                    packet = _Packet(one.pts, one.dts, one.pos, one.is_keyframe, one.is_discard)
+                    found[one.stream_index].append(packet)
+            self._index = max(found, key=lambda index: len(found[index]))
+            stream, packets = self._stream(container), found[self._index]
             self._codec, self._tick_s = stream.codec_context.codec.canonical_name, stream.time_base
-            packets = [
-                _Packet(one.pts, one.dts, one.pos, one.is_keyframe, one.is_discard)
-                for one in container.demux(stream)
-                if one.size
-            ]
+            is_avi = container.format.name == "avi"
             # AVI has a slot of time for each packet in place of stamps: the frames take them in their order
             slots = any(one.pts is None for one in packets) or (
-                container.format.name == "avi" and self._codec == "h264" and stream.codec_context.has_b_frames
+                is_avi and self._codec == "h264" and stream.codec_context.has_b_frames
             )
+            # FFmpeg shortens the duration of an AVI file to the bytes that are there, and not the count of its frames
+            if is_avi and stream.average_rate:
+                whole_s = stream.frames / stream.average_rate
+            elif stream.duration is not None:
+                whole_s = stream.duration * stream.time_base
+            else:
+                whole_s = (container.duration or 0) / 10**6
+            aspect = float(stream.sample_aspect_ratio or 1)
         self._packets = packets
         self._at, self._data = -1, b""
         """The last packet that was read, and its number."""
@@ -98,6 +116,7 @@ class VideoFrames:
         self._ticks = np.unique(np.array(shown, np.int64))
         if not 0 < len(self._ticks) <= _MOST_FRAMES:
             raise LogError(f"{path} holds no picture with a time stamp. Give another video.")
+        self._note_doubts({index: len(one) for index, one in found.items()}, len(shown), float(whole_s), aspect)
         self._turn = self._first_turn()
         self._decoder()  # raises here where the file cannot be decoded
         order = self._decoded_order() if slots else range(len(packets))
@@ -105,7 +124,7 @@ class VideoFrames:
         rows = [-1] * len(packets)  # of those that are not shown
         for number, time, one in zip(order, times, (packets[number] for number in order), strict=True):
             if time is not None and not one.discarded:
-                rows[number] = places[time]
+                rows[number] = places.pop(time, -1)  # the first of those with one stamp
         kinds = bytes(WHOLE_KEY if one.key else PLAIN for one in packets)
         self._video = VideoStream(self._codec, self._packet, len(packets), self._decoder, rows, kinds)
 
@@ -123,7 +142,7 @@ class VideoFrames:
             frame = self._video.frame(row)
         except BadMessageError:
             return raw_image(stamp_ns, "video", "mono8", np.zeros((0, 0), np.uint8))
-        turn = _TURNS.get(round(frame.rotation) or self._turn)
+        turn = _TURNS.get(_turn_deg(frame) or self._turn)
 
         def turned(image: Bytes) -> Bytes:
             return image if turn is None else np.asarray(cv2.rotate(image, turn), np.uint8)
@@ -173,12 +192,42 @@ class VideoFrames:
 
     def _first_turn(self) -> int:
         """The turn that the container names, in degrees counterclockwise."""
+        name = self._path.name
         with self._opened() as container, suppress(self._av.error.FFmpegError):
             stream = self._stream(container)
             stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
             for frame in container.decode(stream):
-                return round(frame.rotation)
+                if frame.interlaced_frame:
+                    self._note(
+                        f"The frames of {name} are interlaced: rows in turn are of two times. Make whole frames first: "
+                        "ffmpeg -i IN -vf bwdif OUT."
+                    )
+                if (turn := _turn_deg(frame)) is None:
+                    self._note(f"The display matrix of {name} mirrors its pictures; they are read as recorded.")
+                return turn or 0
         return 0
+
+    def _note_doubts(self, packets: dict[int, int], shown: int, whole_s: float, aspect: float) -> None:
+        """Note where the file holds other pictures, or others than it names: `packets` of each stream, frames `shown`
+        of the one in use, its duration, and the width of a pixel by its height."""
+        name, span_s = self._path.name, self.stamp_ns[-1] / 1e9
+        if sum(count > _FEW for count in packets.values()) > 1:
+            listed = ", ".join(f"{index} ({count} packets)" for index, count in packets.items())
+            self._note(
+                f"{name} has the video streams {listed}, of which {self._index} is used. Give another as a file of its "
+                "own: ffmpeg -i IN -map 0:NUMBER -c copy OUT."
+            )
+        if whole_s - span_s > max(_CUT_S, _CUT * whole_s):
+            self._note(
+                f"{name} ends after {span_s:.1f} of the {whole_s:.1f} s that it names: is it cut? Copy it again."
+            )
+        if double := shown - len(self._ticks):
+            self._note(f"{plural(double, 'frame')} of {name} with the time stamp of another left out.")
+        if abs(aspect - 1) > _SQUARE:
+            self._note(
+                f"The pixels of {name} are {aspect:.3g} times as wide as high, and are read as stored. Without a "
+                "calibration of such images, make them square first: ffmpeg -i IN -vf scale=iw*sar:ih,setsar=1 OUT."
+            )
 
     def _decoded_order(self) -> list[int]:
         """Numbers of the packets as their frames come out, those without a frame before the next key frame."""
@@ -204,7 +253,26 @@ class VideoFrames:
         except self._av.error.FFmpegError as error:
             raise LogError(f"{self._path} is no video that can be read: {error.strerror}. Convert it first.") from None
 
-    def _stream(self, container: Any) -> Any:
-        if not container.streams.video:
+    def _streams(self, container: Any) -> list[Any]:
+        """Streams of pictures in time. Raises LogError."""
+        attached = self._av.stream.Disposition.attached_pic
+        found = [one for one in container.streams.video if not one.disposition & attached]
+        if not found:
             raise LogError(f"{self._path} has no video stream. Give a file with pictures.")
-        return container.streams.video[0]
+        if known := [one for one in found if one.codec_context is not None]:
+            return known
+        raise LogError(
+            f"{self._path} is encrypted, or of a codec that FFmpeg does not know. Convert it where it was made."
+        )
+
+    def _stream(self, container: Any) -> Any:
+        return container.streams[self._index]
+
+
+def _turn_deg(frame: Any) -> int | None:
+    """Degrees counterclockwise by the display matrix; None where that mirrors the picture."""
+    with suppress(KeyError):
+        a, b, _, c, d = np.frombuffer(frame.side_data["DISPLAYMATRIX"], np.int32)[:5].tolist()
+        if a * d < b * c:
+            return None
+    return round(frame.rotation)
