@@ -70,6 +70,17 @@ def test_tables_of_vslam_lab_name_the_unit_of_their_stamps(unit: str, unit_ns: i
     assert {topic.name: topic.count for topic in info.topics}["imu_0"] == COUNT
 
 
+def test_tables_of_euroc_name_the_unit_of_their_stamps(tmp_path: Path) -> None:
+    euroc(tmp_path)
+    for table in (tmp_path / "mav0").glob("*/data.csv"):
+        lines = [re.sub(r"^(\d+)(\d{9})(?=,)", r"\1.\2", line) for line in table.read_text().splitlines()]
+        text(table, "#timestamp [s],values", *lines[1:])
+    log = logs.open(tmp_path)
+    np.testing.assert_array_equal(log.stamps(), STAMPS)
+    check_truth(log, STAMPS, poses())
+    assert (log.info().start_ns, log.info().end_ns) == (STAMPS[0], STAMPS[-1])
+
+
 def recording(root: Path) -> None:
     """Colour and depth of an own camera in the layout of TUM RGB-D, 1000 counts a metre."""
     depth = np.full((COUNT, HEIGHT, WIDTH), 2500, np.uint16)
@@ -255,3 +266,18 @@ def test_a_data_sets_camera_of_another_kind_is_uncalibrated(
         assert (log.camera().matrix is None) == (chosen is None)
         assert len(log.stamps()) == COUNT
         assert "The calibration of the data set is not used" in " ".join(log.warnings)
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_a_file_of_the_left_camera_leaves_a_pair_its_right_one(own: bool, tmp_path: Path) -> None:
+    euroc(tmp_path / "drive")
+    placed = np.eye(4)
+    placed[:3, 3] = 0.0, 0.02, 0.03
+    text(tmp_path / "left.yaml", sensor_yaml(placed).replace("70.0, 71.0", "69.0, 70.0"))
+    if not own:
+        (tmp_path / "drive" / "mav0" / "cam1" / "sensor.yaml").unlink()
+    log = logs.open(
+        tmp_path / "drive", TopicChoice(image="cam0", right="cam1", calibration_file=tmp_path / "left.yaml")
+    )
+    assert log.camera().baseline_m == (pytest.approx(0.1) if own else None)
+    assert ("cam1 has no calibration, and that of --calibration is of one camera" in " ".join(log.warnings)) != own

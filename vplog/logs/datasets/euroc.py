@@ -6,7 +6,7 @@ from pathlib import Path
 
 from vplog.logs.calibration_file import calibrations_beside
 from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, imu_stream
-from vplog.logs.datasets.text_tables import listed_images, poses_of
+from vplog.logs.datasets.text_tables import listed_images, poses_of, table_unit_ns
 from vplog.logs.image_folder import below, image_files, named_stamps
 
 _POSES = ("state_groundtruth_estimate0", "gt0", "mocap0", "vicon0")
@@ -28,13 +28,13 @@ def read(path: Path) -> DataSet:
             streams.append(imu_stream(folder.name, folder / "data.csv"))
     truths = [path / name / "data.csv" for name in _POSES]
     found = next((file for file in truths if file.is_file()), None)
-    truth = None if found is None else poses_of(found, 1, scalar_first=True)
+    truth = None if found is None else poses_of(found, table_unit_ns(found), scalar_first=True)
     return DataSet("euroc", streams, truth, remarks)
 
 
 def _camera(folder: Path, remarks: list[str]) -> list[Stream]:
     if (table := folder / "data.csv").is_file():
-        stamp_ns, files = listed_images(table, folder / "data", 1)
+        stamp_ns, files = listed_images(table, folder / "data", table_unit_ns(table))
     else:
         files = image_files(folder / "data")
         stamp_ns, _ = named_stamps(files)

@@ -15,7 +15,7 @@ from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.logs.calibrations.camera import CalibratedCamera
 from vplog.logs.cameras import BODY
-from vplog.logs.datasets.text_tables import header_of, numbers_of, rows_of, stamps_ns, unit_ns
+from vplog.logs.datasets.text_tables import numbers_of, rows_of, stamps_ns, table_unit_ns
 from vplog.logs.formats.container import HEADER_BYTES, Channel, Contents, Message, Notes, Place, by_topic
 from vplog.logs.messages.pixels import scaled_depth_m
 from vplog.logs.messages.records import (
@@ -162,10 +162,8 @@ def imu_stream(topic: str, table: Path) -> Stream:
     """Rates in rad/s and accelerations in m/s^2 of the body: a stamp, in ns unless the first line names another
     unit, and six numbers a line. Raises LogError."""
     rows = rows_of(table, 7)
-    stamp_ns, values = (
-        stamps_ns(table, [row[0] for row in rows], unit_ns(header_of(table)[0])),
-        numbers_of(table, rows, 1, 6),
-    )
+    stamp_ns = stamps_ns(table, [row[0] for row in rows], table_unit_ns(table))
+    values = numbers_of(table, rows, 1, 6)
     channel = Channel(topic, "sensor_msgs/Imu", "ros1")
 
     def message(row: int) -> ImuMessage:

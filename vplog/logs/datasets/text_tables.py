@@ -20,8 +20,8 @@ _LINE_LIMIT = 65536
 """Characters; a line of COLMAP's images.txt has some thousand, and a file without line ends is not read whole."""
 
 
-def lines_of(path: Path) -> Iterator[tuple[int, str]]:
-    """Lines with their numbers, those that are blank or comments left out. Raises LogError."""
+def lines_of(path: Path, comments: bool = False) -> Iterator[tuple[int, str]]:
+    """Lines with their numbers, those that are blank left out, and comments unless asked for. Raises LogError."""
     try:
         with path.open(encoding="utf-8-sig") as stream:
             number = 0
@@ -29,7 +29,7 @@ def lines_of(path: Path) -> Iterator[tuple[int, str]]:
                 number += 1
                 if "\0" in line:
                     raise LogError(f"{path}:{number} is not text. Copy the data set again.")
-                if line.strip() and not line.startswith("#"):
+                if line.strip() and (comments or not line.startswith("#")):
                     yield number, line.strip()
     except (OSError, UnicodeDecodeError) as error:
         raise LogError(f"Cannot read {path}: {error}. Copy the data set again.") from None
@@ -58,6 +58,12 @@ def unit_ns(name: str) -> int:
     """ns of the unit in brackets in the name of a column of stamps, as `ts (s)`; 1 without one."""
     named = _UNIT.search(name)
     return 1 if named is None else _NS[named[1]]
+
+
+def table_unit_ns(path: Path) -> int:
+    """ns of the unit of the stamps, by the first line, a comment or not; 1 without one. Raises LogError."""
+    _, head = next(lines_of(path, comments=True), (0, ""))
+    return unit_ns(head.split(",")[0])
 
 
 def header_of(path: Path) -> list[str]:

@@ -11,7 +11,7 @@ from vplog.logs.calibration_file import calibrations_beside
 from vplog.logs.calibrations.camera import CalibratedCamera
 from vplog.logs.datasets import tum_rgbd
 from vplog.logs.datasets.streams import DataSet, Stream, camera_streams, depth_stream, imu_stream, mount_stream
-from vplog.logs.datasets.text_tables import header_of, listed_images, poses_of, unit_ns
+from vplog.logs.datasets.text_tables import header_of, listed_images, poses_of, table_unit_ns, unit_ns
 
 
 def roots(path: Path) -> list[Path]:
@@ -35,7 +35,7 @@ def read(path: Path, depth_per_m: float | None = None) -> DataSet:
         streams += [mount_stream(one.channel.topic, one.stamp_ns[:1], np.eye(4)) for one in streams[:1]]
     truth = None
     if (table := path / "groundtruth.csv").is_file():
-        truth = poses_of(table, unit_ns(header_of(table)[0]))
+        truth = poses_of(table, table_unit_ns(table))
     elif (table := path / "groundtruth.txt").is_file():
         truth = poses_of(table, 10**9)
     return DataSet("vslam-lab", streams, truth, remarks)
