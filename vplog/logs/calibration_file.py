@@ -86,6 +86,11 @@ class SidecarFiles:
         self.choice, self._path = choice, choice.calibration_file
         """Choice of topics, without a calibration file that is of another camera."""
 
+    @property
+    def has_pair(self) -> bool:
+        """Whether there is a file, of more cameras than the left one of a pair."""
+        return self._path is not None and len(self._cameras) > 1
+
     def camera(self, topic: str) -> CalibratedCamera | None:
         """The camera of an image topic; None without a file. Raises LogError where the file does not say which."""
         return None if self._path is None else camera_for(self._cameras, topic, self._path)

@@ -59,6 +59,8 @@ class RecordedLog:
         self._sidecar = SidecarFiles(choice, notes)
         self._choice = choice = self._sidecar.choice
         self._selection = select(self._candidates, choice, path.name)
+        if self._sidecar.has_pair:
+            self._selection = replace(self._selection, right_info=None)
         topics = {c.channel.topic: self._contents.files.get(c.channel.topic, {}) for c in self._candidates}
         self._masks = masks_of(choice.masks, topics, self._selection.image, self._selection.right)
 
@@ -378,16 +380,19 @@ class RecordedLog:
         try:
             if (candidate := self._candidate(right)) and candidate.codec:
                 raise NoPairError(f"{right.topic} is video; of a stereo pair, only the left images may be video")
-            known = [one.calibration for c in (image, right) if (one := self._sidecar.camera(c.topic))]
-            own, theirs = known or (content.calibration, content.right_calibration)
+            files = self._sidecar.camera(image.topic), self._sidecar.camera(right.topic)
+            both = files[0] is not files[1]  # else none, or a file of the left camera alone
+            own = files[0].calibration if files[0] else content.calibration
+            theirs = files[1].calibration if files[1] and both else content.right_calibration
             if own is None or theirs is None:
-                raise NoPairError(f"{right.topic} has no calibration")
+                why = ", and that of --calibration is of one camera" if files[0] else ""
+                raise NoPairError(f"{right.topic} has no calibration{why}")
             other, size = self._images.first(right, content.companions["right"], self._path.name)
             camera, other = camera_of(right.topic, theirs, size, self._notes), self._optical(other)
             if other and frame and not self._choice.right and self._are_apart(frame, other):
                 return None  # the other is a camera by itself
             right_from_left = content.tree.between(other, frame) if other and frame else None
-            right_from_left = self._sidecar.right_from_left(image.topic, right.topic) if known else right_from_left
+            right_from_left = self._sidecar.right_from_left(image.topic, right.topic) if both else right_from_left
             pair = pair_of(Side(left, own), Side(camera, theirs), right_from_left)
             error_px = row_error_px(self._rectified(pair))
             if error_px is not None and error_px > MOST_ROWS_PX:

@@ -93,7 +93,8 @@ def pair_of(left: Side, right: Side, right_from_left: Floats | None) -> Pair:
         apart = [0.0, float(projections[1][0, 3] / projections[1][0, 0])]
     else:
         raise NoPairError(
-            f"neither P of the calibration of {right.camera.name} nor static transforms say how far apart the two are"
+            f"neither P of the calibrations of {left.camera.name} and {right.camera.name} nor static transforms say "
+            "how far apart the two are"
         )
     baseline_m = apart[0] - apart[1]
     if -_BASELINES_M[1] < baseline_m < -_BASELINES_M[0]:

@@ -275,10 +275,10 @@ def _of_image(
             "not both. Leave out --depth-topic or --right-topic."
         )
     info, depth_info = _calibration(image, usable), None if depth is None else _calibration(depth, usable)
-    found = {"depth": depth, "right": right, "depth_info": None if depth_info is info else depth_info}
-    if choice.calibration_file is not None:
-        return found
     right_info = _calibration(right, usable) if right is not None else None
+    found = {"depth": depth, "right": right, "depth_info": None if depth_info is info else depth_info}
+    if choice.calibration_file is not None:  # which may be of the left camera alone
+        return found | {"right_info": right_info}
     info = info if choice.camera_info is None else pick("camera_info")
     return found | {"right_info": right_info, "camera_info": info}
 
