@@ -13,6 +13,7 @@ from tests.logs.drives import FRAMES, HEIGHT, START_NS, WIDTH, Drive, Written, p
 from vplog import logs
 from vplog.errors import LogError
 from vplog.logs import TopicChoice
+from vplog.logs.masks import Mask
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -65,6 +66,17 @@ def test_one_mask_is_of_every_image_whatever_its_size_and_coding(seed: int, tmp_
         assert frame.mask[:29].all()
         assert not frame.mask[31:].any()
     assert any("is resized" in line for line in log.warnings) == (scale != 1)
+
+
+@pytest.mark.parametrize(("ending", "quality"), [("webp", 60), ("webp", 101), ("jpg", 60), ("png", 0)])
+def test_blurred_edges_mask_what_is_darker_than_half(ending: str, quality: int, tmp_path: Path) -> None:
+    """WebP of quality 101 is lossless, in which 1 counts."""
+    sharp = ending == "png" or quality > 100
+    drawn = cv2.ellipse(np.zeros((480, 640), np.uint8), (320, 240), (300, 200), 10, 0, 360, 1 if sharp else 255, -1)
+    option = {"webp": cv2.IMWRITE_WEBP_QUALITY, "jpg": cv2.IMWRITE_JPEG_QUALITY}.get(ending)
+    assert cv2.imwrite(str(tmp_path / f"m.{ending}"), drawn, [] if option is None else [option, quality])
+    used = Mask(tmp_path / f"m.{ending}").used((640, 480))
+    assert (used != (drawn > 0)).mean() < (1e-9 if sharp else 2e-3)
 
 
 def test_masks_of_a_folder_go_by_name_or_stamp(tmp_path: Path) -> None:

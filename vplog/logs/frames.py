@@ -23,7 +23,7 @@ from vplog.logs.messages.pixels import Levels, depth_m, levels_of, spread
 from vplog.logs.messages.records import BadMessageError, CalibrationMessage, ImageMessage
 from vplog.logs.messages.video import VideoStream
 from vplog.logs.rectification import Pair
-from vplog.storage.image_file import JPEG
+from vplog.storage.image_file import is_lossy
 
 if TYPE_CHECKING:
     from av import VideoFrame
@@ -69,7 +69,7 @@ class LoggedImage:
         """(H, W) px that count, of a mask. Raises LogError."""
 
         def of_message(message: ImageMessage) -> Bools:
-            return is_used(pixels.values(message), message.compressed and message.data[:2] == JPEG)
+            return is_used(pixels.values(message), message.compressed and is_lossy(message.data))
 
         return self._pixels(stamp_ns, of_message, video.grey)
 

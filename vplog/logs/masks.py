@@ -1,8 +1,8 @@
 """Masks of cameras from files: one picture for all images of a camera, or a folder of one for each image.
 
-A px of zero is masked, as in COLMAP and hloc; of a JPEG, which blurs edges, what is darker than half. In a folder the
-mask of `left/7.jpg` is `left/7.jpg.png`, as COLMAP has it, `left/7.png`, or either name without its folder; that of a
-recorded image is called by its stamp in ns.
+A px of zero is masked, as in COLMAP and hloc; of a JPEG or a lossy WebP, which blur edges, what is darker than half. In
+a folder the mask of `left/7.jpg` is `left/7.jpg.png`, as COLMAP has it, `left/7.png`, or either name without its
+folder; that of a recorded image is called by its stamp in ns.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from vplog.data import Bools
 from vplog.errors import LogError, nearest_path, plural
 from vplog.logs.formats.container import Channel, Notes
 from vplog.logs.image_folder import is_image
-from vplog.storage.image_file import JPEG, BadImageError, decode_image, image_size
+from vplog.storage.image_file import BadImageError, decode_image, image_size, is_lossy
 
 _HALF = 128
 _INVERTED = 0.5
@@ -49,12 +49,12 @@ class Mask:
             raise LogError(f"Cannot read the mask {self.path}: {error.strerror or error}.") from None
         except BadImageError as error:
             raise LogError(f"The mask {self.path} cannot be decoded: {error}. Write it as PNG.") from None
-        return is_used(image, data[:2] == JPEG)
+        return is_used(image, is_lossy(data))
 
 
-def is_used(image: Any, jpeg: bool) -> Bools:
+def is_used(image: Any, lossy: bool) -> Bools:
     """(H, W) px that count, of a mask as it was decoded."""
-    return image >= _HALF if jpeg else image > 0
+    return image >= _HALF if lossy else image > 0
 
 
 class Masks:

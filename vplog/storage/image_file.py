@@ -107,6 +107,11 @@ def image_size(data: bytes | memoryview) -> tuple[int, int] | None:
     return (int(found[1]), int(found[2])) if found else None
 
 
+def is_lossy(data: bytes | memoryview) -> bool:
+    """Whether a file's kind blurs edges: JPEG, and WebP but for its lossless one."""
+    return data[:2] == JPEG or (data[:4] == b"RIFF" and b"VP8L" not in bytes(data))
+
+
 def _decode_jpeg(data: bytes | memoryview, unchanged: bool) -> Any:
     marker, at = next((one for one in _jpeg_segments(data) if one[0] in _JPEG_FRAMES), (0, len(data) - 5))
     if marker not in _JPEG_SEQUENTIAL and bytes(data).count(_SCAN_START) > _MOST_SCANS:
