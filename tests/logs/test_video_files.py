@@ -119,3 +119,32 @@ def test_a_codec_that_is_not_known_is_one_line(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"mp4v", b"zzz1").replace(b"esds", b"zzzz"))
     with pytest.raises(LogError, match=r"a\.mp4 is encrypted, or of a codec that FFmpeg does not know"):
         logs.open(path)
+
+
+@pytest.mark.parametrize(
+    ("others", "found"),
+    [
+        ((), ["a/1.mp4", "a/2.MOV", "b/3.mkv"]),
+        (("b/drive.mcap",), ["a/1.mp4", "a/2.MOV", "b/drive.mcap"]),
+        (("a/images/sub/1.png",), ["b/3.mkv"]),
+        (("notes.txt", "a/.1.png"), ["a/1.mp4", "a/2.MOV", "b/3.mkv"]),
+    ],
+)
+def test_videos_of_a_folder_without_images_are_drives(others: Sequence[str], found: list[str], tmp_path: Path) -> None:
+    clip, *files = ("a/1.mp4", "a/2.MOV", "b/3.mkv", "lost+found/4.mp4", *others)
+    for name in (clip, *files):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"\x89PNG\r\n\x1a\n" if name.endswith("png") else b"\0\0\0\x18ftypisom")
+    assert logs.logs_below(tmp_path) == [tmp_path / name for name in found]
+    if not others:
+        with pytest.raises(LogError, match=r"holds 2 videos\. Give one of them, or the folder to `vplog batch`"):
+            logs.open(tmp_path / "a")
+
+
+@pytest.mark.parametrize(("name", "way"), [("a.MTS", "-c copy a.mp4"), ("a.mov", "-c copy a.mp4"), ("a.gif", "a.mp4")])
+def test_videos_that_are_not_read_are_to_be_converted(name: str, way: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"G@\x11\x10" + bytes(188))
+    for path in (tmp_path, tmp_path / name):
+        for step in (logs.open, logs.check):
+            with pytest.raises(LogError, match=f"Convert a video to MP4 first: ffmpeg -i {name} {way}"):
+                step(path)

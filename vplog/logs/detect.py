@@ -49,6 +49,9 @@ _NO_LOG = re.compile(r"\.|lost\+found$")
 """Names of hidden files, and of ext4's folder for root alone."""
 _UNREAD = {".heic", ".heif", ".avif", ".jxl", ".jp2"}
 """Endings of other pictures than those of `image_folder.is_image`."""
+_VIDEO_NAME = re.compile(r"\.(mp4|m4v|mov|mkv|webm|avi)$", re.IGNORECASE)
+_OTHER_VIDEOS = {".ts", ".mts", ".m2ts", ".flv", ".mov", ".mpg", ".mpeg", ".wmv", ".gif"}
+"""Endings of videos in containers that are not read; MOV without the mark of its kind is of before 2001."""
 _LISTED = 5
 """Files that an error lists."""
 _DEEPEST, _MOST_FILES = 4, 10**6
@@ -123,7 +126,11 @@ def _logs_below(folder: Path, levels: int) -> list[Path]:
             logs += _logs_below(one, levels - 1)
         except OSError:  # as opening it says
             logs.append(one)
-    return logs
+    videos = [folder / name for name in names if not inside[name] and _VIDEO_NAME.search(name)]
+    if logs or remote or not videos:
+        return logs
+    files = (one for name in names for one in (_files_below(folder / name) if inside[name] else [folder / name]))
+    return [] if any(file.is_file() and image_folder.is_image(file) for file in files) else videos
 
 
 @contextmanager
@@ -351,6 +358,15 @@ def _unread(files: Collection[Path]) -> list[str]:
     ]
 
 
+def _to_convert(files: Collection[Path]) -> list[str]:
+    """A line on videos in containers that are not read; none without."""
+    first = next((file for file in files if file.suffix.lower() in _OTHER_VIDEOS), None)
+    if first is None:
+        return []
+    copied = "" if first.suffix.lower() in (".gif", ".wmv") else "-c copy "  # whose codecs are none of MP4's
+    return [f"Convert a video to MP4 first: ffmpeg -i {first.name} {copied}{first.stem}.mp4."]
+
+
 def _files_below(path: Path) -> list[Path]:
     """Files of the folders in a folder, a few levels deep. Raises LogError where there are too many to look at."""
     found, folders = list[Path](), [path]
@@ -418,11 +434,13 @@ def _no_folder(path: Path, files: list[Path]) -> str:
     if ours := [what for name, what in _RESULTS.items() if (path / name).is_file()]:
         return f"{path} is {ours[0]} that vplog wrote, not a log. Give the log of a drive."
     found = f"{plural(len(files), 'file')}, but no log and no images" if files else "nothing"
-    return " ".join([f"{path} holds {found}.", *_unread(files), f"A log is {_KNOWN}."])
+    if videos := sum(map(video.is_video, files)):
+        return f"{path} holds {plural(videos, 'video')}. Give one of them, or the folder to `vplog batch`."
+    return " ".join([f"{path} holds {found}.", *_unread(files), *_to_convert(files), f"A log is {_KNOWN}."])
 
 
 def _no_log(path: Path) -> str:
     if path.stat().st_size == 0:
         return f"{path} is empty (0 bytes). Was the recording stopped before anything was written?"
     found = f"{path} starts with {image_folder.first_bytes(path, 8)!r}, which no log does."
-    return " ".join([found, *_unread([path]), f"A log is {_KNOWN}."])
+    return " ".join([found, *_unread([path]), *_to_convert([path]), f"A log is {_KNOWN}."])
