@@ -21,7 +21,8 @@ def compare(arguments: argparse.Namespace) -> None:
     ignored = [one for one in arguments.set if one.partition(".")[0] not in groups]
     if ignored:
         raise SettingsError(
-            f"--set {ignored[0]}: only features, places and, with --sequence, sequence count here; see --library-size."
+            f"--set {ignored[0]}: only features, places and, with --sequence, sequence count here; see --library-size "
+            "and --library-seed."
         )
     with Progress(arguments) as progress:
         done = call(api.compare, arguments, progress=progress)
