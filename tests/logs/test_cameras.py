@@ -126,3 +126,10 @@ def test_a_calibration_without_a_size_is_that_of_images_with_its_centre(scale: f
     assert (f"(607.2, 185.2) px is far from that of images of {size[0]} x {size[1]} px" in " ".join(notes.lines)) == (
         camera.matrix is None
     )
+
+
+def test_a_calibration_without_a_size_is_that_of_cropped_images() -> None:
+    """The bonnet below is cut off."""
+    notes = Notes()
+    assert camera_of("cam", pinhole(np.full(2, 700.0), np.array([640.0, 360.0])), (1280, 480), notes).matrix is not None
+    assert not notes.lines

@@ -10,7 +10,7 @@ import pytest
 
 from vplog import logs
 from vplog.errors import LogError
-from vplog.logs.image_folder import stamps_of
+from vplog.logs.image_folder import by_folder, stamps_of
 from vplog.logs.topic_selection import TopicChoice
 
 if TYPE_CHECKING:
@@ -169,6 +169,22 @@ def test_numbers_behind_a_dot_are_counters_or_times(kind: str) -> None:
     assert (found is not None) == timed
     if found is not None:
         np.testing.assert_allclose(np.diff(found), 1e9 / 30, atol=1001)
+
+
+def test_decimal_seconds_may_be_far_apart_or_near() -> None:
+    for step in (5.5, 0.002):
+        found = stamps_of([f"{12 + step * row:.3f}" for row in range(600)])
+        assert found is not None
+        np.testing.assert_allclose(np.diff(found), step * 1e9, atol=1)
+
+
+@pytest.mark.parametrize("few", ["cam0", "cam2"])
+def test_a_camera_of_few_images_leaves_the_others_cameras(few: str, tmp_path: Path) -> None:
+    folders = ("cam0", "cam1", "cam2")
+    files = [tmp_path / name / f"{row}.png" for name in folders for row in range(2 if name == few else 30)]
+    assert [*by_folder(tmp_path, files)] == [*folders]
+    after = [tmp_path / f"{row // 30}" / f"{row}.png" for row in range(90)]
+    assert not by_folder(tmp_path, after)
 
 
 def test_what_the_system_hides_beside_images_is_none(tmp_path: Path) -> None:

@@ -21,7 +21,9 @@ av = pytest.importorskip("av", reason="PyAV is not installed: pip install 'vplog
 COUNT, RATE = 40, 10
 
 
-def write(path: Path, streams: Sequence[tuple[str, int, int]] = (("mpeg4", 64, COUNT),), **fields: Any) -> Path:
+def write(
+    path: Path, streams: Sequence[tuple[str, int, int]] = (("mpeg4", 64, COUNT),), first: int = 0, **fields: Any
+) -> Path:
     """Streams of a codec, a width and a count of frames, each brighter than the one before; `fields` of encoders."""
     with av.open(str(path), "w") as container:
         tracks = []
@@ -37,7 +39,7 @@ def write(path: Path, streams: Sequence[tuple[str, int, int]] = (("mpeg4", 64, C
                 if row < count:
                     grey = np.full((48, track.width), 20 + 5 * row, np.uint8)
                     frame = av.VideoFrame.from_ndarray(grey, "gray").reformat(format=track.pix_fmt)
-                    frame.pts, frame.time_base = row, Fraction(1, RATE)
+                    frame.pts, frame.time_base = first + row, Fraction(1, RATE)
                     container.mux(track.encode(frame))
         for track, _ in tracks:
             container.mux(track.encode())
@@ -79,6 +81,14 @@ def test_a_video_that_is_cut_short_is_noted(name: str, share: float, tmp_path: P
     log = logs.open(path)
     assert (len(log.stamps()) < 0.7 * COUNT) == (share < 1)
     assert ("of the 4.0 s that it names: is it cut?" in " ".join(log.warnings)) == (share < 1)
+
+
+@pytest.mark.parametrize("name", ["a.mkv", "a.mp4"])
+def test_a_video_whose_time_begins_later_is_whole(name: str, tmp_path: Path) -> None:
+    """Segments of a stream, as of a dash camera."""
+    log = logs.open(write(tmp_path / name, first=600))
+    assert len(log.stamps()) == COUNT
+    assert not log.warnings
 
 
 def test_of_frames_with_one_time_stamp_the_first_is_kept(tmp_path: Path) -> None:
@@ -125,12 +135,14 @@ def test_a_codec_that_is_not_known_is_one_line(tmp_path: Path) -> None:
     ("others", "found"),
     [
         ((), ["a/1.mp4", "a/2.MOV", "b/3.mkv"]),
-        (("b/drive.mcap",), ["a/1.mp4", "a/2.MOV", "b/drive.mcap"]),
-        (("a/images/sub/1.png",), ["b/3.mkv"]),
+        (("b/drive.mcap",), ["b/drive.mcap"]),
+        (("a/images/sub/1.png",), [""]),
+        (("1.mp4",), ["1.mp4", "a/1.mp4", "a/2.MOV", "b/3.mkv"]),
         (("notes.txt", "a/.1.png"), ["a/1.mp4", "a/2.MOV", "b/3.mkv"]),
     ],
 )
 def test_videos_of_a_folder_without_images_are_drives(others: Sequence[str], found: list[str], tmp_path: Path) -> None:
+    """All of them, or the folder itself."""
     clip, *files = ("a/1.mp4", "a/2.MOV", "b/3.mkv", "lost+found/4.mp4", *others)
     for name in (clip, *files):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

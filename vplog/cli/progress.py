@@ -109,6 +109,9 @@ class Progress:
 
         self._events: Events = arguments.events if isinstance(arguments.events, Events) else Events(None)
         self._known, self._earlier = stages, _earlier_seconds(earlier) if earlier is not None else {}
+        if stages and self._earlier:  # the first of them lasts while steps that not every run has are computed
+            within = sum(seconds for name, seconds in self._earlier.items() if name not in stages)
+            self._earlier[stages[0]] = self._earlier.get(stages[0], 0.0) + within
         self._stages: dict[str, _Stage] = {}
         self._tasks: dict[str, Any] = {}
         self._lock, self._end = threading.Lock(), threading.Event()

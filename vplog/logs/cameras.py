@@ -35,8 +35,8 @@ _LARGEST_PX = 1e7
 _SAME_PX = 1.0
 """px that a calibration that came later may move the image's corners without being another: focus moves them."""
 _CENTRED = 0.2
-"""Share of an image that its principal point may lie off the middle: lenses are a few % off, cropped images a tenth; of
-images of half or twice the size it lies by 0.5 or 0.25."""
+"""Share of an image that its principal point may lie off the middle in both axes: lenses are a few % off, images that
+were cropped in one of them; in images of half or twice the size it lies off by 0.5 or 0.25."""
 _SAME_SHAPE = 0.01
 """Relative difference of the scales in x and y below which a resized image still fits its calibration: rounding."""
 
@@ -122,7 +122,7 @@ def _fit(camera: Camera, matrix: Floats, calibration: CalibrationMessage, notes:
     """The camera for the size its images really have."""
     width, height, images = calibration.width, calibration.height, (camera.width, camera.height)
     unknown = replace(camera, distortion_model="none", distortion=np.zeros(0))
-    if not (width and height) and all(images) and np.abs(matrix[:2, 2] / images - 0.5).max() > _CENTRED:
+    if not (width and height) and all(images) and np.abs(matrix[:2, 2] / images - 0.5).min() > _CENTRED:
         notes.add(
             f"{camera.name} is uncalibrated: the centre of its calibration, which has no size, at "
             f"({matrix[0, 2]:.1f}, {matrix[1, 2]:.1f}) px is far from that of images of {images[0]} x {images[1]} px. "

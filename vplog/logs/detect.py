@@ -101,7 +101,7 @@ def logs_below(path: Path) -> list[Path]:
         with suppress(OSError):  # of a folder in it, which is a log of its own
             if len(_data_sets(path)) == 1:
                 return [path]
-        found = _logs_below(path, _DEEPEST)
+        found = _logs_below(path, _DEEPEST) or _videos_below(path)
     except OSError:
         return [path]
     alone = found and found == [path / found[0].name] and _LOG_NAME.search(found[0].name)  # its folder is opened
@@ -126,11 +126,20 @@ def _logs_below(folder: Path, levels: int) -> list[Path]:
             logs += _logs_below(one, levels - 1)
         except OSError:  # as opening it says
             logs.append(one)
-    videos = [folder / name for name in names if not inside[name] and _VIDEO_NAME.search(name)]
-    if logs or remote or not videos:
-        return logs
-    files = (one for name in names for one in (_files_below(folder / name) if inside[name] else [folder / name]))
-    return [] if any(file.is_file() and image_folder.is_image(file) for file in files) else videos
+    return logs
+
+
+def _videos_below(folder: Path) -> list[Path]:
+    """Videos in a folder without images, a few levels deep."""
+    files = list[Path]()
+    if not isinstance(folder, RemotePath):
+        with suppress(LogError):  # too many to look at
+            files = _files_below(folder)
+    files = [one for one in files if not any(map(_NO_LOG.match, one.relative_to(folder).parts))]
+    videos = [file for file in files if _VIDEO_NAME.search(file.name)]
+    if not videos or any(map(image_folder.is_image, files)):
+        return []
+    return sorted(videos, key=lambda file: [image_folder.natural_order(part) for part in file.parts])
 
 
 @contextmanager
@@ -434,8 +443,9 @@ def _no_folder(path: Path, files: list[Path]) -> str:
     if ours := [what for name, what in _RESULTS.items() if (path / name).is_file()]:
         return f"{path} is {ours[0]} that vplog wrote, not a log. Give the log of a drive."
     found = f"{plural(len(files), 'file')}, but no log and no images" if files else "nothing"
-    if videos := sum(map(video.is_video, files)):
-        return f"{path} holds {plural(videos, 'video')}. Give one of them, or the folder to `vplog batch`."
+    if videos := sum(video.is_video(file) and _VIDEO_NAME.search(file.name) is not None for file in files):
+        holds = f"{path} holds {plural(videos, 'video')}. Give one of them, or the folder to `vplog batch`."
+        return " ".join([holds, *_unread(files)])
     return " ".join([f"{path} holds {found}.", *_unread(files), *_to_convert(files), f"A log is {_KNOWN}."])
 
 

@@ -25,6 +25,8 @@ _SINCE_1970_S = (631_152_000, 4_102_444_800)
 """1990 to 2100: whole numbers of s, ms, us or ns in it have 9 to 19 digits, and never fit two of the units."""
 _PERIODS_NS = (5_000_000, 5_000_000_000)
 """200 Hz down to 0.2 Hz, as cameras have it: in us and in ns two ranges that meet and do not overlap."""
+_LEAST_DECIMAL_NS = 2_000_000
+"""Of decimal seconds, which are hardly anything else: 500 Hz."""
 _DATE = re.compile(r"(?<!\d)(20\d{6})[_-]?(\d{9})(?!\d)")
 """A day and a time to the ms, as phones name their pictures."""
 _LEAST = 3
@@ -84,9 +86,9 @@ def stamps_of(names: list[str]) -> list[int] | None:
         found = [datetime.strptime(f"{one[1]}{one[2]}Z", "%Y%m%d%H%M%S%f%z") for one in dates if one]
         if 2 * len({*found}) > len(found):  # else of a burst, or of the clip that they are the frames of
             return [round(at.timestamp() * 1e3) * 10**6 for at in found] if len(found) == len(names) else None
-    names, units = _changing(names), (10**9, 10**6, 10**3, 1)
+    names, units, (least_ns, most_ns) = _changing(names), (10**9, 10**6, 10**3, 1), _PERIODS_NS
     if all(re.fullmatch(r"[0-9]{1,10}\.[0-9]{1,9}", name) for name in names):
-        parts, units = [name.split(".") for name in names], (1,)
+        parts, units, (least_ns, most_ns) = [name.split(".") for name in names], (1,), (_LEAST_DECIMAL_NS, 2**63)
         if len({whole for whole, _ in parts}) == 1 and int(parts[0][0]) < _SINCE_1970_S[0]:
             return None  # a camera's number before a counter, rather than a drive of less than a second
         names = [whole + fraction.ljust(9, "0") for whole, fraction in parts]
@@ -97,7 +99,7 @@ def stamps_of(names: list[str]) -> list[int] | None:
     unit = next((ns for ns in units if low_ns <= values[0] * ns and values[-1] * ns < high_ns), 0)
     if not unit and 1 < len(values) == len(names):
         step = statistics.median(b - a for a, b in pairwise(values))
-        unit = next((ns for ns in units[-2:] if _PERIODS_NS[0] <= step * ns < _PERIODS_NS[1]), 0)
+        unit = next((ns for ns in units[-2:] if least_ns <= step * ns < most_ns), 0)
     return [int(name) * unit for name in names] if unit and values[-1] * unit < 2**63 else None
 
 
@@ -131,7 +133,7 @@ def select_camera(folder: Path, files: list[Path], choice: str | None) -> list[P
     )
 
 
-def _grouped(files: list[Path], name: Callable[[Path], str]) -> Group:
+def grouped(files: list[Path], name: Callable[[Path], str]) -> Group:
     """Files by a name of theirs, without those of an empty one."""
     groups: Group = {}
     for file in files:
@@ -143,17 +145,16 @@ def _grouped(files: list[Path], name: Callable[[Path], str]) -> Group:
 def by_folder(root: Path, files: list[Path]) -> Group:
     """Groups by the folder below `root`, where these are fewer than the images of each and run side by side. Empty
     where they follow each other, or hold a few views of a place each."""
-    groups = _grouped(files, lambda file: file.relative_to(root).parent.as_posix())
-    if min(map(len, groups.values())) < max(len(groups), _LEAST):
-        return {}
-    first, *others = groups.values()
-    return groups if any(_are_parallel(first, other) for other in others) else {}
+    groups = grouped(files, lambda file: file.relative_to(root).parent.as_posix())
+    large = [group for group in groups.values() if len(group) >= max(len(groups), _LEAST)]  # others may be strays
+    pairs = [*pairwise(large), *((large[0], other) for other in large[2:])]
+    return groups if 2 * len(large) > len(groups) and any(_are_parallel(a, b) for a, b in pairs) else {}
 
 
 def _by_name(files: list[Path]) -> Group:
     """Groups whose names differ in more than numbers and whose numbers run side by side: `left_*.png`, `right_*.png`.
     Empty where there is one, or one follows the other."""
-    groups = _grouped(files, lambda file: _pattern(file.name))
+    groups = grouped(files, lambda file: _pattern(file.name))
     groups = {name: group for name, group in groups.items() if len(group) >= _LEAST}
     parallel = {a for a in groups for b in groups if a != b and _are_parallel(groups[a], groups[b])}
     found = {name: group for name, group in groups.items() if name in parallel}
@@ -175,7 +176,7 @@ def _are_parallel(a: list[Path], b: list[Path]) -> bool:
 
 def _by_bits(files: list[Path]) -> Group:
     """PNGs of 8 and of 16 bits: pictures and depth."""
-    groups = _grouped(files, _bits)
+    groups = grouped(files, _bits)
     return groups if all(len(group) >= _LEAST for group in groups.values()) else {}
 
 
@@ -190,7 +191,7 @@ def _by_size(files: list[Path]) -> Group:
     step = max(2 * len(files) // _SIZED, 1)
     if len({size for file in {*files[::step], *files[1::step]} if (size := _size(file))}) < 2:
         return {}
-    groups = _grouped(files, _size)
+    groups = grouped(files, _size)
     return {name: group for name, group in groups.items() if len(group) >= max(_LEAST, _OTHERS * len(files))}
 
 

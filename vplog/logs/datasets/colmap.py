@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from vplog.geometry import se3
 from vplog.logs.calibration_file import calibrations_beside
 from vplog.logs.datasets.streams import DataSet, calibration_stream, camera_streams, mount_stream
 from vplog.logs.datasets.text_tables import lines_of
-from vplog.logs.image_folder import by_folder, image_files, named_stamps, natural_order
+from vplog.logs.image_folder import by_folder, grouped, image_files, named_stamps, natural_order
 from vplog.logs.tf_odometry import are_usable
 
 _MODELS = (".", "sparse", "sparse/*", "colmap/sparse/*", "dslr_calibration_undistorted")
@@ -64,14 +65,17 @@ def read(path: Path) -> DataSet:
     images.sort(key=lambda one: [natural_order(part) for part in PurePosixPath(one.name).parts])
     folder = _folder_of(images, [path, *table.resolve().parents[:3]], table)
     at = {folder / one.name: one for one in images}
-    if len(at) < (count := sum(len(image_files(one)) for one in {file.parent for file in at})):
+    on_disk = {file for one in {file.parent for file in at} for file in image_files(one)}
+    if left := len(on_disk - at.keys()):
         which = f", the largest of {len(tables)} models," if len(tables) > 1 else ""
         remarks.append(
-            f"{table.parent}{which} has {len(at)} of the {count} images in {folder}; the others are left out. "
+            f"{table.parent}{which} does not have {left} of the {len(on_disk)} images in {folder}; they are left out. "
             f"Give {folder} to take all, without a calibration and poses."
         )
     cameras = {one.name: one for one in calibrations_beside(table.with_name(f"cameras{table.suffix}"), remarks)}
     groups = by_folder(folder, [*at]) or {".": [*at]}
+    if any(a >= b for a, b in pairwise(named_stamps(groups.get(".", []))[0].tolist())):
+        groups = grouped([*at], lambda file: file.relative_to(folder).parent.as_posix())  # each has times of its own
     streams, main = [], max(sorted(groups), key=lambda name: len(groups[name]))
     if len(groups) > 1:
         found = ", ".join(f"{name} ({len(group)})" for name, group in sorted(groups.items()))

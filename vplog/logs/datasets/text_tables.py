@@ -61,8 +61,13 @@ def unit_ns(name: str) -> int:
 
 
 def table_unit_ns(path: Path) -> int:
-    """ns of the unit of the stamps, by the first line, a comment or not; 1 without one. Raises LogError."""
-    _, head = next(lines_of(path, comments=True), (0, ""))
+    """ns of the unit of the stamps, by the last line before the numbers, a comment or not; 1 without one. Raises
+    LogError."""
+    head = ""
+    for _, line in lines_of(path, comments=True):
+        if re.match(r"[-+.\d]", line):
+            break
+        head = line
     return unit_ns(head.split(",")[0])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cached_property
@@ -33,8 +34,8 @@ from vplog.logs.messages.video import (
 
 _TURNS = {90: cv2.ROTATE_90_COUNTERCLOCKWISE, 180: cv2.ROTATE_180, -180: cv2.ROTATE_180, -90: cv2.ROTATE_90_CLOCKWISE}
 """By the degrees counterclockwise that PyAV gives of the display matrix (ISO/IEC 14496-12, 8.3.2)."""
-_STILLS = (b"heic", b"heix", b"mif1", b"avif")
-"""Brands of files that hold a picture: ISO/IEC 23008-12, annex B; AVIF 1.1."""
+_STILLS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"avif", b"crx ", b"M4A ")
+"""Brands of files that hold a picture, or sound alone: ISO/IEC 23008-12, annex B; AVIF 1.1; Canon's CR3; M4A."""
 _AHEAD = 250
 """Packets that are read to reach one, rather than sought from the key frame before it: usual distances of these."""
 _FILTERS = {"h264": "h264_mp4toannexb,dump_extra", "hevc": "hevc_mp4toannexb,dump_extra"}
@@ -46,6 +47,7 @@ _FEW = 10
 _CUT_S, _CUT = 1.0, 0.1
 """s, and share of the duration that a file names, without which at its end it is noted to be cut short: audio may go
 on a little longer."""
+_DURATION = re.compile(r"(\d+):(\d+):(\d+\.?\d*)")
 _SQUARE = 0.01
 """Most that the width of a pixel may differ from its height: rounding."""
 
@@ -103,8 +105,10 @@ class VideoFrames:
                 whole_s = stream.frames / stream.average_rate
             elif stream.duration is not None:
                 whole_s = stream.duration * stream.time_base
+            elif named := _DURATION.match(stream.metadata.get("DURATION", "")):  # Matroska's, of this stream alone
+                whole_s = sum(float(part) * 60**power for power, part in zip((2, 1, 0), named.groups(), strict=True))
             else:
-                whole_s = (container.duration or 0) / 10**6
+                whole_s = 0 if len(container.streams) > 1 else (container.duration or 0) / 10**6
             aspect = float(stream.sample_aspect_ratio or 1)
         self._packets = packets
         self._at, self._data = -1, b""
@@ -211,16 +215,15 @@ class VideoFrames:
         """Note where the file holds other pictures, or others than it names: `packets` of each stream, frames `shown`
         of the one in use, its duration, and the width of a pixel by its height."""
         name, span_s = self._path.name, self.stamp_ns[-1] / 1e9
+        end_s = max(span_s, float(self._ticks[-1] * self._tick_s))  # where time does not begin at 0
         if sum(count > _FEW for count in packets.values()) > 1:
             listed = ", ".join(f"{index} ({count} packets)" for index, count in packets.items())
             self._note(
                 f"{name} has the video streams {listed}, of which {self._index} is used. Give another as a file of its "
                 "own: ffmpeg -i IN -map 0:NUMBER -c copy OUT."
             )
-        if whole_s - span_s > max(_CUT_S, _CUT * whole_s):
-            self._note(
-                f"{name} ends after {span_s:.1f} of the {whole_s:.1f} s that it names: is it cut? Copy it again."
-            )
+        if whole_s - end_s > max(_CUT_S, _CUT * whole_s):
+            self._note(f"{name} ends after {end_s:.1f} of the {whole_s:.1f} s that it names: is it cut? Copy it again.")
         if double := shown - len(self._ticks):
             self._note(f"{plural(double, 'frame')} of {name} with the time stamp of another left out.")
         if abs(aspect - 1) > _SQUARE:

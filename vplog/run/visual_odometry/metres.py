@@ -116,7 +116,9 @@ def _sigma_m(gps: Gps) -> float:
     variance = np.trace(gps.covariance[:, :2, :2], axis1=1, axis2=2) / 2.0  # the altitude may not be known
     known = variance[np.isfinite(variance) & (variance > 0)]
     claimed = float(np.sqrt(np.median(known))) if len(known) else RECEIVER_SIGMA_M
-    stamp_ns, enu_m = (fixes := local_enu(gps)).stamp_ns, fixes.enu_m
+    fixes = local_enu(gps)
+    new = np.append(True, (np.diff(fixes.enu_m, axis=0) != 0).any(axis=1))  # receivers' are repeated at a higher rate
+    stamp_ns, enu_m = fixes.stamp_ns[new], fixes.enu_m[new]
     share = ((stamp_ns[1:-1] - stamp_ns[:-2]) / (stamp_ns[2:] - stamp_ns[:-2]))[:, None]
     off = (enu_m[1:-1] - (1.0 - share) * enu_m[:-2] - share * enu_m[2:])[stamp_ns[2:] - stamp_ns[:-2] <= _STRAIGHT_NS]
     spread = 1.4826 * float(np.median(np.abs(off[:, :2]))) if len(off) else 0.0
