@@ -161,6 +161,31 @@ def test_edges_that_say_nothing_of_one_direction_leave_the_closures_true(tmp_pat
     assert optimize(tmp_path / "in.g2o", tmp_path / "out.g2o").record["kept"] == 12
 
 
+@pytest.mark.parametrize("step", [1, 2])
+def test_edges_computed_from_the_odometry_do_not_make_it_better(tmp_path: Path, step: int) -> None:
+    """As those of a covisibility graph are: every true closure was rejected."""
+    drive = ring(60, 12, false=2)
+    graph, of_closures = drive.graph, len(drive.false) - 59
+    a = np.arange(60 - step, dtype=np.int32)
+    poses = OdometryChain.of(graph).poses
+    write_g2o(
+        tmp_path / "in.g2o",
+        replace(
+            graph,
+            a=np.append(graph.a, a),
+            b=np.append(graph.b, a + np.int32(step)),
+            a_from_b=np.append(graph.a_from_b, se3.between(poses[a], poses[a + step]), axis=0),
+            information=np.append(graph.information, graph.information[a], axis=0),
+            kind=graph.kind + [EdgeKind.LOOP] * len(a),
+        ),
+        graph.world_from_body,
+    )
+    done = optimize(tmp_path / "in.g2o", tmp_path / "out.g2o")
+    assert done.record["kept"] == 12 + len(a)
+    assert (done.solution.weight[59 : 59 + of_closures] == ~drive.false[59:]).all()
+    assert any(f"restate the odometry: {len(a)} edges" in text for text in done.record["warnings"])
+
+
 def test_what_cannot_be_is_said(path: Path, tmp_path: Path) -> None:
     with pytest.raises(GraphError, match="is not a file"):
         optimize(tmp_path / "none.g2o", tmp_path / "out.g2o")

@@ -9,14 +9,21 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
-from vplog.data import Ints, PoseGraph, Solution
+from vplog.data import Bools, Ints, PoseGraph, Solution
 from vplog.errors import GraphError, plural
 from vplog.execution.timing import StageTimer
 from vplog.geometry.se3 import inverse
 from vplog.graph.build import checked, parts, subgraph
 from vplog.graph.certificate import solve_certified
+from vplog.graph.consistency import OdometryChain, residual_sigma, residual_twists
+from vplog.graph.factors import Factors
+from vplog.graph.lm import LmSettings, solve_weighted
 from vplog.graph.solve import OptimiserSettings, decided
 from vplog.results.g2o import GraphFile, read_g2o, write_g2o
+
+_RESTATED, _RESTATED_SIGMA = 1e-3, 1e-2
+"""m and rad, and sigma, within which an edge measures what the odometry does: poses that were rounded for a file. Two
+measurements by themselves are as near only by chance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,10 +107,21 @@ def solve_parts(
         if len(rows) == 1:
             continue
         alone, repairs = checked(subgraph(graph, rows, edges))
-        solution = decided(alone, optimiser).solution
         where = f"Part from {ids[rows[0]]} on: " if (size > 1).sum() > 1 else ""
+        again, own = _restates_odometry(alone), np.ones(len(edges))
+        judged = np.flatnonzero(~again)
+        solution = decided(subgraph(alone, np.arange(len(rows)), judged), optimiser).solution
+        own[judged] = solution.weight
+        if again.any():
+            found = plural(int(again.sum()), "edge")
+            repairs = [*repairs, f"Accepted without being judged, as they restate the odometry: {found}."]
+            settings, reason = LmSettings(), solution.reason
+            solution = solve_weighted(
+                Factors.of(alone), own, solution.world_from_body, settings.max_iterations, settings.tolerance, ""
+            )
+            solution = replace(solution, reason=reason)
         warnings += [where + text for text in repairs]
-        poses[rows], weight[edges], information[edges] = solution.world_from_body, solution.weight, alone.information
+        poses[rows], weight[edges], information[edges] = solution.world_from_body, own, alone.information
         solutions.append(replace(solution, reason=where + solution.reason))
     if not solutions:
         raise GraphError(
@@ -114,6 +132,15 @@ def solve_parts(
     reason = " ".join(one.reason for one in solutions)
     solution = Solution(poses, weight, before, after, iterations, converged, reason)
     return solution, replace(graph, information=information), warnings
+
+
+def _restates_odometry(graph: PoseGraph) -> Bools:
+    """(E,) edges but odometry that are computed from the odometry's poses, as those of covisibility graphs are: no
+    measurement of their own, they would have the odometry taken for as good as they agree with it."""
+    chain, edges = OdometryChain.of(graph), np.arange(len(graph.a))
+    off = np.abs(residual_twists(graph, chain.poses, edges)).max(1)
+    same = (off < _RESTATED) & (residual_sigma(graph, chain.poses) < _RESTATED_SIGMA)
+    return ~graph.odometry & same & (chain.part[graph.a] == chain.part[graph.b])
 
 
 def _by_part(part: Ints, parts: int) -> list[Ints]:
