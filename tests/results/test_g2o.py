@@ -151,6 +151,20 @@ def test_consecutive_ids_are_odometry_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("pairs", "odometry"),
+    [
+        ([(0, 1), (1, 2), (5, 6), (2, 6)], 3),
+        ([(0, 2), (2, 4), (4, 6), (1, 3), (3, 5), (5, 7), (2, 3)], 0),  # two robots with even and odd ids
+        ([(0, 3), (3, 4), (4, 7), (7, 1), (1, 5), (5, 2), (2, 6), (6, 0)], 0),  # a graph of views
+    ],
+)
+def test_without_a_chain_no_edge_is_odometry(tmp_path: Path, pairs: list[tuple[int, int]], odometry: int) -> None:
+    read = read_g2o(file(tmp_path, "".join(f"EDGE_SE2 {a} {b} 1 0 0 1 0 0 1 0 1\n" for a, b in pairs)))
+    assert read.graph.odometry.sum() == odometry
+    assert any("No odometry" in text for text in read.warnings) == (odometry == 0)
+
+
+@pytest.mark.parametrize(
     ("text", "said"),
     [
         ("", "no EDGE_SE2 or EDGE_SE3"),

@@ -78,8 +78,8 @@ def read_g2o(path: Path) -> GraphFile:
 
     Ids may come in any order, with gaps, up to 2^63 - 1 (GTSAM's symbols are such). Edges between consecutive ids are
     odometry, the first of several; all others are loop closures. Where ids are thinned out, so that fewer than half
-    of the neighbours have consecutive ids, neighbours in order of ids count as consecutive. Edges from a pose to itself
-    are left out, with a warning. Poses that only edges name are placed along the edges, odometry first. Information is
+    of the neighbours have consecutive ids, neighbours in order of ids count as consecutive; where edges join fewer than
+    half of those, as in graphs of views, none is odometry. Edges from a pose to itself are left out, with a warning. Poses that only edges name are placed along the edges, odometry first. Information is
     that of the rotation vector, as GTSAM reads it.
 
     Raises GraphError with file and line where that is not a graph of poses.
@@ -113,6 +113,8 @@ def read_g2o(path: Path) -> GraphFile:
     values = _numbers(path, edges, layout.pose + len(layout.axes) * (len(layout.axes) + 1) // 2)
     measured = _poses(path, edges, values[:, : layout.pose])
     kind = _kinds(ids, a, b)
+    if EdgeKind.ODOMETRY not in kind:
+        warnings.append("No odometry: edges join too few poses with consecutive ids. Every edge is judged as a closure.")
     poses, given = np.tile(np.eye(4), (len(ids), 1, 1)), np.zeros(len(ids), bool)
     at = np.searchsorted(ids, known)
     poses[at], given[at] = _poses(path, vertices, places), True
@@ -259,7 +261,8 @@ def _information(path: Path, lines: _Lines, upper: Floats, layout: _Layout) -> F
 
 
 def _kinds(ids: Ints, a: Int32s, b: Int32s) -> list[EdgeKind]:
-    """Odometry is the first edge between each two consecutive ids."""
+    """Odometry is the first edge between each two consecutive ids, of a graph that has such a chain: in others a few
+    are neighbours by chance, and would be trusted."""
     first, last = np.minimum(a, b), np.maximum(a, b)
     neighbours = last == first + 1
     consecutive = neighbours & (ids[last] - ids[first] == 1)
@@ -271,7 +274,8 @@ def _kinds(ids: Ints, a: Int32s, b: Int32s) -> list[EdgeKind]:
         if first[edge] not in met:
             met.add(first[edge])
             kind[edge] = EdgeKind.ODOMETRY
-    return kind
+    joined = len(np.unique(np.concatenate([a, b])))
+    return kind if 2 * len(met) >= joined - 1 else [EdgeKind.LOOP] * len(a)
 
 
 def _place(poses: Floats, given: np.ndarray, a: Int32s, b: Int32s, a_from_b: Floats, kind: list[EdgeKind]) -> None:

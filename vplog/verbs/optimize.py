@@ -168,6 +168,7 @@ def _record(
         "dimension": graph.dimension,
         "poses": len(file.ids),
         "edges": len(graph.a),
+        "odometry": int(graph.odometry.sum()),
         "loops": int(loop.sum()),
         "kept": int(loop.sum()) - len(rejected),
         "rejected": len(rejected),
