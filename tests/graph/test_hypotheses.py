@@ -42,13 +42,20 @@ def with_family(drive: Drive, rows: np.ndarray, shift_m: float) -> tuple[Drive, 
     return replace(drive, graph=replace(drive.graph, a_from_b=measured)), false
 
 
-@pytest.mark.parametrize(("odometry", "closures"), [(0.2, 0.3), (0.2, 4.0), (8.0, 0.3), (8.0, 4.0)])
+@pytest.mark.parametrize(("odometry", "closures"), [(0.2, 0.3), (0.2, 4.0), (8.0, 0.3), (8.0, 4.0), (5e-3, 5e-3)])
 def test_claimed_sigmas_decide_nothing(odometry: float, closures: float) -> None:
     drive = claiming(ring(60, loops=20, false=10, seed=2), odometry, closures)
     loops = is_loop(drive.graph)
     kept = decided(drive.graph, GncSettings()).solution.weight > 0.5
     assert not (kept & drive.false).any()
     assert (kept & loops & ~drive.false).sum() >= 19
+
+
+@pytest.mark.parametrize("odometry", [0.01, 1000.0])
+def test_claims_further_off_than_an_estimate_reaches_are_found(odometry: float) -> None:
+    sigmas = decided(claiming(ring(60, loops=20, false=10, seed=2), odometry).graph, GncSettings()).sigmas
+    assert sigmas.translation * odometry == pytest.approx(1.0, rel=0.3)
+    assert 0.5 < sigmas.of_closures < 2.0
 
 
 def test_true_closures_of_heavy_tails_are_kept_and_false_ones_left_out() -> None:

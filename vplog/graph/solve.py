@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from pydantic import Field
@@ -15,7 +16,7 @@ from vplog.graph.hypotheses import best_hypothesis, bounded
 from vplog.graph.lm import LmSettings, half_chi2, solve_weighted
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import CauchySettings, DcsSettings, GemanMcClureSettings
-from vplog.graph.variance_components import Sigmas
+from vplog.graph.variance_components import Sigmas, claimed_times
 from vplog.stages import Optimiser
 
 if TYPE_CHECKING:
@@ -50,6 +51,9 @@ def decided(
     if not loops.any():
         return Decision(graph, optimiser(graph), Sigmas())
     best = best_hypothesis(graph, optimiser, cost, log_odds)
+    if best.sigmas.at_bound:  # beyond it true closures are lost, or false ones kept
+        again = best_hypothesis(claimed_times(graph, best.sigmas), optimiser, cost, log_odds)
+        best = replace(again, sigmas=best.sigmas.times(again.sigmas))
     graph = bounded(graph)
     count, inliers = int(loops.sum()), int(best.weight[loops].sum())
     if inliers == 0:

@@ -56,6 +56,15 @@ class Sigmas(NamedTuple):
         """Factor of the closures' sigma along a mean axis."""
         return math.sqrt(self.closure_rotation * self.closure_translation)
 
+    @property
+    def at_bound(self) -> bool:
+        """Whether a claim is so far off that it may be further off still."""
+        return max(self) ** 2 >= _MOST * (1.0 - _STILL) or min(self) ** 2 <= _LEAST * (1.0 + _STILL)
+
+    def times(self, other: Sigmas) -> Sigmas:
+        """Factors of both, one after the other."""
+        return Sigmas(*(one * two for one, two in zip(self, other, strict=True)))
+
     def log_prior(self) -> float:
         """Log of the prior density but for a constant: normal in the logarithm of each variance."""
         return -sum((2.0 * math.log(sigma) / _SPREAD) ** 2 for sigma in self) / 2.0
