@@ -186,6 +186,21 @@ def test_edges_computed_from_the_odometry_do_not_make_it_better(tmp_path: Path, 
     assert any(f"restate the odometry: {len(a)} edges" in text for text in done.record["warnings"])
 
 
+@pytest.mark.parametrize(("claimed", "warned"), [(1.0, False), (0.1, True)])
+def test_noise_that_is_not_as_claimed_is_said_and_the_least_squares_are_the_files(
+    tmp_path: Path, claimed: float, warned: bool
+) -> None:
+    graph = ring(60, 20, false=2).graph
+    factor = np.where(graph.odometry, claimed, 1.0)[:, None, None] ** -2.0
+    write_g2o(tmp_path / "in.g2o", replace(graph, information=graph.information * factor), graph.world_from_body)
+    done = optimize(tmp_path / "in.g2o", tmp_path / "out.g2o")
+    assert any("not as the information claims" in text for text in done.record["warnings"]) == warned
+    [sigmas] = done.record["sigmas"]
+    assert sigmas["translation"] * claimed == pytest.approx(1.0, rel=0.4)
+    weight, poses = done.solution.weight, done.solution.world_from_body
+    assert done.record["error_after"] == pytest.approx(lm.half_chi2(done.file.graph, weight, poses))
+
+
 def test_what_cannot_be_is_said(path: Path, tmp_path: Path) -> None:
     with pytest.raises(GraphError, match="is not a file"):
         optimize(tmp_path / "none.g2o", tmp_path / "out.g2o")

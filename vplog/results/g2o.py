@@ -79,8 +79,9 @@ def read_g2o(path: Path) -> GraphFile:
     Ids may come in any order, with gaps, up to 2^63 - 1 (GTSAM's symbols are such). Edges between consecutive ids are
     odometry, the first of several; all others are loop closures. Where ids are thinned out, so that fewer than half
     of the neighbours have consecutive ids, neighbours in order of ids count as consecutive; where edges join fewer than
-    half of those, as in graphs of views, none is odometry. Edges from a pose to itself are left out, with a warning. Poses that only edges name are placed along the edges, odometry first. Information is
-    that of the rotation vector, as GTSAM reads it.
+    half of those, as in graphs of views, none is odometry. Edges from a pose to itself are left out, with a warning.
+    Poses that only edges name are placed along the edges, odometry first. Information is that of the rotation vector,
+    as GTSAM reads it.
 
     Raises GraphError with file and line where that is not a graph of poses.
     """
@@ -114,7 +115,9 @@ def read_g2o(path: Path) -> GraphFile:
     measured = _poses(path, edges, values[:, : layout.pose])
     kind = _kinds(ids, a, b)
     if EdgeKind.ODOMETRY not in kind:
-        warnings.append("No odometry: edges join too few poses with consecutive ids. Every edge is judged as a closure.")
+        warnings.append(
+            "No odometry: edges join too few poses with consecutive ids. Every edge is judged as a closure."
+        )
     poses, given = np.tile(np.eye(4), (len(ids), 1, 1)), np.zeros(len(ids), bool)
     at = np.searchsorted(ids, known)
     poses[at], given[at] = _poses(path, vertices, places), True

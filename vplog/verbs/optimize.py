@@ -19,11 +19,14 @@ from vplog.graph.consistency import OdometryChain, residual_sigma, residual_twis
 from vplog.graph.factors import Factors
 from vplog.graph.lm import LmSettings, solve_weighted
 from vplog.graph.solve import OptimiserSettings, decided
+from vplog.graph.variance_components import Sigmas
 from vplog.results.g2o import GraphFile, read_g2o, write_g2o
 
 _RESTATED, _RESTATED_SIGMA = 1e-3, 1e-2
 """m and rad, and sigma, within which an edge measures what the odometry does: poses that were rounded for a file. Two
 measurements by themselves are as near only by chance."""
+_AS_CLAIMED = 2.0
+"""Factor of a sigma up to which noise is as claimed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +42,9 @@ class Optimised:
 def optimize(path: Path, out: Path, method: str = "gnc", certify: bool = False) -> Optimised:
     """Solve the graph of a g2o file and write it with its new poses to `out`, all its edges too.
 
+    The poses are the least squares of the edges accepted with the information of the file, as g2o and GTSAM have them;
+    closures are judged by the noise that they imply, which the record has as `sigmas` of each part.
+
     Parts that no edge joins are solved each by itself. The pose that FIX names, else the first of each part, stays
     where it is. With `certify` the record has a `certificate`: whether the solution is the global optimum of the edges
     accepted. Where it is not and a better one is found, that is taken.
@@ -53,7 +59,7 @@ def optimize(path: Path, out: Path, method: str = "gnc", certify: bool = False) 
     part = parts(len(ids), graph.a, graph.b)
     warnings = file.warnings + _about_parts(part, ids)
     with watch.stage("solve"):
-        solution, graph, repairs = solve_parts(graph, part, optimiser, ids)
+        solution, graph, sigmas, repairs = solve_parts(graph, part, optimiser, ids)
     certificate = None
     if certify:
         with watch.stage("certify"):
@@ -62,7 +68,7 @@ def optimize(path: Path, out: Path, method: str = "gnc", certify: bool = False) 
         solution = _with_fixed(solution, graph, part == part[file.held], file.held)
         write_g2o(out, file.graph, solution.world_from_body, ids, file.held)
     warnings += repairs + _about_rejected(graph, solution, part, ids)
-    record = _record(path, out, method, file, solution, warnings, watch)
+    record = _record(path, out, method, file, solution, warnings, watch) | {"sigmas": [one._asdict() for one in sigmas]}
     if certificate is not None:
         record["certificate"] = certificate.record()
     return Optimised(file, solution, record)
@@ -97,10 +103,11 @@ def _about_rejected(graph: PoseGraph, solution: Solution, part: Ints, ids: Ints)
 
 def solve_parts(
     graph: PoseGraph, part: Ints, optimiser: OptimiserSettings, ids: Ints
-) -> tuple[Solution, PoseGraph, list[str]]:
-    """The solution of each part (N,) of a graph by itself, put together, the graph as repaired, and warnings of it."""
+) -> tuple[Solution, PoseGraph, list[Sigmas], list[str]]:
+    """The solution of each part (N,) of a graph by itself, put together, the graph as repaired, factors of the claimed
+    sigmas in each part, and warnings."""
     poses, weight, information = np.array(graph.world_from_body), np.ones(len(graph.a)), np.array(graph.information)
-    solutions, warnings = [], []
+    solutions, sigmas, warnings = [], list[Sigmas](), []
     size = np.bincount(part)
     of_part = zip(_by_part(part, len(size)), _by_part(part[graph.a], len(size)), strict=True)
     for rows, edges in of_part:
@@ -110,8 +117,10 @@ def solve_parts(
         where = f"Part from {ids[rows[0]]} on: " if (size > 1).sum() > 1 else ""
         again, own = _restates_odometry(alone), np.ones(len(edges))
         judged = np.flatnonzero(~again)
-        solution = decided(subgraph(alone, np.arange(len(rows)), judged), optimiser).solution
-        own[judged] = solution.weight
+        decision = decided(subgraph(alone, np.arange(len(rows)), judged), optimiser)
+        solution, own[judged] = decision.solution, decision.solution.weight
+        sigmas.append(decision.sigmas)
+        repairs = repairs + _about_noise(decision.sigmas)
         if again.any():
             found = plural(int(again.sum()), "edge")
             repairs = [*repairs, f"Accepted without being judged, as they restate the odometry: {found}."]
@@ -131,7 +140,19 @@ def solve_parts(
     iterations, converged = max(one.iterations for one in solutions), all(one.converged for one in solutions)
     reason = " ".join(one.reason for one in solutions)
     solution = Solution(poses, weight, before, after, iterations, converged, reason)
-    return solution, replace(graph, information=information), warnings
+    return solution, replace(graph, information=information), sigmas, warnings
+
+
+def _about_noise(sigmas: Sigmas) -> list[str]:
+    """A warning where the information of the file is not that of the noise found."""
+    if not sigmas.differ(Sigmas(), float(np.log(_AS_CLAIMED))):
+        return []
+    return [
+        f"The noise is not as the information claims: sigma of the odometry is {sigmas.rotation:.3g} times that in "
+        f"rotation and {sigmas.translation:.3g} in translation, of closures {sigmas.closure_rotation:.3g} and "
+        f"{sigmas.closure_translation:.3g}. Poses are solved as claimed; divide the information by the squares for "
+        "better ones."
+    ]
 
 
 def _restates_odometry(graph: PoseGraph) -> Bools:
