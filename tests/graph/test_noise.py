@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import accumulate
 
 import numpy as np
@@ -145,6 +146,22 @@ def test_constants_of_a_driver_are_bounded_by_the_model(rest: float) -> None:
     largest = np.linalg.eigvalsh(result / sigma[:, :, None] / sigma[:, None, :])[:, -1]
     assert np.median(largest) == pytest.approx(1.0, rel=1e-3)
     assert any(f"{1 + (rest < 1.0)} constant" in warning and "lowered" in warning for warning in warnings)
+
+
+@pytest.mark.parametrize(
+    ("scale", "increments", "lowered"), [(1e4, False, True), (1e4, True, False), (1, False, False)]
+)
+def test_the_covariance_of_a_pose_that_is_corrected_is_bounded_by_the_model(
+    scale: float, increments: bool, lowered: bool
+) -> None:
+    """It fluctuates, and as noise of increments it would grow with the rate of samples."""
+    drive = replace(odometry(scale * fluctuating()), increments=increments)
+    result, warnings, source = edge_covariance(drive, STAMPS[::7], NoiseSettings())
+    model, _, _ = edge_covariance(odometry(None), STAMPS[::7], NoiseSettings())
+    share = np.sqrt(np.diagonal(result, axis1=1, axis2=2) / np.diagonal(model, axis1=1, axis2=2))
+    assert source == "increments"
+    assert (share.max() <= 1.001) == lowered
+    assert any("does not grow" in warning for warning in warnings) == lowered
 
 
 def test_constants_that_tell_how_sure_the_odometry_is_stay_apart() -> None:

@@ -14,6 +14,8 @@ from vplog.settings import Settings
 
 _MOST_CONSTANTS = 4
 """Covariances that a driver chooses from: for motion and rest, or for straight ways and turns."""
+_VAIN = 10.0
+"""Sigmas of summed increments as a multiple of the drift model's, from which they are none: a fifth of the distance."""
 _CHUNK = 1 << 15
 """Rows handled at once; bounds the memory of (rows, 6, 6) arrays to some 10 MB each."""
 _AXES = ("roll", "pitch", "yaw", "x", "y", "z")
@@ -89,7 +91,8 @@ def covariance_without_breaks(
     has less noise than `best_share` of the model's: over-confident odometry would throw every closure out. A covariance
     that never changes, or only between a few values as from motion to rest, is a figure in a driver, not an estimate
     (it has a parked robot drift away), so its edges have no more than `worst_share` of the model's: odometry that may
-    be anywhere cannot tell a false closure.
+    be anywhere cannot tell a false closure. Likewise increments that the odometry does not say to be such, where they
+    sum up to far more than the model: a filter that fixes correct has such a covariance of its pose.
 
     Raises GraphError where the keyframes are not increasing or the odometry does not cover them.
     """
@@ -150,7 +153,16 @@ def covariance_without_breaks(
             f"The odometry's covariance is unusable at {int((~usable).sum())} of {len(usable)} samples, "
             f"so {int(broken.sum())} edges take the drift model."
         )
-    most = settings.worst_share if constants else np.inf
+    of_pose = not (constants or accumulated or odometry.increments)
+    within, implausible = _plausible(covariance, modelled, settings, constants, of_pose)
+    return within, warnings + implausible, source
+
+
+def _plausible(
+    covariance: Floats, modelled: Floats, settings: NoiseSettings, constants: int, of_pose: bool
+) -> tuple[Floats, list[str]]:
+    """The covariances within what odometry can have, and warnings. `of_pose` says that they may be a pose's, summed."""
+    most, warnings = settings.worst_share, []
     within, share = _bounded(covariance, modelled, settings.best_share, most if constants == 1 else np.inf)
     # judged by the surest and the least sure direction of an edge: a sound heading must not hide a vain position
     least, largest = np.median(share[:, 0]), np.median(share[:, -1])
@@ -160,14 +172,17 @@ def covariance_without_breaks(
             f"({settings.drift_per_metre:.1%} of the distance, {np.degrees(settings.turn_per_metre):.3f} deg/m), which "
             f"no odometry reaches, so it is raised to {settings.best_share:.0%} of it."
         )
-    if largest > most:
+    if (constants and largest > most) or (of_pose and largest > _VAIN * most):
         if constants > 1:  # which of them it is tells how sure the odometry is
             within = _bounded(covariance * (most / largest) ** 2, modelled, settings.best_share, np.inf)[0]
+        elif of_pose:
+            within = _bounded(covariance, modelled, settings.best_share, most)[0]
+        what = "is " + plural(constants, "constant") + "," if constants else "does not grow, and sums up to"
         warnings.append(
-            f"The odometry's covariance is implausible: it is {plural(constants, 'constant')}, {largest:.1f} times the "
-            f"drift model in sigma, so it is lowered to {most:g} times."
+            f"The odometry's covariance is implausible: it {what} {largest:.1f} times the drift model in sigma, so it "
+            f"is lowered to {most:g} times."
         )
-    return within, warnings, source
+    return within, warnings
 
 
 def _unknown(what: str, settings: NoiseSettings) -> str:
