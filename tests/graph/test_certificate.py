@@ -182,6 +182,16 @@ def test_edges_of_no_weight_are_left_out_and_parts_certified_each_by_itself() ->
     assert certify(joined, weight, found.better).verdict == "certified"
 
 
+def test_a_descent_that_did_not_settle_is_named_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No eigenvalue is negative, and yet it is refused."""
+    monkeypatch.setattr(certificate, "is_stationary", lambda *_: False)
+    graph = ring(12, 2, 1)
+    found = certify(graph, np.ones(12), graph.world_from_body, search=True)
+    assert found.verdict == "refused"
+    assert "did not settle" in found.reason
+    assert "eigenvalue" not in found.reason
+
+
 def test_a_chain_is_its_own_optimum_and_too_many_poses_are_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     graph = ring(30, 3, 1)
     open_chain = np.append(np.ones(29), 0.0)

@@ -131,6 +131,11 @@ def _sentence(found: Certificate, search: bool) -> str:
             f"kept than {found.chi2:.6g}, the minimum that the solution leads to, {found.moved_m:.3g} m away at most. "
             f"{_CAVEAT}"
         )
+    if found.gap == 0.0:  # no eigenvalue refuses it
+        return (
+            "Not certified as the optimum: the descent from the solution to a minimum of the isotropic chi-square did "
+            f"not settle, {found.moved_m:.3g} m away. Solve again from the poses written. {_CAVEAT}"
+        )
     text = f"Not certified as the optimum: the certificate's least eigenvalue is {found.smallest_eigenvalue:.3g}"
     if found.lower_chi2 is not None:
         text += f", and other poses have a chi-square of {found.lower_chi2:.6g} in place of {found.chi2:.6g}"
