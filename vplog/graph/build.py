@@ -16,6 +16,8 @@ _FURTHEST_M = 1e8
 """m; frames of drives (UTM, ECEF) stay below 1e7, and from 1e8 on the last bit of a double is coarser than 10 nm."""
 _MOST_INFORMATION = 1e30
 """Most information, of m or rad: a millionth of a nanometre. Beyond it, squares and determinants overflow a double."""
+_LEAST_INFORMATION = 1e-30
+"""Least of an axis that is known of: less, and the squares of the covariance overflow."""
 _LEAST_SHARE = 1e-10
 """Least eigenvalue of an information matrix as a share of its largest: GTSAM factorises them, so none may be zero."""
 _CLEARLY = 0.01
@@ -187,7 +189,7 @@ def _check_poses(poses: Floats, name: str, dimension: int) -> None:
 def _check_matrices(matrices: Floats, name: str, a: Int32s | Ints, b: Int32s | Ints) -> None:
     finite: Bools = np.asarray(np.isfinite(matrices).all((1, 2)))
     diagonal = np.diagonal(np.where(finite[:, None, None], matrices, 0.0), axis1=1, axis2=2)
-    least: Bools = np.asarray((diagonal < 0).any(1) | (diagonal <= 0).all(1))
+    least: Bools = np.asarray(((diagonal < _LEAST_INFORMATION) & (diagonal != 0)).any(1) | (diagonal == 0).all(1))
     most: Bools = np.asarray((diagonal > _MOST_INFORMATION).any(1))
     bad = np.flatnonzero(~finite | least | most)
     if len(bad):
@@ -197,7 +199,7 @@ def _check_matrices(matrices: Floats, name: str, a: Int32s | Ints, b: Int32s | I
         value = value if finite[edge] else matrices[edge][~np.isfinite(matrices[edge])][0]
         raise GraphError(
             f"The {name} of edge {edge} ({a[edge]} to {b[edge]}) holds {value:.6g}; "
-            f"it must be finite with a positive diagonal of at most {_MOST_INFORMATION:g}."
+            f"it must be finite with a positive diagonal of {_LEAST_INFORMATION:g} to {_MOST_INFORMATION:g}."
         )
 
 
