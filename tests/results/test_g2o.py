@@ -169,6 +169,7 @@ def test_without_a_chain_no_edge_is_odometry(tmp_path: Path, pairs: list[tuple[i
     [
         ("", "no EDGE_SE2 or EDGE_SE3"),
         ("VERTEX_SE2 0 0 0 0\n", "no EDGE_SE2 or EDGE_SE3"),
+        ("VERTEX2 0 0 0 0\nEDGE2 0 1 1 0 0 1 0 1 1 0 0\n", "It is TORO's: convert it"),
         ("EDGE_SE2 0 1 1 0 0 1 0 0 1 0\n", "line 1: 8 numbers after the ids instead of 9"),
         ("# c\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1 1\n", "line 2: 10 numbers"),
         ("EDGE_SE2 0 1 1 0 0 1 0 0 1 0\nEDGE_SE2 1 2 1 0 0 1 0 0 1 0 1 1\n", "line 1: 8 numbers"),
@@ -193,6 +194,17 @@ def test_what_is_wrong_is_said_with_its_line(tmp_path: Path, text: str, said: st
     with pytest.raises(GraphError, match=said) as error:
         read_g2o(file(tmp_path, text))
     assert "\n" not in str(error.value)
+
+
+def test_a_byte_order_mark_is_left_out(tmp_path: Path) -> None:
+    assert read_g2o(file(tmp_path, "\u00ef\u00bb\u00bfVERTEX_SE2 5 3 0 0\n" + PLANAR)).ids.tolist() == [0, 5, 10, 20]
+
+
+def test_edges_with_a_switch_are_named_as_edges(tmp_path: Path) -> None:
+    text = "EDGE_SE2_SWITCHABLE 0 2 9 1 0 0 1 0 0 1 0 1\nVERTEX_SWITCH 9 1\n"
+    warnings = " ".join(read_g2o(file(tmp_path, PLANAR + text)).warnings)
+    assert "1 line of EDGE_SE2_SWITCHABLE left out: write them as EDGE_SE2" in warnings
+    assert "1 line of VERTEX_SWITCH left out: they are no poses" in warnings
 
 
 def test_what_is_no_file_or_too_large_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

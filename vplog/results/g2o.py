@@ -21,8 +21,12 @@ _MOST_BYTES = 1 << 30
 """Largest file read: a million poses with as many edges, at 500 to 770 bytes of each. Arrays take up to 14 times the
 bytes of the text they come from."""
 _MOST_ID = 2**63 - 1
+_BYTE_ORDER_MARK = "\u00ef\u00bb\u00bf"
+"""Of UTF-8, as Latin-1."""
 _LEFT_OUT = re.compile(r"(VERTEX|EDGE|PARAMS|DATA|ROBOT|FLASER|RAWLASER|TRUEPOSE|LASER)[A-Z0-9_:]*$")
 """Tags of the format's other elements: landmarks, priors, sensor data. A pose graph is solved without them."""
+_JOINS_POSES = re.compile("SWITCHABLE|MAXMIX|MIXTURE")
+"""Edges between poses that have a switch or several modes, as Vertigo and Olson's max-mixtures write them."""
 _QUATERNION_OFF = 0.1
 """Largest difference of a quaternion's length from 1: rounded to one digit passes, another quantity does not."""
 _FURTHEST_M = 1e8
@@ -96,7 +100,14 @@ def read_g2o(path: Path) -> GraphFile:
                 path, lines[name].line[0], f"{name} in a graph that has {layout.edge}; it must be one or the other"
             )
     if not edges.line:
-        raise GraphError(f"{path} has no EDGE_SE2 or EDGE_SE3:QUAT line, so there is no pose graph in it to solve.")
+        toro = (
+            " It is TORO's: convert it, as GTSAM's load2D and writeG2o do."
+            if {"EDGE2", "EDGE3"} & set(left_out)
+            else ""
+        )
+        raise GraphError(
+            f"{path} has no EDGE_SE2 or EDGE_SE3:QUAT line, so there is no pose graph in it to solve.{toro}"
+        )
 
     known, ends = _ids(path, vertices, 1)[:, 0], _ids(path, edges, 2)
     repeated = np.setdiff1d(np.arange(len(known)), np.unique(known, return_index=True)[1])
@@ -121,7 +132,9 @@ def read_g2o(path: Path) -> GraphFile:
     poses, given = np.tile(np.eye(4), (len(ids), 1, 1)), np.zeros(len(ids), bool)
     at = np.searchsorted(ids, known)
     poses[at], given[at] = _poses(path, vertices, places), True
-    warnings += [f"{plural(count, 'line')} of {name} left out: they are no poses." for name, count in left_out.items()]
+    for name, count in left_out.items():
+        why = f"write them as {layout.edge} to be judged" if _JOINS_POSES.search(name) else "they are no poses"
+        warnings.append(f"{plural(count, 'line')} of {name} left out: {why}.")
     if not given.all():
         if given.any():
             warnings.append(f"{int((~given).sum())} of {len(ids)} poses without a VERTEX line: placed by their edges.")
@@ -165,7 +178,7 @@ def _split(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counte
             )
         with path.open(encoding="latin-1") as stream:  # every byte is a character: bad ones fail as what they stand for
             for number, line in enumerate(stream, 1):
-                words = line.split(None, 3)
+                words = line.removeprefix(_BYTE_ORDER_MARK).split(None, 3)
                 tag = words[0] if words else "#"
                 if tag in ends:
                     named = ends[tag]
