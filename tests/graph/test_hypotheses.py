@@ -51,10 +51,9 @@ def test_claimed_sigmas_decide_nothing(odometry: float, closures: float) -> None
     assert (kept & loops & ~drive.false).sum() >= 19
 
 
-@pytest.mark.parametrize("odometry", [0.01, 1000.0])
-def test_claims_further_off_than_an_estimate_reaches_are_found(odometry: float) -> None:
-    sigmas = decided(claiming(ring(60, loops=20, false=10, seed=2), odometry).graph, GncSettings()).sigmas
-    assert sigmas.translation * odometry == pytest.approx(1.0, rel=0.3)
+def test_claims_further_off_than_an_estimate_reaches_are_found() -> None:
+    sigmas = decided(claiming(ring(60, loops=20, false=10, seed=2), odometry=0.01).graph, GncSettings()).sigmas
+    assert sigmas.translation * 0.01 == pytest.approx(1.0, rel=0.3)
     assert 0.5 < sigmas.of_closures < 2.0
 
 

@@ -51,7 +51,7 @@ def decided(
     if not loops.any():
         return Decision(graph, optimiser(graph), Sigmas())
     best = best_hypothesis(graph, optimiser, cost, log_odds)
-    if best.sigmas.at_bound:  # beyond it true closures are lost, or false ones kept
+    if best.sigmas.at_bound:  # beyond it true closures are lost
         again = best_hypothesis(claimed_times(graph, best.sigmas), optimiser, cost, log_odds)
         best = replace(again, sigmas=best.sigmas.times(again.sigmas))
     graph = bounded(graph)

@@ -58,8 +58,8 @@ class Sigmas(NamedTuple):
 
     @property
     def at_bound(self) -> bool:
-        """Whether a claim is so far off that it may be further off still."""
-        return max(self) ** 2 >= _MOST * (1.0 - _STILL) or min(self) ** 2 <= _LEAST * (1.0 + _STILL)
+        """Whether claims are so far too small that the noise may be larger still."""
+        return max(self) ** 2 >= _MOST * (1.0 - _STILL)
 
     def times(self, other: Sigmas) -> Sigmas:
         """Factors of both, one after the other."""

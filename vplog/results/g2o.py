@@ -100,13 +100,10 @@ def read_g2o(path: Path) -> GraphFile:
                 path, lines[name].line[0], f"{name} in a graph that has {layout.edge}; it must be one or the other"
             )
     if not edges.line:
-        toro = (
-            " It is TORO's: convert it, as GTSAM's load2D and writeG2o do."
-            if {"EDGE2", "EDGE3"} & set(left_out)
-            else ""
-        )
+        toro = {"EDGE2", "EDGE3"} & set(left_out)
         raise GraphError(
-            f"{path} has no EDGE_SE2 or EDGE_SE3:QUAT line, so there is no pose graph in it to solve.{toro}"
+            f"{path} has no EDGE_SE2 or EDGE_SE3:QUAT line, so there is no pose graph in it to solve."
+            + " It is TORO's: convert it, as GTSAM's load2D and writeG2o do." * bool(toro)
         )
 
     known, ends = _ids(path, vertices, 1)[:, 0], _ids(path, edges, 2)
