@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -220,7 +221,8 @@ def _cameras(folder: Path) -> list[Floats]:
 def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptions) -> dict[str, Any]:
     """A joint run: drives by themselves, each map of several as one trajectory, and the closures between drives.
 
-    Drives that the truth does not cover are listed under `uncovered`. Raises TruthError where it covers none.
+    Drives that the truth does not cover are listed under `uncovered`. Raises TruthError where it covers none, or where
+    drives of a map were recorded at the same time.
     """
     if truth in ("gps", "auto"):
         raise TruthError(f"{folder} holds several drives; each has its own truth: vplog evaluate {folder}/DRIVE")
@@ -240,6 +242,7 @@ def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptio
             except TruthError as error:
                 uncovered[name] = str(error)
         names = [name for name in names if name in drives]
+        _check_apart_in_time(folder, {name: drives[name].keyframes for name in names})
         if names:
             file = "trajectory.parquet" if found.get("reason") is None else "joint_trajectory.parquet"
             parts = [tables.read_trajectory(folder / name / file)[0] for name in names]
@@ -252,6 +255,17 @@ def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptio
         raise TruthError(next(iter(uncovered.values()), f"{folder} holds no drive."))
     joins = _joins(folder, drives, options)
     return {"truth": shown(truth), "maps": maps, "joins": joins, "uncovered": uncovered}
+
+
+def _check_apart_in_time(folder: Path, drives: dict[str, Keyframes]) -> None:
+    """Raises TruthError where two drives of a map were recorded at the same time: a truth is of one body."""
+    in_time = sorted(drives, key=lambda name: int(drives[name].stamp_ns[0]))
+    for one, other in pairwise(in_time):
+        if drives[other].stamp_ns[0] <= drives[one].stamp_ns[-1]:
+            raise TruthError(
+                f"{one} and {other} of {folder} were recorded at the same time, and a truth is of one of them. "
+                f"Evaluate each by itself: vplog evaluate {folder}/{one} --truth FILE.tum"
+            )
 
 
 def _joins(folder: Path, drives: dict[str, RunEvaluation], place: closures.PlaceCriterion) -> list[dict[str, Any]]:

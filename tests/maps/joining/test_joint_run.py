@@ -17,7 +17,7 @@ from vplog.evaluate.truth import read_truth
 from vplog.geometry import se3
 from vplog.geometry.tum import write_tum
 from vplog.results import tables
-from vplog.results.run_record import read_run_json
+from vplog.results.run_record import read_run_json, write_run_json
 from vplog.run.provenance import OWN_LIBRARY
 from vplog.verbs.evaluate_run import evaluate
 
@@ -150,6 +150,15 @@ def test_a_drive_that_the_truth_does_not_cover_is_named(
     write_tum(tmp_path / "positions.tum", Trajectory(known.stamp_ns, identity))
     said = verb("evaluate", joint, "--truth", tmp_path / "positions.tum")
     assert said.err.count("before, after, drive: The truth has no orientations") == 1
+
+
+def test_drives_of_a_map_at_the_same_time_need_a_truth_each(joint: Path, drive: Demo, tmp_path: Path) -> None:
+    out = shutil.copytree(joint, tmp_path / "out")
+    record = read_run_json(out / "run.json")
+    record["maps"] = [{**record["maps"][0], "drives": ["before", "after", "drive"]}]
+    write_run_json(out / "run.json", record)
+    with pytest.raises(vplog.TruthError, match=r"before and drive of .* at the same time"):
+        evaluate(out, str(drive.truth))
 
 
 def test_verbs_of_one_drive_say_which_there_are(joint: Path, tmp_path: Path, verb: Callable[..., Said]) -> None:
