@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,7 +16,7 @@ from tests.graph.drive import position_error, ring, without_loops
 from tests.graph.gtsam_graph import as_array, weighted
 from vplog.data import EdgeKind, PoseGraph, Solution
 from vplog.graph.consistency import chi2_quantile
-from vplog.graph.solve import GncSettings, LmSettings, OptimiserSettings
+from vplog.graph.solve import GncSettings, LmSettings, OptimiserSettings, about_jump, decided
 
 METHODS = [GncSettings(), LmSettings()]
 
@@ -54,6 +55,17 @@ def test_false_closures_lose_their_weight_and_true_ones_keep_it(false: int, seed
     assert position_error(solution.world_from_body, drive.true) < 0.5 * position_error(
         drive.keyframes.odom_from_body, drive.true
     )
+
+
+@pytest.mark.parametrize("jump_m", [0.0, 10.0])
+def test_rejected_closures_that_agree_tell_where_the_odometry_jumps(jump_m: float) -> None:
+    graph = ring(60, loops=20, false=5).graph
+    measured = graph.a_from_b.copy()
+    measured[30, 0, 3] += jump_m
+    decision = decided(replace(graph, a_from_b=measured), GncSettings())
+    found = [re.search(r"between poses (\d+) and (\d+)", text) for text in about_jump(decision, np.arange(60) + 100)]
+    assert len(found) == (jump_m > 0.0)
+    assert all(one is not None and 120 <= int(one[1]) <= 130 < int(one[2]) < 140 for one in found)
 
 
 def test_gnc_agrees_with_gtsam() -> None:

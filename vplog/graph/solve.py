@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
+import numpy as np
 from pydantic import Field
 
-from vplog.data import Floats, PoseGraph, Solution
+from vplog.data import Floats, Ints, PoseGraph, Solution
 from vplog.graph.build import checked
 from vplog.graph.consistency import is_loop
+from vplog.graph.evidence import Accidents, agreeing, runs
 from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
 from vplog.graph.hypotheses import best_hypothesis, bounded
@@ -21,6 +23,9 @@ from vplog.stages import Optimiser
 
 if TYPE_CHECKING:
     from vplog.graph.hypotheses import Cost
+
+_SHARE, _PLACES = 1 / 3, 3
+"""Share of the closures, and their runs, that agree on a displacement before it is said to be the odometry's."""
 
 OptimiserSettings = Annotated[
     GncSettings | PcmSettings | DcsSettings | CauchySettings | GemanMcClureSettings | LmSettings,
@@ -68,3 +73,24 @@ def decided(
         Factors.of(graph), best.weight, best.poses, optimiser.max_iterations, optimiser.tolerance, found
     )
     return Decision(graph, solution, best.sigmas)
+
+
+def about_jump(decision: Decision, names: Ints) -> list[str]:
+    """A warning where many rejected closures claim one displacement, as they do across a step of the odometry that is
+    far beyond its noise, where a wheel slipped or frames are missing. `names` (N,) are those of the poses."""
+    graph, loops = decision.graph, is_loop(decision.graph)
+    rejected = np.flatnonzero(loops & (decision.solution.weight < 0.5))
+    if len(rejected) <= _SHARE * loops.sum():
+        return []
+    largest = next(iter(agreeing(Accidents(graph), rejected)), rejected[:0])
+    places = sum(1 for _ in runs(graph, largest))
+    if len(largest) <= _SHARE * loops.sum() or places < _PLACES:
+        return []
+    ends = np.sort([graph.a[largest], graph.b[largest]], axis=0)
+    first, last = int(ends[0].max()), int(ends[1].min())
+    if first >= last:
+        return []
+    return [
+        f"{len(largest)} rejected closures of {places} places agree on one displacement: they are true if the odometry "
+        f"jumps between poses {names[first]} and {names[last]}. Look at it there."
+    ]

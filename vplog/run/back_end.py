@@ -36,7 +36,7 @@ from vplog.graph.marginals import pose_covariances
 from vplog.graph.noise import NoiseSettings, broken_edges, edge_covariance
 from vplog.graph.pieces import pieces_placed
 from vplog.graph.refine import Refined, RefineSettings, Scale, refine, rescaled
-from vplog.graph.solve import Decision, OptimiserSettings, decided
+from vplog.graph.solve import Decision, OptimiserSettings, about_jump, decided
 from vplog.graph.variance_components import Sigmas, claimed_times
 from vplog.loops.false_rate import log_odds_false
 from vplog.run.cache.steps import step
@@ -96,6 +96,7 @@ def solve(
     decision = decided(present, settings.solve, cost, log_odds)
     refined = refine(bounded(graph), decision.solution, of_odometry, settings.refine, fixes, decision.sigmas, scale)
     warnings = noise_warnings + build_warnings + (fixes.warnings if fixes else [])
+    warnings += about_jump(decision, np.arange(len(keyframes.stamp_ns)))
     warnings += _apart(broken, keyframes, graph, refined.solution)
     warnings += _contradicted(present, partial(decided, optimiser=settings.solve, cost=cost))
     warnings += _confirmed(closures, refined.solution.world_from_body)
