@@ -22,7 +22,7 @@ _MOST_BYTES = 1 << 30
 bytes of the text they come from."""
 _MOST_ID = 2**63 - 1
 _BYTE_ORDER_MARK = "\u00ef\u00bb\u00bf"
-"""Of UTF-8, as Latin-1."""
+"""UTF-8 writes it; read as Latin-1."""
 _LEFT_OUT = re.compile(r"(VERTEX|EDGE|PARAMS|DATA|ROBOT|FLASER|RAWLASER|TRUEPOSE|LASER)[A-Z0-9_:]*$")
 """Tags of the format's other elements: landmarks, priors, sensor data. A pose graph is solved without them."""
 _JOINS_POSES = re.compile("SWITCHABLE|MAXMIX|MIXTURE")
