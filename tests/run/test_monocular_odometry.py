@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -128,7 +129,7 @@ def test_the_unit_is_that_of_all_that_is_followed(monkeypatch: pytest.MonkeyPatc
     frames, truth = street()
     lengths = []
     for unit in (UNIT_DEPTH, UNIT_DEPTH / 5):
-        monkeypatch.setitem(two_views.__globals__, "UNIT_DEPTH", unit)
+        monkeypatch.setattr(sys.modules[two_views.__module__], "UNIT_DEPTH", unit)
         lengths.append(np.linalg.norm(np.diff(followed(frames).odom_from_body[:, :3, 3], axis=0), axis=1).sum())
     assert lengths[0] == pytest.approx(lengths[1], rel=0.02)
     assert 0.5 < lengths[0] / np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum() < 2.0
