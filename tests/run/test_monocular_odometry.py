@@ -245,7 +245,7 @@ def test_each_piece_keeps_its_own_scale_to_its_ends() -> None:
     odometry = Odometry(stamp_ns, poses, None, breaks=np.array([100]), metric=False)
     rows = np.concatenate([np.arange(0, 95, 5), np.arange(110, 200, 5)])
     match, query = np.arange(18), np.arange(19, 37)
-    ratios = np.column_stack([query, match, np.full(18, -np.log(2.0)), np.full(18, 0.02)])
+    ratios = np.column_stack([query, match, np.full(18, -np.log(2.0)), np.full(18, 0.02)]).astype(np.float64)
     keyframes = Keyframes("drive", stamp_ns[rows], poses[rows])
     found, _ = in_one_scale(odometry, keyframes, SENSOR.camera, ratios)
     steps = np.delete(np.linalg.norm(np.diff(found.odom_from_body[:, :3, 3], axis=0), axis=1), 99)
