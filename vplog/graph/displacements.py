@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numba
@@ -15,7 +16,7 @@ from vplog.graph.sparse.dense_front import eliminate_front
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from vplog.data import Floats, Ints
+    from vplog.data import Bools, Floats, Ints
     from vplog.graph.consistency import OdometryChain
 
 _EARLIER = 200
@@ -23,6 +24,28 @@ _EARLIER = 200
 _PAIRS = 1 << 12
 """Pairs of runs compared at once: some megabytes."""
 _LOG_2PI = math.log(2.0 * math.pi)
+
+
+@dataclass(eq=False)
+class Compared:
+    """Claims that were compared in one room, by their names, which are numbers: of sets that differ in a few, most
+    were."""
+
+    joint: dict[tuple[int, ...], float] = field(default_factory=dict)
+    pairs: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(P,) the earlier one's name times 2^32 plus the later one's, increasing."""
+    alike: Bools = field(default_factory=lambda: np.zeros(0, bool))
+    """(P,) whether the two agree."""
+
+    def known(self, pairs: Ints) -> tuple[Ints, Bools]:
+        """(K,) where the pairs stand, and which of them were compared."""
+        at = np.searchsorted(self.pairs, pairs)
+        return at, np.append(self.pairs, -1)[at] == pairs
+
+    def take(self, pairs: Ints, alike: Bools) -> None:
+        """Further pairs."""
+        order = np.argsort(joined := np.concatenate([self.pairs, pairs]), kind="stable")
+        self.pairs, self.alike = joined[order], np.concatenate([self.alike, alike])[order]
 
 
 class Displacements:
@@ -34,11 +57,11 @@ class Displacements:
 
     def __init__(
         self, chain: OdometryChain, a: Ints, b: Ints, measured: Floats, noise: Floats,
-        names: Sequence[int] | None = None, joint: dict[tuple[int, ...], float] | None = None,
+        names: Sequence[int] | None = None, compared: Compared | None = None,
     ) -> None:  # fmt: skip
         """Closures z `measured` (K, 4, 4) from earlier poses a to later ones b with `noise` (K, d, d) in b's frame.
 
-        `joint` holds densities by `names` of the closures, and gets new ones.
+        `compared` holds what is known of closures of these `names`, and gets more.
         """
         self._chain, self._a, self._b = chain, a, b
         at_a, at_b = (se3.between(chain.poses[:1], chain.poses[end]) for end in (a, b))
@@ -46,8 +69,8 @@ class Displacements:
         Ad = self._adjoint(at_b)
         self._own = Ad @ noise @ np.swapaxes(Ad, 1, 2)
         self._after = self._adjoint(se3.inverse(self._displaced))
-        self._names = list(range(len(a))) if names is None else names
-        self._joint: dict[tuple[int, ...], float] = {} if joint is None else joint
+        self._names = np.arange(len(a)) if names is None else np.array(names, np.int64)
+        self._compared = Compared() if compared is None else compared
 
     @property
     def count(self) -> int:
@@ -61,26 +84,35 @@ class Displacements:
         one = np.arange(len(two)) - np.repeat(np.cumsum(each) - np.arange(self.count), each)
         comparable = (part[self._a[one]] == part[self._a[two]]) & (part[self._b[one]] == part[self._b[two]])
         one, two = one[comparable], two[comparable]
+        pairs = (self._names[one] << 32) + self._names[two]
+        new = np.flatnonzero(~self._compared.known(pairs)[1])
+        self._compared.take(pairs[new], self._alike(one[new], two[new], room))
+        alike = self._compared.alike[self._compared.known(pairs)[0]]
+        for earlier, later in zip(one[alike].tolist(), two[alike].tolist(), strict=True):
+            near[later].append(earlier)
+        return near
+
+    def _alike(self, one: Ints, two: Ints, room: float) -> Bools:
+        """(P,)."""
+        found = np.zeros(len(one), bool)
         for start in range(0, len(one), _PAIRS):
             rows = slice(start, start + _PAIRS)
             error, covariance = self.apart(one[rows], two[rows])
             log_volume = np.linalg.slogdet(covariance)[1] + error.shape[1] * _LOG_2PI
-            alike = -0.5 * (se3.mahalanobis2(error, covariance) + log_volume) > -room
-            for earlier, later in zip(one[rows][alike].tolist(), two[rows][alike].tolist(), strict=True):
-                near[later].append(earlier)
-        return near
+            found[rows] = -0.5 * (se3.mahalanobis2(error, covariance) + log_volume) > -room
+        return found
 
     def log_joint(self, members: list[int]) -> float:
         """Log density of these given that all claim one displacement, whatever it is; -inf where the noise has no
         positive definite covariance."""
         if len(members) == 1:
             return 0.0
-        key = tuple(self._names[member] for member in members)
-        if key not in self._joint:
+        key, joint = tuple(self._names[members].tolist()), self._compared.joint
+        if key not in joint:
             rows, axes = np.array(members), np.array(self._chain.axes)
             claims = self._a, self._b, self._displaced, self._after, self._own
-            self._joint[key] = _log_joint(rows, axes, *claims, self._chain.total)
-        return self._joint[key]
+            joint[key] = _log_joint(rows, axes, *claims, self._chain.total)
+        return joint[key]
 
     def _adjoint(self, poses: Floats) -> Floats:
         return se3.adjoint(poses)[:, self._chain.axes][:, :, self._chain.axes]

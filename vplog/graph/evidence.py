@@ -18,7 +18,7 @@ import numpy as np
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed, parts, subgraph
 from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, residual_sigma
-from vplog.graph.displacements import Displacements, log_common
+from vplog.graph.displacements import Compared, Displacements, log_common
 from vplog.graph.least_squares import GAUGE_SIGMA, Objective
 from vplog.graph.leave_one_out import tension
 
@@ -127,7 +127,8 @@ class Accidents:
         self.room = log_room(graph, self.chain.poses) if views is None else views.log_room(self.chain)
         self._parted: dict[bytes, list[Ints]] = {}
         self._measured: dict[bytes, tuple[float, _Run | None]] = {}
-        self._joint: dict[tuple[int, ...], float] = {}
+        self._names: dict[int, int] = {}
+        self._compared = Compared()
 
     def among(self, loops: Ints) -> Iterator[Ints]:
         """Runs of the edges `loops` (K,) that agree with each other: of those that do not, each lot is an accident of
@@ -168,8 +169,8 @@ class Accidents:
         """See `families`; of sets that differ in a few runs, most families are the same."""
         a, b = np.array([run.a for run in together]), np.array([run.b for run in together])
         measured, noise = np.array([run.a_from_b for run in together]), np.array([run.covariance for run in together])
-        names = [id(run) for run in together]  # which stay in memory
-        return families(Displacements(self.chain, a, b, measured, noise, names, self._joint), self.room)
+        names = [self._names.setdefault(id(run), len(self._names)) for run in together]  # they stay in memory
+        return families(Displacements(self.chain, a, b, measured, noise, names, self._compared), self.room)
 
 
 def log_evidence(factors: Factors, weight: Floats, poses: Floats, accidents: Accidents) -> float:
