@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from vplog.data import Camera, Frame
+from vplog.execution.execution import Execution
+from vplog.geometry import se3
+from vplog.run import self_calibration
 from vplog.run.visual_odometry.self_calibration import Lens, lens_of
 from vplog.testing import pictures
 from vplog.verbs.demo.scene import make_scene, take_picture
@@ -27,6 +30,22 @@ def test_a_bend_of_a_street_tells_the_focal_length() -> None:
     assert found is not None
     assert found.focal_px == pytest.approx(FOCAL_PX, rel=0.03)
     assert found.radial == pytest.approx(0.0, abs=0.03)
+
+
+def test_excerpts_of_a_long_drive_are_also_where_it_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two bends and four of the straight parts of a lap."""
+    scene = make_scene(DemoSettings(seed=5, laps=0.6, frame_rate_hz=10.0, width=128, height=72, block_length_m=100.0))
+    log = pictures.PictureLog([take_picture(scene, row)[0] for row in range(len(scene.stamp_ns))])
+    monkeypatch.setattr(self_calibration, "EXCERPT", 20)
+    found = [*self_calibration._turning(log, log.stamps(), 1, Execution())]
+    assert len(found) > 2
+    turned = [se3.angle(se3.between(*scene.world_from_body[[first, first + 20]])) for first in found]
+    assert np.degrees(min(turned[:2])) > 60.0 > np.degrees(max(turned[2:]))
+    for name, value in (("_MOST_APART", 1), ("_EXCERPTS", 2)):
+        monkeypatch.setattr(self_calibration, name, value)
+    excerpts = self_calibration._excerpts(log, Execution())
+    starts = [one.args[1][0] - log.stamps()[0] for one in excerpts]  # type: ignore[attr-defined]
+    assert starts[1:3] == found[:2]
 
 
 def test_images_that_do_not_move_tell_none() -> None:

@@ -136,12 +136,12 @@ def thumbnail_of_image(image: Bytes) -> Bytes:
 
 
 def depth_at(points: NDArray[np.float32], depth_m: Float32s | None) -> Float32s:
-    """(M,) depth of the pixel each point falls in, NaN where there is none."""
+    """(M,) depth of the pixel each point falls in, NaN where there is none, or no point."""
     if depth_m is None:
         return np.full(len(points), np.nan, np.float32)
-    column = np.clip(np.rint(points[:, 0]).astype(np.int64), 0, depth_m.shape[1] - 1)
-    row = np.clip(np.rint(points[:, 1]).astype(np.int64), 0, depth_m.shape[0] - 1)
-    return depth_m[row, column]
+    column, row = np.rint(np.nan_to_num(points[:, :2])).astype(np.int64).T
+    found = depth_m[np.clip(row, 0, depth_m.shape[0] - 1), np.clip(column, 0, depth_m.shape[1] - 1)]
+    return np.where(np.isfinite(points[:, 0]), found, np.float32(np.nan))
 
 
 def mirrored(features: Features) -> Features:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
+import cv2
 import numpy as np
 
 from vplog.data import Camera, Frame
@@ -28,7 +29,12 @@ _RATE_HZ = 15.0
 _MOST_APART = 8
 """One of so many frames at least, as at 120 Hz: stamps may run faster than the camera did."""
 _EXCERPTS = 6
-"""Excerpts that are tried until two agree."""
+"""Excerpts that are tried until two agree, and as many more where a longer drive turns most: a straight one tells
+nothing, and a car turns for some % of its time."""
+_PLACES = 120
+"""Places of a drive at which it is looked how far the images turn."""
+_SMALL = (64, 36)
+"""px of the images that are compared there."""
 _GOLDEN = 0.618034
 """Multiples of it, without their integers, spread evenly however many there are."""
 
@@ -72,15 +78,42 @@ def self_calibrated(log: Log, inputs: Inputs, images: dict[str, Any], *, executi
 
 
 def _excerpts(log: Log, execution: Execution) -> Iterator[Callable[[], Iterator[Frame]]]:
-    """Readers of excerpts that are spread over the drive; of one shorter than an excerpt the whole, twice."""
+    """Readers of excerpts that are spread over the drive, in a long one also of those where it turns; of one shorter
+    than an excerpt the whole, twice."""
     stamp_ns = log.stamps()
     if len(stamp_ns) < 2:
         return
     every = min(max(round(1e9 / _RATE_HZ / float(np.median(np.diff(stamp_ns)))), 1), _MOST_APART)
     last = max(len(stamp_ns) - EXCERPT * every, 0)
-    for number in range(_EXCERPTS if last else 2):
-        first = round(last * ((number + 1) * _GOLDEN % 1.0))
-        yield partial(decoded, log, stamp_ns[first : first + EXCERPT * every : every], execution, "self_calibration")
+    spread = [round(last * ((number + 1) * _GOLDEN % 1.0)) for number in range(_EXCERPTS if last else 2)]
+    turning = _turning(log, stamp_ns, every, execution) if len(stamp_ns) > _EXCERPTS * EXCERPT * every else iter(())
+    left = iter(spread)
+    for kind in (left, turning, turning, left) * _EXCERPTS:  # both kinds with both lenses that they begin with
+        if (first := next(kind, None)) is not None:
+            excerpt = stamp_ns[first : first + EXCERPT * every : every]
+            yield partial(decoded, log, excerpt, execution, "self_calibration")
+
+
+def _turning(log: Log, stamp_ns: np.ndarray, every: int, execution: Execution) -> Iterator[int]:
+    """First rows of excerpts about the places where the images move sideways most, none in another."""
+    long, last = EXCERPT * every, len(stamp_ns) - EXCERPT * every
+    rows = np.unique(np.round((len(stamp_ns) - 1 - every) * (np.arange(1, _PLACES + 1) * _GOLDEN % 1.0)).astype(int))
+    pairs = stamp_ns[np.unique([rows, rows + every])]
+    small = {
+        frame.stamp_ns: np.asarray(cv2.resize(frame.image, _SMALL, interpolation=cv2.INTER_AREA), np.float32)
+        for frame in decoded(log, pairs, execution, "self_calibration")
+    }
+    window, moved = cv2.createHanningWindow(_SMALL, cv2.CV_32F), dict[int, float]()
+    for row in rows.tolist():
+        one, other = (small.get(int(stamp_ns[at])) for at in (row, row + every))
+        if one is not None and other is not None:
+            (x, _), response = cv2.phaseCorrelate(one, other, window)
+            moved[row] = abs(x) * response
+    chosen = list[int]()
+    for row in sorted(moved, key=lambda row: -moved[row]):
+        if len(chosen) < _EXCERPTS and all(abs(row - other) >= long for other in chosen):
+            chosen.append(row)
+            yield min(max(row - long // 2, 0), last)
 
 
 def decoded(log: Log, stamp_ns: np.ndarray, execution: Execution, stage: str) -> Iterator[Frame]:
