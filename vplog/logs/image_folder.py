@@ -26,7 +26,7 @@ _SINCE_1970_S = (631_152_000, 4_102_444_800)
 _PERIODS_NS = (5_000_000, 5_000_000_000)
 """200 Hz down to 0.2 Hz, as cameras have it: in us and in ns two ranges that meet and do not overlap."""
 _LEAST_DECIMAL_NS = 2_000_000
-"""Of decimal seconds, which are hardly anything else: 500 Hz."""
+"""Least step of decimal seconds, which are hardly anything else: 500 Hz."""
 _DATE = re.compile(r"(?<!\d)(20\d{6})[_-]?(\d{9})(?!\d)")
 """A day and a time to the ms, as phones name their pictures."""
 _LEAST = 3
