@@ -100,16 +100,6 @@ def test_the_usual_spacing_follows_the_path(speed: float, seconds: float, spacin
     np.testing.assert_allclose(np.linalg.norm(np.diff(usual.odom_from_body[:, :3, 3], axis=0), axis=1), expected)
 
 
-def test_keyframes_of_a_long_drive_are_as_far_apart_as_is_set() -> None:
-    stamps, odometry = _frames(60.0, rate=20.0), _drive(50.0, seconds=60.0)
-    far, twice = _select(stamps, odometry, most_distance_m=2.0), _select(stamps, odometry, distance_m=2.0)
-    np.testing.assert_array_equal(far[0].stamp_ns, twice[0].stamp_ns)
-    short = _drive(5.0, seconds=60.0)
-    np.testing.assert_array_equal(
-        _select(stamps, short, most_distance_m=2.0)[0].stamp_ns, _select(stamps, short)[0].stamp_ns
-    )
-
-
 def test_noise_of_a_robot_that_stands_makes_no_path() -> None:
     odometry, rng = _drive(1.0, seconds=60.0), np.random.default_rng(1)
     poses = np.concatenate([odometry.odom_from_body, np.tile(odometry.odom_from_body[-1], (12_000, 1, 1))])

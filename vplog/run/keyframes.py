@@ -13,6 +13,8 @@ from vplog.geometry import se3
 from vplog.logs.stamps import longest_gap_ns
 from vplog.settings import Settings
 
+_PAPER_SPACING_M = 1.0
+"""m; the paper takes views 1-5 m apart (section IV): the near end."""
 _LEAST_SPACING_M = 0.05
 """m; closer views, even indoors, hardly differ (at 2 m distance 5 cm is 1.4 degrees of parallax)."""
 
@@ -21,9 +23,7 @@ class KeyframeSettings(Settings):
     """A frame becomes a keyframe when the odometry has moved or turned far enough since the last one."""
 
     distance_m: float | None = Field(default=None, ge=0)
-    """Spacing in m; None takes a thousandth of the path, at least 5 cm, at most `most_distance_m`."""
-    most_distance_m: float = Field(default=1.0, ge=_LEAST_SPACING_M, le=1e6)
-    """m; the paper takes views 1-5 m apart (section IV): the near end."""
+    """Spacing in m; None takes 1 m, or a thousandth of the path where that is shorter (at least 5 cm)."""
     sparseness: float = Field(default=1.0, gt=0, le=1000)
     """Times the spacing that is taken where `distance_m` is None: 2 makes half as many keyframes."""
     rotation_deg: float = Field(default=10.0, ge=0)
@@ -88,7 +88,7 @@ def _spacing(poses: Floats, settings: KeyframeSettings) -> float:
         return settings.distance_m
     apart = poses[_far_enough(poses, _LEAST_SPACING_M, np.pi)]  # noise of a robot that stands is no way
     path_m = float(np.linalg.norm(np.diff(apart[:, :3, 3], axis=0), axis=1).sum())
-    return settings.sparseness * float(np.clip(path_m / 1000.0, _LEAST_SPACING_M, settings.most_distance_m))
+    return settings.sparseness * float(np.clip(path_m / 1000.0, _LEAST_SPACING_M, _PAPER_SPACING_M))
 
 
 def _far_enough(poses: Floats, distance_m: float, rotation_rad: float, always: Ints | None = None) -> list[int]:

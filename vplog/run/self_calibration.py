@@ -88,7 +88,7 @@ def _excerpts(log: Log, execution: Execution) -> Iterator[Callable[[], Iterator[
     spread = [round(last * ((number + 1) * _GOLDEN % 1.0)) for number in range(_EXCERPTS if last else 2)]
     turning = _turning(log, stamp_ns, every, execution) if len(stamp_ns) > _EXCERPTS * EXCERPT * every else iter(())
     left = iter(spread)
-    for kind in (left, turning, turning, left) * _EXCERPTS:  # both kinds with both lenses that they begin with
+    for kind in (left, turning, turning, left) * (_EXCERPTS // 2):  # both kinds with both lenses that they begin with
         if (first := next(kind, None)) is not None:
             excerpt = stamp_ns[first : first + EXCERPT * every : every]
             yield partial(decoded, log, excerpt, execution, "self_calibration")

@@ -117,7 +117,9 @@ def _sigma_m(gps: Gps) -> float:
     known = variance[np.isfinite(variance) & (variance > 0)]
     claimed = float(np.sqrt(np.median(known))) if len(known) else RECEIVER_SIGMA_M
     fixes = local_enu(gps)
-    new = np.append(True, (np.diff(fixes.enu_m, axis=0) != 0).any(axis=1))  # receivers' are repeated at a higher rate
+    new = np.append(
+        True, (np.diff(fixes.enu_m[:, :2], axis=0) != 0).any(axis=1)
+    )  # receivers' are repeated at a higher rate
     stamp_ns, enu_m = fixes.stamp_ns[new], fixes.enu_m[new]
     share = ((stamp_ns[1:-1] - stamp_ns[:-2]) / (stamp_ns[2:] - stamp_ns[:-2]))[:, None]
     off = (enu_m[1:-1] - (1.0 - share) * enu_m[:-2] - share * enu_m[2:])[stamp_ns[2:] - stamp_ns[:-2] <= _STRAIGHT_NS]

@@ -129,7 +129,7 @@ class Tracker:
             self.passed.append(frame)
             return
         passed, self.passed = self.passed, []
-        if passed and since_ns <= PERIOD_NS and self._is_followed(frame):
+        if passed and since_ns <= PERIOD_NS and self._follow(frame):
             return
         for one in (*passed, frame):
             self._take(one)
@@ -147,11 +147,11 @@ class Tracker:
         followed_ns = self.stamp_ns[-1] if self.stamp_ns else -math.inf
         if self.start is not None:
             self._follow_start(self.start, frame)
-        elif not self._is_followed(frame) and frame.stamp_ns - followed_ns > _PATIENCE_NS:
+        elif not self._follow(frame) and frame.stamp_ns - followed_ns > _PATIENCE_NS:
             self._start(frame)
 
-    def _is_followed(self, frame: Frame) -> bool:
-        """Whether the frame can be followed from the reference; it is added then."""
+    def _follow(self, frame: Frame) -> bool:
+        """Add a frame that can be followed from the reference; False where it is lost."""
         if self.reference is None:
             return False
         tracked = track(self.reference, frame, self._guess(frame.stamp_ns), self.sensor)
@@ -392,7 +392,7 @@ class Tracker:
     def odometry(self) -> Odometry | None:
         """None where fewer than two frames have a pose."""
         passed, self.passed = self.passed, []
-        if passed and not self._is_followed(passed[-1]):
+        if passed and not self._follow(passed[-1]):
             for frame in passed:
                 self._take(frame)
         if len(self.stamp_ns) < 2:
