@@ -143,3 +143,14 @@ def test_what_was_there_before_makes_no_stage_look_fast() -> None:
     stage = _Stage("extract", 6000, time.monotonic() - 10.0, done=5410, known=5400)
     assert stage.eta_s() == pytest.approx(590.0, rel=0.1)
     assert _Stage("extract", 6000, time.monotonic(), done=5400, known=5400).eta_s() is None
+
+
+def test_a_second_count_has_a_rate_of_its_own() -> None:
+    """As where a stage checks the best candidates, then further ones."""
+    stage = _Stage("verify", 60, time.monotonic() - 3600.0)
+    stage.count(60, 60)
+    stage.count(1, 100)
+    stage.counted_s -= 5.0
+    stage.count(51, 100)
+    assert stage.rate() == pytest.approx(10.0, rel=0.01)
+    assert stage.eta_s() == pytest.approx(4.9, rel=0.01)

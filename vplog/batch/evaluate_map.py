@@ -43,7 +43,7 @@ def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None =
                 found = evaluate(folder, own, None, options, about["log"])
             except VplogError as error:
                 found = {"error": str(error)}
-            noted = {name: found.get(name) for name in ("truth_is", "interpolated")}
+            noted = {name: found.get(name) for name in ("truth_is", "interpolated", "warnings")}
             drives.append({**row, **figures_of(found), **noted, "error": found.get("error", "")})
             store.evict(drive)
     if all(one["error"] for one in drives):

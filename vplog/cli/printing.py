@@ -112,6 +112,7 @@ def print_diff(found: dict[str, Any]) -> None:
     def cell(value: Any) -> str:
         return f"{value:.6g}" if isinstance(value, float) else "-" if value is None else str(value)
 
+    warn(found.get("warnings", ()))
     named = [(name, *map(cell, pair)) for name, pair in found["settings"].items()]
     if named:
         print_table(("setting", "baseline", "run"), named)
@@ -221,7 +222,7 @@ def print_evaluation(found: dict[str, Any]) -> None:
     if "maps" in found:
         warn(_notes_of_drives([drive for one in found["maps"] for drive in one["drives"]]))
         return
-    warn(_truth_notes(found))
+    warn(found["warnings"])
     if found.get("closures"):
         _print_lines("closures", closure_sentences(found["closures"]))
     residuals = found.get("residuals")
@@ -261,39 +262,11 @@ def _notes_of_drives(drives: Iterable[dict[str, Any]]) -> Iterator[str]:
     """The notes about the truth, each once, with the first of the drives that it is about."""
     notes: dict[str, list[str]] = {}
     for drive in drives:
-        for note in _truth_notes(drive):
+        for note in drive.get("warnings") or ():
             notes.setdefault(note, []).append(drive["drive"])
     for note, names in notes.items():
         more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
         yield f"{', '.join(names[:_NAMED])}{more}: {note}"
-
-
-def _truth_notes(found: dict[str, Any]) -> list[str]:
-    """Warnings about the truth that bear on the figures."""
-    truth, notes = found.get("truth_is"), []
-    if found.get("scale") is not None:
-        notes.append(
-            "The run has no metres of its own: Sim(3) alignment finds them, and all lengths and figures are multiplied "
-            f"by {found['scale']:.4g}."
-        )
-    if truth is not None and truth["frame"] != "body":
-        what = "the camera" if truth["frame"] == "camera" else "another point of the body, found by the odometry"
-        notes.append(f"The truth is that of {what}: closures and drift are the body's, ATE and RPE are not.")
-    if truth is not None and truth["offset_s"] is not None:
-        notes.append(
-            "The truth is of another clock: it moves as the odometry does with "
-            f"--truth-offset-s {truth['offset_s']:g}. Without that, figures and closures are judged at wrong times."
-        )
-    if truth is not None and truth["odometry"]:
-        notes.append("The odometry of this run is the truth itself: only the scores of its closures mean something.")
-    if truth is not None and not truth["oriented"]:
-        notes.append(
-            "The truth has no orientations, so closures are judged by place, without heading, and there is no RPE and "
-            "no drift. For these, give a truth with orientations."
-        )
-    if found.get("interpolated"):
-        notes.append("Few poses have a stamp within 0.01 s of the truth's: poses are interpolated at its stamps.")
-    return notes
 
 
 def _print_lines(label: str, lines: list[str]) -> None:

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TextIO
@@ -85,10 +85,21 @@ class _Stage:
     reported_s: float = 0.0
     known: int = 0
     """Items that were there when it began, as far as its first report tells."""
+    counted_s: float = field(init=False)
+    """When the count of its items began, which may begin again."""
+
+    def __post_init__(self) -> None:
+        self.counted_s = self.began_s
+
+    def count(self, done: int, total: int) -> None:
+        """Take another number of items."""
+        if done < self.done:
+            self.counted_s, self.known = time.monotonic(), done
+        self.done, self.total = done, total
 
     def rate(self) -> float:
         """Items a second, 0 where unknown."""
-        return (self.done - self.known) / max(time.monotonic() - self.began_s, 1e-9)
+        return (self.done - self.known) / max(time.monotonic() - self.counted_s, 1e-9)
 
     def eta_s(self) -> float | None:
         return (self.total - self.done) / self.rate() if self.done > self.known and self.total > 1 else None
@@ -152,7 +163,7 @@ class Progress:
             self._write("stage_started", stage, total=total)
         if stage.seconds is not None:
             return
-        stage.done, stage.total = done, total
+        stage.count(done, total)
         if done >= total and not step:
             self._finish(stage)
         elif done and time.monotonic() - stage.reported_s >= _EVENT_EVERY_S:

@@ -132,7 +132,8 @@ def export(arguments: argparse.Namespace) -> None:
         execution, warnings = Execution(arguments.threads, progress), list[str]()
         with logged_warnings(warnings):
             found = export_run(arguments.run, arguments.format, path, arguments.log, execution, arguments.truth)
-    printing.warn(warnings)
+    found["warnings"] += warnings
+    printing.warn(found["warnings"])
     if arguments.json:
         print_json(found)
     elif path == arguments.output:

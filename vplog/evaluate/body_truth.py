@@ -14,6 +14,9 @@ from vplog.data import Bools, Floats, Ints, Trajectory
 from vplog.evaluate.pairs import bracketing, poses_at
 from vplog.geometry import se3
 
+_OTHER_MOTION = 1.0 / 3.0
+"""Disagreement with the odometry from which the truth may not be this drive's: the right one of a drive whose odometry
+drifts has a tenth, another drive's or one whose stamps are 2 s off two thirds."""
 _BETTER = 0.5
 """Another frame must halve the disagreement with the odometry to be taken: chance does not."""
 _MOTIONS = 400
@@ -66,6 +69,12 @@ class BodyTruth:
     """rad and m by which single poses of the truth are off their neighbours."""
     offset_s: float = 0.0
     """s to add to the truth's stamps for its motions to be those of the odometry; 0 where that is not clear."""
+    disagreement: float = 0.0
+    """Median of what its motions and those of the odometry differ by, rad and shares of their length."""
+
+    @property
+    def is_of_other_motion(self) -> bool:
+        return self.disagreement > _OTHER_MOTION
 
     def at(self, stamp_ns: Ints) -> TruthAt:
         """Poses at the stamps.
@@ -106,11 +115,12 @@ def body_truth(truth: Trajectory, odometry: Trajectory, body_from_camera: Floats
     turned = [se3.angle(se3.between(poses[:1], poses)).max() for poses in (true, moved)]
     if turned[0] < np.radians(0.01) and turned[1] > np.radians(_LEAST_TURN_DEG):
         return BodyTruth(truth, oriented=False)
-    frame, truth_from_body, scale = _frame(true, moved, body_from_camera)
+    frame, truth_from_body, scale, apart = _frame(true, moved, body_from_camera)
     poses = odometry.world_from_body.copy()
     poses[:, :3, 3] *= scale if scale > 0 else 1.0
     odometry = Trajectory(odometry.stamp_ns, poses)
-    found = BodyTruth(Trajectory(truth.stamp_ns, truth.world_from_body @ truth_from_body), odometry, frame)
+    poses = truth.world_from_body @ truth_from_body
+    found = BodyTruth(Trajectory(truth.stamp_ns, poses), odometry, frame, disagreement=apart)
     frames = [truth_from_body, np.eye(4)] + ([] if body_from_camera is None else [se3.inverse(body_from_camera)])
     return replace(found, noise=_noise(found.trajectory, odometry), offset_s=_offset_s(truth, odometry, frames))
 
@@ -163,20 +173,20 @@ def _at(trajectory: Trajectory, stamp_ns: Ints) -> Floats:
     return se3.interpolate_at(trajectory.stamp_ns, trajectory.world_from_body, within)
 
 
-def _frame(true: Floats, moved: Floats, body_from_camera: Floats | None) -> tuple[str, Floats, float]:
-    """Frame of the truth's poses (T, 4, 4), by those of the odometry: a name, truth_from_body (4, 4), and the true
-    metres of one of the odometry's, which has no metres of its own where a single camera made it."""
+def _frame(true: Floats, moved: Floats, body_from_camera: Floats | None) -> tuple[str, Floats, float, float]:
+    """Frame of the truth's poses (T, 4, 4), by those of the odometry: a name, truth_from_body (4, 4), the true metres
+    of one of the odometry's, which has no metres of its own where a single camera made it, and the disagreement."""
     step = max(1, len(true) // _MOTION_SHARE)
     first = np.unique(np.linspace(0, len(true) - 1 - step, _MOTIONS).astype(np.int64))
     a, b = (se3.between(poses[first], poses[first + step]) for poses in (true, moved))
     weight, frames = _weights(a), [("body", np.eye(4)), ("estimated", _hand_eye(a, b, _weights(b)))]
     if body_from_camera is not None:
         frames.insert(1, ("camera", se3.inverse(body_from_camera)))
-    best, least = ("body", np.eye(4), 1.0), np.inf
+    best, least = ("body", np.eye(4), 1.0, np.inf), np.inf
     for name, truth_from_body in frames:
         apart, scale = _disagreement(a, b, truth_from_body, weight)
         if apart < least:
-            best, least = (name, truth_from_body, scale), _BETTER * apart
+            best, least = (name, truth_from_body, scale, apart), _BETTER * apart
     return best
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,9 @@ from vplog.geometry import geodesy, se3
 from vplog.geometry.tum import read_tum
 from vplog.storage.remote_path import located
 from vplog.storage.urls import shown
+
+_NOT_COVERED = 0.05
+"""Keyframes outside the truth as a share of those within that are spoken of: more than a truth's late start."""
 
 
 def read_truth(place: str | Path, kinds: Iterable[str] = ("gps", "auto")) -> Trajectory:
@@ -59,3 +63,40 @@ def ate_to_gps(estimate: Trajectory, gps: Gps, alignment: str = "se3") -> Ate:
     poses = se3.interpolate_at(estimate.stamp_ns, estimate.world_from_body, stamp_ns[inside])
     antenna_m = np.zeros(3) if gps.antenna_m is None else gps.antenna_m
     return aligned_error(se3.transform(poses, antenna_m[None])[:, 0], positions[inside], alignment)
+
+
+def truth_warnings(found: dict[str, Any]) -> list[str]:
+    """What bears on the figures that `evaluate` found of one drive, by the record of them."""
+    truth, warnings = found["truth_is"], []
+    if found["scale"] is not None:
+        warnings.append(
+            "The run has no metres of its own: Sim(3) alignment finds them, and all lengths and figures are multiplied "
+            f"by {found['scale']:.4g}."
+        )
+    if truth["frame"] != "body":
+        what = "the camera" if truth["frame"] == "camera" else "another point of the body, found by the odometry"
+        warnings.append(f"The truth is that of {what}: closures and drift are the body's, ATE and RPE are not.")
+    if truth["offset_s"] is not None:
+        warnings.append(
+            "The truth is of another clock: it moves as the odometry does with "
+            f"--truth-offset-s {truth['offset_s']:g}. Without that, figures and closures are judged at wrong times."
+        )
+    elif truth["other_motion"]:
+        warnings.append(
+            f"The truth does not move as the odometry does (median difference {truth['disagreement']:.0%} of the "
+            "motion). Is it of another drive, is its clock more than 5 s off, are its poses world_from_body and its "
+            "quaternions x y z w?"
+        )
+    if truth["odometry"]:
+        warnings.append("The odometry of this run is the truth itself: only the scores of its closures mean something.")
+    if not truth["oriented"]:
+        warnings.append(
+            "The truth has no orientations, so closures are judged by place, without heading, and there is no RPE and "
+            "no drift. For these, give a truth with orientations."
+        )
+    if found["interpolated"]:
+        warnings.append("Few poses have a stamp within 0.01 s of the truth's: poses are interpolated at its stamps.")
+    keyframes, outside = found["closures"]["keyframes"], found["closures"]["outside"]
+    if outside > keyframes * _NOT_COVERED:
+        warnings.append(f"The truth covers {keyframes} of {keyframes + outside} keyframes: all figures are of these.")
+    return warnings

@@ -199,3 +199,9 @@ def align(source: Floats, target: Floats, body_from_camera: Floats | None) -> tu
 def mahalanobis2(error: Floats, covariance: Floats) -> Floats:
     """(K,) e^T C^-1 e of errors (K, d) with covariances (K, d, d)."""
     return (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(1)
+
+
+def far_origin(poses: Floats) -> Floats:
+    """(3,) the whole kilometre at which positions of poses (R, 4, 4) begin that are written as float32, which has steps
+    of half a metre where UTM's northings are."""
+    return np.round(poses[:1, :3, 3], -3).sum(0)

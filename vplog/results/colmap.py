@@ -101,7 +101,7 @@ def _points(images: PosedImages) -> Iterator[str]:
     for point, (place, colour) in enumerate(zip(found.world.tolist(), images.rgb.tolist(), strict=True)):
         track = order[start[point] : start[point + 1]]
         ends = " ".join(f"{image + 1} {at}" for image, at in zip(found.image[track], within[track], strict=True))
-        where = " ".join(f"{value:.9g}" for value in place)
+        where = " ".join(f"{value:.12g}" for value in place)
         yield f"{point + 1} {where} {' '.join(map(str, colour))} {found.error_px[point]:.4f} {ends}"
 
 
@@ -146,13 +146,14 @@ def _intrinsics(camera: Camera) -> dict[str, Any]:
 
 
 def _write_ply(path: Path, images: PosedImages) -> None:
-    """Points with their colours, little endian (Turk, The PLY polygon file format, 1994)."""
-    kind = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    """Points with their colours, little endian (Turk, The PLY polygon file format, 1994); in doubles, as floats have
+    steps of half a metre where UTM's northings are."""
+    kind = [(name, "<f8") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
     rows = np.empty(len(images.rgb), kind)
     for at, name in enumerate("xyz"):
         rows[name] = images.structure.world[:, at]
     for at, name in enumerate(("red", "green", "blue")):
         rows[name] = images.rgb[:, at]
-    fields = [f"property {'float' if one[1] == '<f4' else 'uchar'} {one[0]}" for one in kind]
+    fields = [f"property {'double' if one[1] == '<f8' else 'uchar'} {one[0]}" for one in kind]
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *fields, "end_header", ""]
     path.write_bytes("\n".join(head).encode() + rows.tobytes())

@@ -23,6 +23,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from vplog.data import Camera, Floats, Gps
+from vplog.geometry import se3
 
 PoseVector = list[float]
 """Position in m and quaternion x y z w of one pose."""
@@ -71,8 +72,7 @@ def path(stamp_ns: int, poses: list[PoseVector]) -> PosesInFrame:
 def points(stamp_ns: int, poses: Floats, color: Rgba) -> PointCloud:
     """The positions of poses (R, 4, 4), all in one colour."""
     packed = np.zeros(len(poses), np.dtype([("position", "<f4", 3), ("color", "u1", 4)]))
-    # float32 has steps of half a metre where UTM's northings are: far from the origin they begin at a whole kilometre
-    origin = np.round(poses[:1, :3, 3], -3).sum(0)
+    origin = se3.far_origin(poses)
     packed["position"] = poses[:, :3, 3] - origin
     packed["color"] = np.round(255 * np.array(color))
     data = packed.tobytes()

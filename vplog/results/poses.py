@@ -19,7 +19,7 @@ def write_kitti(path: Path, trajectory: Trajectory) -> Path:
     times = path.with_name(f"{path.stem}.times.txt")
     with replacing(path) as stream:
         for row in trajectory.world_from_body[:, :3].reshape(-1, 12).tolist():
-            stream.write(f"{' '.join(f'{value:.9g}' for value in row)}\n".encode())
+            stream.write(f"{' '.join(f'{value:.12g}' for value in row)}\n".encode())
     with replacing(times) as stream:
         for stamp_ns in trajectory.stamp_ns.tolist():
             stream.write(f"{seconds(stamp_ns)}\n".encode())

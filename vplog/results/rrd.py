@@ -40,8 +40,9 @@ def write_rrd(
     with replacing(path) as file:  # rerun's own writer hides a full disk
         stream = recording.binary_stream()
         recording.send_blueprint(_blueprint(tracks, read_topics(result)))
-        _log(recording, rr, tracks, closures)
-        _log_errors(recording, rr, tracks, closures, judged)
+        origin = se3.far_origin(tracks.world_from_body)
+        _log(recording, rr, tracks, closures, origin)
+        _log_errors(recording, rr, tracks, closures, judged, origin)
         _log_camera(recording, rr, result)
         for row, picture in tracks.found.pictures.items():
             recording.set_time(_TIMELINE, timestamp=_time(tracks.keyframes.stamp_ns[closures.query[row]]))
@@ -50,12 +51,13 @@ def write_rrd(
         recording.disconnect()
 
 
-def _log(recording: Any, rr: Any, tracks: Tracks, closures: Closures) -> None:
-    recording.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+def _log(recording: Any, rr: Any, tracks: Tracks, closures: Closures, origin: Floats) -> None:
+    """Paths and closures, `origin` (3,) taken off their positions."""
+    recording.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, rr.AnyValues(origin_m=origin), static=True)
     for name, trajectory, colour in (("odometry", tracks.before, _GREY), ("optimised", tracks.after, _BLUE)):
-        strip = rr.LineStrips3D([trajectory.world_from_body[:, :3, 3]], colors=[colour])
+        strip = rr.LineStrips3D([trajectory.world_from_body[:, :3, 3] - origin], colors=[colour])
         recording.log(f"map/path/{name}", strip, static=True)
-    ends = tracks.world_from_body[:, :3, 3]
+    ends = tracks.world_from_body[:, :3, 3] - origin
     for name, verdicts, colour in (
         ("accepted", ACCEPTED, _GREEN),
         ("without_metres", (Verdict.DIRECTION_ONLY,), _AMBER),
@@ -92,7 +94,9 @@ def _blueprint(tracks: Tracks, topics: Collection[str]) -> Any:
     return rrb.Blueprint(rrb.Vertical(upper, rrb.Horizontal(*plots), row_shares=[3, 1]), *panels)
 
 
-def _log_errors(recording: Any, rr: Any, tracks: Tracks, closures: Closures, judged: TruthComparison | None) -> None:
+def _log_errors(
+    recording: Any, rr: Any, tracks: Tracks, closures: Closures, judged: TruthComparison | None, origin: Floats
+) -> None:
     """Residuals of accepted closures at their queries' stamps, and distances of the solved keyframes from the odometry
     and from the truth."""
     rows = np.flatnonzero(closures.accepted)
@@ -108,7 +112,7 @@ def _log_errors(recording: Any, rr: Any, tracks: Tracks, closures: Closures, jud
     distances = [("odometry", np.linalg.norm((odometry - keyframes)[:, :3, 3], axis=1), _GREY)]
     if judged is not None and judged.error_m is not None and judged.path is not None:
         distances.append(("truth", judged.error_m, _VIOLET))
-        recording.log("map/path/truth", rr.LineStrips3D([judged.path], colors=[_VIOLET]), static=True)
+        recording.log("map/path/truth", rr.LineStrips3D([judged.path - origin], colors=[_VIOLET]), static=True)
     for name, distance, colour in distances:
         style = rr.SeriesLines(colors=colour, names=f"to the {name}")
         _series(recording, rr, f"errors/distance/{name}", style, stamp_ns, distance)

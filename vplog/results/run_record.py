@@ -124,6 +124,14 @@ def unit_warnings(record: dict[str, Any]) -> list[str]:
     return [] if has_metres(record) else ["This run has no metres: lengths in m here are in its own unit."]
 
 
+def piece_warnings(record: dict[str, Any]) -> list[str]:
+    """A warning beside poses of a run whose pieces nothing relates to each other."""
+    pieces = (record.get("solution") or {}).get("pieces", 1)
+    if pieces == 1:
+        return []
+    return [f"The trajectory has {pieces} pieces that no closure relates: where they lie to each other is not known."]
+
+
 def command_of(record: dict[str, Any], out: str | Path, *more: str | Path) -> str:
     """The command that runs a drive again into a folder, by its run.json; of older ones its log alone."""
     known = record.get("arguments")

@@ -42,6 +42,8 @@ from vplog.loops.false_rate import log_odds_false
 from vplog.run.cache.steps import step
 
 _log = logging.getLogger(__name__)
+_FIXES_OF_A_PIECE = 2
+"""Satellite fixes that place a piece of the trajectory on earth, and by which way it heads."""
 _CONFIRMED = 0.99
 """Probability that the noise of a true closure leaves it within the bound of its distance to the solution."""
 
@@ -68,6 +70,8 @@ class BackEndResult:
     warnings: list[str]
     of_images: bool = False
     """Whether the odometry is that of the images."""
+    pieces: int = 1
+    """Pieces of the trajectory that nothing relates to each other."""
 
 
 @step("solve")
@@ -97,29 +101,35 @@ def solve(
     refined = refine(bounded(graph), decision.solution, of_odometry, settings.refine, fixes, decision.sigmas, scale)
     warnings = noise_warnings + build_warnings + (fixes.warnings if fixes else [])
     warnings += about_jump(decision, np.arange(len(keyframes.stamp_ns)))
-    warnings += _apart(broken, keyframes, graph, refined.solution)
+    apart = _apart(broken, graph, refined)
+    if len(apart):
+        seconds = (keyframes.stamp_ns[apart[0] + 1] - odometry.stamp_ns[0]) / 1e9
+        warnings.append(
+            f"{len(apart)} of {len(broken)} breaks of the odometry have no closure across them, the first at "
+            f"{seconds:.1f} s: the poses after it are not known relative to those before it."
+        )
     warnings += _contradicted(present, partial(decided, optimiser=settings.solve, cost=cost))
     warnings += _confirmed(closures, refined.solution.world_from_body)
     for warning in warnings:
         _log.warning(warning)
     trajectory = correct_trajectory.correct_trajectory(odometry, keyframes, refined.solution.world_from_body)
     return BackEndResult(
-        judged_ledger(closures, graph, refined, rows), refined, trajectory, source, warnings, odometry.of_images
-    )
+        judged_ledger(closures, graph, refined, rows), refined, trajectory, source, warnings, odometry.of_images,
+        1 + len(apart),
+    )  # fmt: skip
 
 
-def _apart(broken: Ints, keyframes: Keyframes, graph: PoseGraph, solution: Solution) -> list[str]:
-    """A warning of the breaks of the odometry (edges) that no accepted closure spans."""
-    accepted = ~graph.odometry & (solution.weight > 0.5)
+def _apart(broken: Ints, graph: PoseGraph, refined: Refined) -> Ints:
+    """The breaks of the odometry (edges) that no accepted closure spans, and without fixes on both sides."""
+    accepted = ~graph.odometry & (refined.solution.weight > 0.5)
     begin, end = (np.sort(rows[accepted]) for rows in (graph.a, graph.b))
     open_ = begin.searchsorted(broken, "right") == end.searchsorted(broken, "right")  # as many ended as had begun
-    if not open_.any():
-        return []
-    seconds = (keyframes.stamp_ns[broken[open_] + 1] - keyframes.stamp_ns[0]) / 1e9
-    return [
-        f"{int(open_.sum())} of {len(broken)} breaks of the odometry have no closure across them, the first at "
-        f"{seconds[0]:.1f} s: the poses after it are not known relative to those before it."
-    ]
+    apart = broken[open_]
+    if refined.fixes is None:
+        return apart
+    piece = apart.searchsorted(refined.fixes.row[refined.inlier > 0.5])
+    placed = np.bincount(piece, minlength=len(apart) + 1) >= _FIXES_OF_A_PIECE
+    return apart[~(placed[:-1] & placed[1:])]
 
 
 def _contradicted(graph: PoseGraph, solve: Callable[[PoseGraph], Decision]) -> list[str]:

@@ -251,6 +251,7 @@ def _results_record(run: Run, spacing: int) -> dict[str, Any]:
             "error_after": solution.error_after,
             "iterations": solution.iterations,
             "converged": solution.converged,
+            "pieces": run.solved.pieces,
             "reason": solution.reason if constrained else "No closure passed verification.",
             **_outcome(run.solved.trajectory, run.odometry, run.closures, spacing),
         },

@@ -89,6 +89,9 @@ def staged_run(
         above = out.absolute().parent
         if out.absolute().name in _drives_in(_read(above / "run.json") or {}) or (out / "drive.json").exists():
             raise SettingsError(f"{out} is a drive of the run or map in {above}. Choose another folder with -o.")
+        for file in files:
+            if file.is_dir() and out.resolve().is_relative_to(file.resolve()):
+                raise SettingsError(f"{out} is within the log {file}, which would change by it. Name another with -o.")
         if not cache.force:
             _check_same_logs(out, files)
         return _results_in(out, library, drives, resumable)

@@ -64,12 +64,15 @@ def diff(
     figures["accepted"] = [len(one) for one in ledgers]
     changes = {"gained": len(gained), "lost": len(lost), "moved_m": moved["rmse_m"], "moved_deg": moved["rmse_deg"]}
     figures |= {name: (0, change) for name, change in changes.items()}
+    warnings = [] if _are_of_one_log(records) else ["The runs are of different logs: stamps alone pair their poses."]
     if truth is not None:
         scores = [evaluate(folder, truth, topics, options) for folder in folders]
         figures |= {name: [figures_of(one)[name] for one in scores] for name in _SCORES}
+        warnings += dict.fromkeys(text for one in scores for text in one["warnings"])
     return {
         "baseline": str(baseline),
         "run": str(run),
+        "warnings": warnings,
         "settings": differences(trees[0], trees[1]),
         "closures": {"common": len(ledgers[1]) - len(gained), "gained": gained, "lost": lost},
         "trajectory": moved,
@@ -125,6 +128,12 @@ def exceeded(found: dict[str, Any], limits: Sequence[str]) -> list[str]:
             moved = f"{value:+.4g}{limit.percent}, from {before:.6g} to {after:.6g}"
             sentences.append(f"{limit.name} changed by {moved} ({limit.text}).")
     return sentences
+
+
+def _are_of_one_log(records: Sequence[dict[str, Any]]) -> bool:
+    """Whether the runs share a file, by its sha256, or a record does not tell."""
+    one, other = ({*map(str, mapping(each.get("inputs")).values())} for each in records)
+    return not one or not other or not one.isdisjoint(other)
 
 
 def _closures(folder: Path) -> dict[tuple[int, int], None]:

@@ -16,7 +16,7 @@ from vplog.errors import ResultError, SettingsError, TruthError
 from vplog.evaluate import closures, trajectory
 from vplog.evaluate.body_truth import BodyTruth, body_truth
 from vplog.evaluate.closure_pose import pose_bounds
-from vplog.evaluate.truth import ate_to_gps, read_truth
+from vplog.evaluate.truth import ate_to_gps, read_truth, truth_warnings
 from vplog.geometry import se3
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.results import mcap_read, run_record, tables
@@ -39,6 +39,7 @@ _FIGURES = {
 FIGURES = tuple(_FIGURES)
 """Names of the figures of a run against the truth."""
 _BESIDE = {"odometry_file", "calibration_file", "masks"}
+_OWN_FIXES = "The satellite fixes are in this run's trajectory: that it is near them says little of its error."
 _PUT_BACK = "Put it back there, or give a truth file: --truth FILE.tum."
 
 
@@ -165,6 +166,8 @@ def evaluate_poses(
             "oriented": of_body.oriented,
             "offset_s": round(options.truth_offset_s + of_body.offset_s, 3) if of_body.offset_s else None,
             "odometry": (record.get("topics") or {}).get("odometry") == "truth",
+            "disagreement": round(of_body.disagreement, 3),
+            "other_motion": of_body.is_of_other_motion,
         },
         **_trajectories(before, after, known, of_body, options),
         "closures": asdict(score),
@@ -172,6 +175,7 @@ def evaluate_poses(
     }
     if record.get("gps") is None:  # with GPS they are relative to earth, where the truth need not be
         found["poses"] = asdict(closures.score_poses(keyframes, world_from_body, covariance, of_body))
+    found["warnings"] = [*truth_warnings(found), *run_record.piece_warnings(record)]
     return RunEvaluation(found, keyframes, of_body, judged)
 
 
@@ -304,7 +308,10 @@ def _against_gps(
     if (mount := unit_camera(record)) is not None:  # the antenna is taken to be at the camera, whose path has one unit
         fixes = replace(fixes, antenna_m=mount[:3, 3])
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
+    in_run = record.get("gps") is not None or (record.get("topics") or {}).get("odometry") == "gps"
+    warnings = [_OWN_FIXES] * in_run + run_record.piece_warnings(record)
     return {
+        "warnings": warnings,
         "ate_before": asdict(ate_to_gps(before, fixes, options.align)),
         "ate_after": asdict(ate_to_gps(after, fixes, options.align)),
     }

@@ -16,7 +16,7 @@ from vplog.results.geo import Earth
 from vplog.results.mcap_read import read_topics
 from vplog.results.report.page import Tracks
 from vplog.results.rrd import write_rrd
-from vplog.results.run_record import read_single_run
+from vplog.results.run_record import piece_warnings, read_single_run, unit_warnings
 from vplog.run.report import gather_tracks
 from vplog.storage.scratch import replacing
 from vplog.verbs.evaluate_run import TruthOptions
@@ -76,7 +76,9 @@ def export(
                 stream.write(f"{json.dumps(tree, indent=2)}\n".encode())
         case _:
             raise ResultError(f"No format {kind!r}. Formats: {', '.join([*FORMATS, *FOLDERS])}.")
-    return {"run": str(folder), "format": kind, "written": written, "poses": len(tracks.after.stamp_ns)}
+    warnings = [*unit_warnings(record), *piece_warnings(record)]
+    poses_written = len(tracks.after.stamp_ns)
+    return {"run": str(folder), "format": kind, "written": written, "poses": poses_written, "warnings": warnings}
 
 
 def _copy(source: Path, path: Path, sha256: object) -> None:

@@ -65,7 +65,8 @@ def judge(
     """The run against a TUM file or the log's own GPS. Raises TruthError or ResultError."""
     known = log_truth(record, topics, options) if truth == "auto" else None
     if truth == "gps" or isinstance(known, Gps):
-        return TruthComparison(truth, evaluate(folder, truth, topics, options))
+        found = evaluate(folder, truth, topics, options)
+        return TruthComparison(truth, found, found["warnings"])
     found = evaluate_poses(folder, record, truth, options, known)
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     at, known, judged = found.truth.at(keyframes.stamp_ns), found.truth.trajectory, found.judged
@@ -83,7 +84,7 @@ def judge(
     return TruthComparison(
         Path(shown(truth)).name,
         found.record,
-        closure_sentences(found.record["closures"]),
+        [*found.record["warnings"], *closure_sentences(found.record["closures"])],
         path,
         judged.right,
         judged.right | judged.wrong,
