@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from tests.graph.drive import ODOMETRY_SIGMA, ledger, position_error, ring
-from vplog.data import Odometry, Verdict
+from vplog.data import Gps, Keyframes, Odometry, Verdict
+from vplog.geometry import geodesy, se3
 from vplog.graph.consistency import is_loop
-from vplog.pipeline import Pipeline
+from vplog.loops.verify import no_closures
+from vplog.pipeline import Pipeline, load_pipeline
 from vplog.run.back_end import solve
 
 if TYPE_CHECKING:
@@ -59,3 +61,23 @@ def test_poisoned_closures_end_with_the_odometry_and_say_so() -> None:
     assert found.closures.verdict.count(Verdict.ACCEPTED) == 0
     assert found.refined.solution.reason.startswith("Odometry was kept: ")
     np.testing.assert_allclose(found.trajectory.world_from_body, drive.odometry.odom_from_body, atol=1e-9)
+
+
+@pytest.mark.parametrize("fixed", [False, True], ids=["without fixes", "with fixes"])
+def test_fixes_relate_the_pieces_of_a_drive(fixed: bool) -> None:
+    count = 200
+    angle = np.linspace(0.0, 3.0 * np.pi, count)
+    vectors = np.stack([0 * angle, 0 * angle, angle + np.pi / 2], axis=1)
+    true = se3.pose(se3.so3_exp(vectors), 60.0 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1))
+    odometry = se3.inverse(true[:1]) @ true
+    turned = se3.exp(np.array([[0.0, 0.0, 2.0, 0.0, 0.0, 0.0]]))[0]
+    odometry[100:] = odometry[99] @ turned @ se3.inverse(odometry[100]) @ odometry[100:]
+    stamps = np.arange(count) * 500_000_000 + 10**18
+    noise = np.tile(np.diag([1e-6] * 3 + [1e-4] * 3), (count, 1, 1))
+    given = Odometry(stamps, odometry, noise, breaks=np.array([100]), increments=True)
+    near = np.random.default_rng(0).normal(true[:, :3, 3], 0.3)
+    fixes = Gps(stamps, *geodesy.geodetic(near, (48.0, 11.0, 500.0)).T, np.tile(0.09 * np.eye(3), (count, 1, 1)))
+    pipeline = load_pipeline("default", ["gps.use=true"] * fixed)
+    found = solve(given, Keyframes("drive", stamps[::2], odometry[::2]), no_closures(), fixes, pipeline)
+    assert found.pieces == 2 - fixed
+    assert fixed != any("breaks of the odometry have no closure" in one for one in found.warnings)

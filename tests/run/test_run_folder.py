@@ -102,6 +102,16 @@ def test_the_run_of_another_log_is_refused(log: Path, other: Path, tmp_path: Pat
     assert read_finished_run(out)["log"] == str(other)
 
 
+def test_a_run_is_not_written_into_its_log(tmp_path: Path) -> None:
+    """The log would be another one by it: nothing could be cached or gone on with."""
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    for out in (folder, folder / "out", folder / "image_0" / "out"):
+        with pytest.raises(SettingsError, match="is within the log"):
+            complete(out, folder)
+    complete(tmp_path / "drive-out", folder)
+
+
 def test_the_same_log_is_known(log: Path, other: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By path, length and times without reading it; moved, copied or touched by its content."""
     out, counted = tmp_path / "out", list[object]()

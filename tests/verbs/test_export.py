@@ -17,7 +17,7 @@ import pytest
 
 from tests.rerun import rerun
 from tests.results.example import read_map
-from vplog.data import Gps, Verdict
+from vplog.data import Gps, Trajectory, Verdict
 from vplog.geometry import geodesy, se3
 from vplog.places.bobb import BobbSettings, BobbState
 from vplog.places.bobb_paper import PaperBobbSettings, PaperBobbState
@@ -25,6 +25,7 @@ from vplog.results import tables
 from vplog.results.contracts import LAYOUTS
 from vplog.results.mcap_read import read_pictures, read_topics
 from vplog.results.messages import loop_closure_class
+from vplog.results.poses import write_kitti
 from vplog.verbs.export import FORMATS
 
 if TYPE_CHECKING:
@@ -77,6 +78,18 @@ def test_evo_reads_kitti_poses_and_their_times_lie_beside(exported: Callable[[st
     np.testing.assert_allclose(found.poses_se3, poses, atol=1e-6)
     lines = (path.parent / "run.times.txt").read_text().split()
     assert [int(line.replace(".", "")) for line in lines] == stamp_ns.tolist()
+
+
+def test_steps_are_whole_far_from_the_origin(tmp_path: Path) -> None:
+    """UTM's northings need more than the digits of a float."""
+    poses = np.tile(np.eye(4), (50, 1, 1))
+    poses[:, :3, 3] = [[691234.5, 5412345.5 + 0.013 * row, 500.0] for row in range(50)]
+    write_kitti(tmp_path / "a.txt", Trajectory(np.arange(50), poses))
+    found = np.loadtxt(tmp_path / "a.txt").reshape(-1, 3, 4)[:, :, 3]
+    np.testing.assert_allclose(found, poses[:, :3, 3], atol=1e-4, rtol=0)
+    near = (poses[:, :3, 3] - se3.far_origin(poses)).astype(np.float32)
+    np.testing.assert_allclose(np.diff(near[:, 1]), 0.013, atol=1e-4)
+    assert not se3.far_origin(np.tile(np.eye(4), (2, 1, 1))).any()
 
 
 def test_gtsam_reads_the_graph(exported: Callable[[str], Path], finished: Path) -> None:

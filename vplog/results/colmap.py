@@ -146,14 +146,15 @@ def _intrinsics(camera: Camera) -> dict[str, Any]:
 
 
 def _write_ply(path: Path, images: PosedImages) -> None:
-    """Points with their colours, little endian (Turk, The PLY polygon file format, 1994); in doubles, as floats have
-    steps of half a metre where UTM's northings are."""
-    kind = [(name, "<f8") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    """Points with their colours, little endian (Turk, The PLY polygon file format, 1994); far from the origin in
+    doubles."""
+    number = "double" if se3.far_origin(images.world_from_camera).any() else "float"
+    kind = [(name, "<f8" if number == "double" else "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
     rows = np.empty(len(images.rgb), kind)
     for at, name in enumerate("xyz"):
         rows[name] = images.structure.world[:, at]
     for at, name in enumerate(("red", "green", "blue")):
         rows[name] = images.rgb[:, at]
-    fields = [f"property {'double' if one[1] == '<f8' else 'uchar'} {one[0]}" for one in kind]
+    fields = [f"property {'uchar' if one[1] == 'u1' else number} {one[0]}" for one in kind]
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *fields, "end_header", ""]
     path.write_bytes("\n".join(head).encode() + rows.tobytes())

@@ -439,7 +439,8 @@ def _columns(content: ReportContent, rows: list[int]) -> dict[str, list[Any]]:
     columns |= {name: getattr(closures, name)[rows].tolist() for name in whole}
     columns |= {name: _rounded(getattr(closures, name)[rows], digits) for name, digits in shares.items()}
     columns["p_false"] = [float(f"{one:.3g}") if np.isfinite(one) else None for one in closures.p_false[rows].tolist()]
-    columns["metres" if has_metres(content.record) else "units"] = _rounded(np.linalg.norm(closures.match_from_query[rows, :3, 3], axis=1), 2)
+    length = "metres" if has_metres(content.record) else "units"
+    columns[length] = _rounded(np.linalg.norm(closures.match_from_query[rows, :3, 3], axis=1), 2)
     if judged is not None and judged.closure_error_m is not None:
         columns["error_m"] = _rounded(judged.closure_error_m[rows], 2)
     columns["reverse_inliers"] = [value if value >= 0 else None for value in columns["reverse_inliers"]]
