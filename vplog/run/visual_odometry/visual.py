@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from vplog.data import Camera, Float32s, Floats, Frame, Odometry
+from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.graph.bundle import Observations, adjust
 from vplog.run.visual_odometry.ground import Below, below, by_height
@@ -455,6 +456,6 @@ def visual_odometry(
     frame's motion since the one before it, by the bundle adjustment's marginals. The height of a camera without depth
     over the ground gives metres where its images show the ground."""
     tracker = Tracker(Sensor(camera, metric), None if metric else height_m)
-    for frame in frames:
-        tracker.add(frame)
+    for _ in Execution().map(tracker.add, frames):  # in one thread, while this one reads the next frames
+        pass
     return tracker.odometry()
