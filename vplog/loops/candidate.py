@@ -38,6 +38,9 @@ class VerifySettings(Settings):
     always: int = Field(default=3, ge=1)
     """Best candidates of a keyframe that are verified in any case; the others are where one of these, or of those of
     the keyframe before or after, shares enough matches. Of a drive's keyframes most return to nowhere."""
+    enough: int = Field(default=0, ge=0)
+    """Accepted ones among these best from which the others of a keyframe are left out, 0 never: they tell the graph of
+    a drive that passes a place often little more."""
     matching: MatchSettings = MatchSettings()
     """Feature matching."""
     landmarks: LandmarkSettings = LandmarkSettings()

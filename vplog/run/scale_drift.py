@@ -24,6 +24,8 @@ from vplog.run.visual_odometry.metres import random_walk, scaled
 
 _RANKS = 2
 """Candidates of a keyframe that are measured: those of neighbouring ranks give the same ratio."""
+_MEASURED = 4000
+"""Places that candidates are measured at, evenly spread over the drive: its scale wanders over hundreds of metres."""
 _LEAST = 12
 """Landmarks of both views that give a ratio."""
 _ACROSS = 1.0
@@ -46,7 +48,8 @@ def scale_ratios(proposals: Proposals, drive: DriveFeatures, *, execution: Execu
     geometry finds."""
     if drive.camera.matrix is None:
         return np.zeros((0, 4))
-    views, first = for_verification(drive), proposals.rows(proposals.rank < _RANKS)
+    every = -(-len(drive.keyframes.stamp_ns) // _MEASURED)
+    views, first = for_verification(drive), proposals.rows((proposals.rank < _RANKS) & (proposals.match % every == 0))
     order = np.argsort(first.match, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(first.match[order])) + 1) if len(order) else []
 

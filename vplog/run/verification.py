@@ -44,8 +44,8 @@ def verify(proposals: Proposals, drive: DriveFeatures, *, steps: Steps) -> Closu
     """The ledger of `loops.verify.verify_between`, whose row depends on its two frames and the calibration alone.
 
     The best candidates of every keyframe are verified, and the others where one of those, or of a neighbouring
-    keyframe's, shows the same view; where none does they are left out. A part has all candidates of some map frames,
-    whose landmarks are made once all the same.
+    keyframe's, shows the same view; where none does, or `enough` of the best are accepted, they are left out. A part
+    has all candidates of some map frames, whose landmarks are made once all the same.
     """
     if not len(proposals.query):
         return no_closures()
@@ -58,7 +58,9 @@ def verify(proposals: Proposals, drive: DriveFeatures, *, steps: Steps) -> Closu
     first = verified(np.flatnonzero(best))
     alike = first.query[~first.of(Verdict.TOO_FEW_MATCHES)]
     near = np.isin(proposals.query, np.concatenate([alike - 1, alike, alike + 1]))
-    more = np.flatnonzero(~best & near)
+    accepted = np.bincount(first.query[first.accepted], minlength=len(drive.keyframes.stamp_ns))
+    few = accepted[proposals.query] < drive.settings.enough if drive.settings.enough else True
+    more = np.flatnonzero(~best & near & few)
     return merged([first, verified(more)], [np.flatnonzero(best), more]) if len(more) else first
 
 
