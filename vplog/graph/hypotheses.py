@@ -381,10 +381,8 @@ def _improved(claimed: Factors, best: Hypothesis, families: Sequence[Ints] = ())
     Tried are the rejected runs that fit best, the accepted ones that fit worst, and `families` rejected as a whole:
     their members support each other.
     """
-    loops, at = is_loop(claimed.graph), AtSigmas.of(claimed, best.sigmas)
+    loops, at, given = is_loop(claimed.graph), AtSigmas.of(claimed, best.sigmas), best
     for _ in range(_MOST_FLIPS):
-        if at.sigmas != best.sigmas:
-            at = AtSigmas.of(claimed, best.sigmas)
         misfit = residual_sigma(at.factors.graph, best.poses)
         flips: list[Ints] = []
         for accepted, sign in ((False, 1.0), (True, -1.0)):
@@ -395,9 +393,16 @@ def _improved(claimed: Factors, best: Hypothesis, families: Sequence[Ints] = ())
         better = max(tried, key=lambda one: one.log_evidence, default=best)
         if better.log_evidence <= best.log_evidence:
             break
-        again = _refit(claimed, better.weight, better.poses, better.sigmas)
-        best = max(again, better, key=lambda one: one.log_evidence)
-    return best
+        best = better
+        poses, sigmas = _estimated(claimed, best.weight, best.poses, best.sigmas)
+        if sigmas.differ(best.sigmas, _STEADY):  # what false closures come to is computed once for all flips at others
+            other = AtSigmas.of(claimed, sigmas)
+            again = other.hypothesis(best.weight, poses)
+            at, best = (other, again) if again.log_evidence > best.log_evidence else (at, best)
+    if best is given:
+        return best
+    again = _refit(claimed, best.weight, best.poses, best.sigmas)
+    return max(again, best, key=lambda one: one.log_evidence)
 
 
 def _flipped(at: AtSigmas, best: Hypothesis, run: Ints) -> list[Hypothesis]:
