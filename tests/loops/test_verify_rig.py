@@ -14,7 +14,7 @@ from vplog.loops.candidate import lenient
 from vplog.loops.propose import Proposals
 from vplog.loops.undistort import project
 from vplog.loops.verify import VerifySettings, drive_of, verify_between
-from vplog.loops.verify_rig import Rig, verify_together
+from vplog.loops.verify_rig import Rig, _is_sure, _pairs, verify_together
 
 K = np.array([[200.0, 0, 159.5], [0, 200, 119.5], [0, 0, 1]])
 AHEAD = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -149,3 +149,16 @@ def test_what_chance_does_not_explain_has_a_pose_whatever_the_share_of_its_inlie
         drive = drive_of(own.keyframes, own.camera, mixed.__getitem__, settings)
         rig.drives = [drive, drive]
         assert by_one(rig).accepted.tolist() == [accepted]
+
+
+def test_chance_is_that_of_the_smallest_image() -> None:
+    """20 of 80 matches may agree by chance where the images of one pair have 10^4 px, whatever the first camera's."""
+    rng = np.random.default_rng(7)
+    rig = rig_of(rng, np.eye(4), (60, 60))
+    pairs = _pairs(by_one(rig), np.eye(4), rig)
+    pairs = [replace(one, matches=one.matches.rows(np.arange(40)), place=one.place[:40]) for one in pairs]
+    sure = []
+    for areas in ((10**7, 10**7), (10**7, 10**4), (10**4, 10**7)):
+        sized = [replace(one, area_px=area) for one, area in zip(pairs, areas, strict=True)]
+        sure.append(_is_sure(np.eye(4), sized, [np.arange(40) < 10] * 2, rig))
+    assert sure == [True, False, False]

@@ -45,6 +45,8 @@ class _Pair:
     place: Floats
     """(K, 2) in the query's image, in shares of its sides."""
     focal_px: float
+    area_px: int
+    """px of the query's image."""
     scale: str
 
     def of_cameras(self, match_from_query: Floats) -> Floats:
@@ -175,7 +177,8 @@ def _pairs(row: Closures, start: Floats | None, rig: Rig) -> list[_Pair]:
             matches = observe(landmarks, theirs[usable], rays[usable], used.depth_m, drive.camera, settings.landmarks)
             scale = ("stereo" if other.stereo else "depth") if landmarks.from_depth else "odometry"
             place, focal_px = used.points / [own.width, own.height], undistort.focal_px(drive.camera)
-            found.append(_Pair((a, b), (query_mount, match_mount), matches, place, focal_px, scale))
+            area_px = own.width * own.height
+            found.append(_Pair((a, b), (query_mount, match_mount), matches, place, focal_px, area_px, scale))
     return found
 
 
@@ -227,9 +230,9 @@ def _agreeing(pair: _Pair, pose: Floats, most: float) -> Bools:
 
 def _is_sure(pose: Floats, pairs: Sequence[_Pair], inlier: Sequence[Bools], rig: Rig) -> bool:
     """Whether the pose holds to the bounds of one camera's, with the inliers of all."""
-    metric, camera, each = rig.drives[0].settings.metric, rig.drives[0].camera, list(zip(pairs, inlier, strict=True))
+    metric, each = rig.drives[0].settings.metric, list(zip(pairs, inlier, strict=True))
     count, total = sum(int(rows.sum()) for rows in inlier), sum(map(len, inlier))
-    chance = np.pi * metric.max_error_px**2 / (camera.width * camera.height)
+    chance = np.pi * metric.max_error_px**2 / min(one.area_px for one in pairs)
     alarms = log10_false_alarms(total, count, SAMPLE, MODELS * len(pairs), chance)
     depth_m = np.median(np.concatenate([1.0 / one.matches.points[rows, 2] for one, rows in each]))
     return bool(
