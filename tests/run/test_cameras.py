@@ -29,6 +29,7 @@ from vplog.results.mcap_read import read_pictures
 from vplog.results.run_cameras import CameraPictures
 from vplog.results.run_record import read_run_json, write_run_json
 from vplog.run import cameras
+from vplog.run.keyframes import KeyframeSettings
 from vplog.verbs.demo import SMALL, make_drive
 from vplog.verbs.demo.record import IMAGE, REAR, TYPES
 
@@ -185,12 +186,21 @@ def test_pictures_are_the_nearest_of_a_keyframe_and_none_is_far() -> None:
     odometry = Odometry(np.arange(0, 1001, 10), poses_of(rng, 101), None)
     keyframes = Keyframes("drive", np.array([100, 203, 300, 480, 700]), poses_of(rng, 5))
     stamps = np.array([90, 112, 200, 206, 290, 360, 430, 950, 1020])
-    row, pictures = cameras.pictures_at(keyframes, stamps, odometry)
+    row, pictures = cameras.pictures_at(keyframes, stamps, odometry, KeyframeSettings())
     assert pictures.stamp_ns.tolist() == [90, 200, 290, 430]
     assert row.tolist() == [0, 1, 2, 3]
     assert np.allclose(pictures.odom_from_body, odometry.odom_from_body[[9, 20, 29, 43]])
     with pytest.raises(LogError, match="near the stamp"):
-        cameras.pictures_at(keyframes, np.array([0, 10, 20]), odometry)
+        cameras.pictures_at(keyframes, np.array([0, 10, 20]), odometry, KeyframeSettings())
+
+
+def test_a_picture_is_of_the_nearest_of_several_keyframes_and_has_odometry() -> None:
+    odometry = Odometry(np.delete(np.arange(0, 1001, 10), np.s_[70:80]), np.tile(np.eye(4), (91, 1, 1)), None)
+    stamp_ns, settings = np.array([60, 130, 160, 260, 540, 740, 940]), KeyframeSettings(max_odometry_gap_s=5e-8)
+    keyframes = Keyframes("drive", stamp_ns, np.tile(np.eye(4), (7, 1, 1)))
+    row, pictures = cameras.pictures_at(keyframes, np.arange(150, 1000, 200), odometry, settings)
+    assert row.tolist() == [2, 3, 4, 6]
+    assert pictures.stamp_ns.tolist() == [150, 350, 550, 950]
 
 
 def test_a_closure_of_pictures_is_carried_to_the_keyframes() -> None:

@@ -29,6 +29,7 @@ from vplog.results.run_cameras import CameraPictures
 from vplog.run.cache.codecs import closures_codec
 from vplog.run.cache.steps import Steps, step
 from vplog.run.feature_extraction import Extraction, decoded, extract
+from vplog.run.keyframes import KeyframeSettings, is_covered
 from vplog.run.place_recognition import describe, shared_of
 from vplog.run.reference_library import own_images, own_references
 from vplog.run.verification import DriveFeatures, calibrated, for_verification, merged
@@ -104,7 +105,7 @@ def read_cameras(
     for topic, choice in others.items():
         try:
             other = logs.open_drive(files_of(steps.cache.drive), choice)
-            row, selected = pictures_at(keyframes, other.stamps(), odometry)
+            row, selected = pictures_at(keyframes, other.stamps(), odometry, settings.keyframes)
             features = extract(other, choice, selected, settings, steps=steps, execution=execution)
             pictures, camera = decoded(selected, features, settings.features), other.camera()
             chosen = (other, pictures, features, settings.library)
@@ -120,18 +121,20 @@ def read_cameras(
     return found
 
 
-def pictures_at(keyframes: Keyframes, stamp_ns: Ints, odometry: Odometry) -> tuple[Ints, Keyframes]:
+def pictures_at(
+    keyframes: Keyframes, stamp_ns: Ints, odometry: Odometry, settings: KeyframeSettings
+) -> tuple[Ints, Keyframes]:
     """Rows of the keyframes that have a picture among those with these (F,) stamps no further than their period away,
-    and these pictures. Raises LogError where there are fewer than two."""
-    inside = (stamp_ns >= odometry.stamp_ns[0]) & (stamp_ns <= odometry.stamp_ns[-1])
-    stamp_ns = stamp_ns[inside]
+    and these pictures, each of the nearest keyframe alone. Raises LogError where there are fewer than two."""
+    stamp_ns = stamp_ns[is_covered(stamp_ns, odometry, settings)]
     if len(stamp_ns) < 2:
         raise LogError(f"{len(stamp_ns)} of its images have odometry at their stamps.")
     after = np.clip(np.searchsorted(stamp_ns, keyframes.stamp_ns), 1, len(stamp_ns) - 1)
     before_is_nearer = keyframes.stamp_ns - stamp_ns[after - 1] <= stamp_ns[after] - keyframes.stamp_ns
     nearest = after - before_is_nearer
-    near = np.abs(stamp_ns[nearest] - keyframes.stamp_ns) <= np.median(np.diff(stamp_ns))
-    row = np.flatnonzero(near)
+    apart_ns = np.abs(stamp_ns[nearest] - keyframes.stamp_ns)
+    row = np.flatnonzero(apart_ns <= np.median(np.diff(stamp_ns)))
+    row = row[np.lexsort([apart_ns[row], nearest[row]])]
     taken, first = np.unique(nearest[row], return_index=True)
     if len(taken) < 2:
         raise LogError(f"{len(taken)} of its images are near the stamp of a keyframe.")

@@ -45,9 +45,7 @@ def select_keyframes(
             f"{drive} has {plural(len(stamp_ns), 'frame')}, and a graph needs two. Give a longer part of it."
         )
     warnings = []
-    longest_s = settings.max_odometry_gap_s
-    gap_ns = longest_gap_ns(odometry.stamp_ns) if longest_s is None else int(longest_s * 1e9)
-    covered = has_odometry(stamp_ns, odometry.stamp_ns, gap_ns)
+    covered = is_covered(stamp_ns, odometry, settings)
     if missing := int((~covered).sum()):
         warnings.append(f"{missing} of {plural(len(stamp_ns), 'frame')} without odometry at its stamp left out.")
     stamp_ns = np.unique(stamp_ns[covered])
@@ -72,6 +70,13 @@ def row_of(keyframes: Keyframes, name: int | str) -> int | None:
     number, count = int(name), len(keyframes.stamp_ns)
     row = number if number < count else int(np.searchsorted(keyframes.stamp_ns, number))
     return row if row == number or (row < count and keyframes.stamp_ns[row] == number) else None
+
+
+def is_covered(stamp_ns: Ints, odometry: Odometry, settings: KeyframeSettings) -> Bools:
+    """(F,) whether odometry is known at each stamp."""
+    longest_s = settings.max_odometry_gap_s
+    gap_ns = longest_gap_ns(odometry.stamp_ns) if longest_s is None else int(longest_s * 1e9)
+    return has_odometry(stamp_ns, odometry.stamp_ns, gap_ns)
 
 
 def has_odometry(stamp_ns: Ints, odometry_ns: Ints, gap_ns: int) -> Bools:
