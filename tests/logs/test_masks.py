@@ -28,13 +28,15 @@ def write(path: Path, image: np.ndarray) -> Path:
     return path
 
 
-def bag(folder: Path, masks: str = "") -> Path:
-    """The drive as a ROS 2 bag; with `masks`, an encoding, a topic of masks of which the third is missing."""
+def bag(folder: Path, masks: str = "", used: float = 1.0) -> Path:
+    """The drive as a ROS 2 bag; with `masks`, an encoding, a topic of masks of which the third is missing. `used` is
+    the share of their columns that is not zero throughout."""
     messages = ros_messages(Drive(), 2)
     for one in [one for one in messages if masks and one.topic == TOPIC]:
         number = (one.stamp_ns - START_NS) // 10**8
         label = (ZERO_BELOW > 0) * np.array(1 + number, np.uint8 if masks == "mono8" else np.uint16)
         label[:5] = np.iinfo(label.dtype).max // 2  # classes far apart, of which none is stretched to zero
+        label[:, round(used * WIDTH) :] = 0
         image = store(2).types["sensor_msgs/msg/Image"](
             header=one.message.header, height=HEIGHT, width=WIDTH, encoding=masks, is_bigendian=0,
             step=WIDTH * label.itemsize, data=label.view(np.uint8).ravel(),
@@ -162,6 +164,7 @@ REFUSED = {
     "damaged": ({"": "cut.png"}, "is no whole image"),
     "another shape": ({"": "square.png"}, "another shape"),
     "black": ({"": "black.png"}, "is black"),
+    "a folder of black ones": ({"": "many"}, "is black"),
     "another topic": ({"/rear": "square.png"}, "the log has no topic /rear"),
     "empty folder": ({"": "empty"}, "has no images"),
     "other names": ({"": "others"}, "called like it"),
@@ -174,6 +177,8 @@ def test_what_is_no_mask_is_refused_in_one_line(kind: str, tmp_path: Path) -> No
     write(tmp_path / "square.png", np.ones((40, 40), np.uint8))
     write(tmp_path / "black.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     write(tmp_path / "others/x.png", ZERO_BELOW)
+    for stamp_ns in Drive().stamp_ns[:3]:
+        write(tmp_path / f"many/{stamp_ns}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     (tmp_path / "cut.png").write_bytes(png(ZERO_BELOW)[:-20])
     (tmp_path / "text.png").write_text("mask")
     (tmp_path / "empty").mkdir()
@@ -183,8 +188,31 @@ def test_what_is_no_mask_is_refused_in_one_line(kind: str, tmp_path: Path) -> No
     assert "\n" not in str(found.value)
 
 
-def test_an_inverted_mask_is_doubted(tmp_path: Path) -> None:
-    file = write(tmp_path / "mask.png", 255 - ZERO_BELOW)
-    log = logs.open(bag(tmp_path), TopicChoice(masks={"": file}))
+@pytest.mark.parametrize(
+    ("levels", "words"),
+    [
+        ([255 - ZERO_BELOW], "mask.png masks 62%"),
+        ([np.dstack([0 * ZERO_BELOW + 255] * 3 + [ZERO_BELOW])], "mask.png masks nothing"),  # drawn as transparency
+        ([0 * ZERO_BELOW, ZERO_BELOW, 0 * ZERO_BELOW], "mask masks 79%"),  # the first may be black
+        ([0 * ZERO_BELOW, 0 * ZERO_BELOW + 255, ZERO_BELOW], ""),
+    ],
+)
+def test_masks_that_leave_out_most_or_nothing_are_doubted(levels: list[np.ndarray], words: str, tmp_path: Path) -> None:
+    for stamp_ns, level in zip(Drive().stamp_ns, levels, strict=False):
+        write(tmp_path / f"mask/{stamp_ns}.png", level)
+    path = tmp_path / "mask"
+    if len(levels) == 1:
+        path = write(tmp_path / "mask.png", levels[0])
+    log = logs.open(bag(tmp_path), TopicChoice(masks={"": path}))
     log.camera()
-    assert "masks 62%" in " ".join(log.warnings)
+    doubts = [line for line in log.warnings if " masks " in line]
+    assert len(doubts) == bool(words)
+    assert words in " ".join(doubts)
+
+
+def test_masks_of_a_topic_are_looked_at_too(tmp_path: Path) -> None:
+    log = logs.open(bag(tmp_path, "mono8", 0.2), TopicChoice(mask="/segments"))
+    log.camera()
+    assert "/segments masks 87% of the images of /cam/image/compressed; zero" in " ".join(log.warnings)
+    with pytest.raises(LogError, match="/segments is black, which masks all of /cam/image/compressed"):
+        logs.open(bag(tmp_path / "black", "mono8", 0.0), TopicChoice(mask="/segments")).camera()

@@ -16,7 +16,7 @@ from vplog.errors import LogError, plural
 from vplog.geometry.masking import filled
 from vplog.logs.cameras import camera_from_image
 from vplog.logs.formats.container import Channel, Container, Notes, Place, RawData
-from vplog.logs.masks import Mask, is_used, resized_mask
+from vplog.logs.masks import Mask, check_share, is_used, resized_mask
 from vplog.logs.messages import pixels, video
 from vplog.logs.messages.decode import decode
 from vplog.logs.messages.pixels import Levels, depth_m, levels_of, spread
@@ -250,6 +250,18 @@ class ImageReader:
         channel, place = getattr(self.content.chosen, part), self.content.companions[part][row]
         levels = self._levels if part == "right" else None
         return None if place is None else LoggedImage(channel, self._container.read(place), levels)
+
+    def check_masks(self, topic: str, notes: Notes) -> None:
+        """Note masks of a topic that leave out most of the images of `topic`. Raises LogError where they mask all."""
+        if (masks := self.content.chosen.mask) is None:
+            return
+        placed, used = zip(self.content.stamp_ns.tolist(), self.content.companions["mask"], strict=True), list[Bools]()
+        found = [(stamp_ns, place) for stamp_ns, place in placed if place is not None]
+        for stamp_ns, place in found[:: spread(len(found))]:
+            with suppress(LogError):  # its image is left out
+                used.append(LoggedImage(masks, self._container.read(place)).used(stamp_ns))
+        if used:
+            check_share(masks.topic, used, topic, notes)
 
     @cached_property
     def _levels(self) -> Levels | None:

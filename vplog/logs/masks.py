@@ -7,7 +7,8 @@ folder; that of a recorded image is called by its stamp in ns.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -19,6 +20,7 @@ from vplog.data import Bools
 from vplog.errors import LogError, nearest_path, plural
 from vplog.logs.formats.container import Channel, Notes
 from vplog.logs.image_folder import is_image
+from vplog.logs.messages.pixels import spread
 from vplog.storage.image_file import BadImageError, decode_image, image_size, is_lossy
 
 _HALF = 128
@@ -83,19 +85,21 @@ class Masks:
 
     def check(self, stamp_ns: Iterable[int], size: tuple[int, int], notes: Notes) -> None:
         """Note what is unlikely to be meant. Raises LogError where no mask is of one of the images, or the first is of
-        another shape or masks all."""
+        another shape, or all mask all."""
         if self._path is None:
             return
         found = [self.of(one) for one in stamp_ns]
-        first = next((one for one in found if one is not None), None)
-        if first is None:
+        masks = [one for one in found if one is not None]
+        if not masks:
             raise LogError(
                 f"No mask in {self._path} is of an image of {self._topic}: the mask of an image is called like it, "
                 "that of a recorded image by its stamp in ns."
             )
-        used, own = first.used(size), first.own.shape[::-1]
-        if not used.any():
-            raise LogError(f"{first.path} is black, which masks all of {self._topic}: zero is masked. Invert it.")
+        first, *others = masks[:1] if self._one else masks[:: spread(len(masks))]
+        used, own = [first.used(size)], first.own.shape[::-1]
+        for one in others:
+            with suppress(LogError):  # its image is left out
+                used.append(one.used(size))
         if own != size:
             notes.add(
                 f"{first.path.name} has {own[0]} x {own[1]} px and is resized to the images' {size[0]} x {size[1]}."
@@ -104,10 +108,20 @@ class Masks:
             notes.add(
                 f"{self._path} has no mask for {plural(missing, 'image')} of {self._topic}; these are used whole."
             )
-        if (share := 1 - float(used.mean())) > _INVERTED:
+        if self._one and used[0].all():
             notes.add(
-                f"{first.path.name} masks {share:.0%} of the images of {self._topic}; zero is masked: is it inverted?"
+                f"{first.path.name} masks nothing of {self._topic}: a px of zero is masked, and an alpha channel does "
+                "not count. Write the mask as grey levels."
             )
+        check_share(str(self._path), used, self._topic, notes)
+
+
+def check_share(name: str, used: Sequence[Bools], topic: str, notes: Notes) -> None:
+    """Note masks that leave out most of their images. Raises LogError where they leave out all."""
+    if not any(one.any() for one in used):
+        raise LogError(f"{name} is black, which masks all of {topic}: zero is masked. Invert it.")
+    if (share := 1 - float(np.mean([one.mean() for one in used]))) > _INVERTED:
+        notes.add(f"{name} masks {share:.0%} of the images of {topic}; zero is masked: is it inverted?")
 
 
 def masks_of(

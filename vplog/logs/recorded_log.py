@@ -348,6 +348,7 @@ class RecordedLog:
         calibration = known.calibration if known else content.calibration
         camera = camera_of(image.topic, calibration, size, notes)
         self._masks[0].check(content.stamp_ns.tolist(), size, notes)
+        self._images.check_masks(image.topic, notes)
         body = self._body
         named = body and frame and frame == logged and content.tree.between(body, frame) is not None
         visual = camera.matrix is not None or self._contents.names is None
