@@ -156,7 +156,7 @@ def test_chance_is_that_of_the_smallest_image() -> None:
     rng = np.random.default_rng(7)
     rig = rig_of(rng, np.eye(4), (60, 60))
     pairs = _pairs(by_one(rig), np.eye(4), rig)
-    pairs = [replace(one, matches=one.matches.rows(np.arange(40)), place=one.place[:40]) for one in pairs]
+    pairs = [replace(one, matches=one.matches.rows(np.arange(60) < 40), place=one.place[:40]) for one in pairs]
     sure = []
     for areas in ((10**7, 10**7), (10**7, 10**4), (10**4, 10**7)):
         sized = [replace(one, area_px=area) for one, area in zip(pairs, areas, strict=True)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,8 @@ from hypothesis import strategies as st
 from vplog.data import Keyframes, Odometry
 from vplog.errors import LogError, SettingsError
 from vplog.geometry import se3
-from vplog.run.keyframes import KeyframeSettings, select_keyframes
+from vplog.logs import TopicChoice
+from vplog.run.keyframes import KeyframeSettings, select_keyframes, ways_without_images
 
 START = 1_700_000_000 * 10**9
 MS = 10**6
@@ -156,6 +158,50 @@ def test_short_gaps_and_slow_odometry_are_bridged() -> None:
     assert _select(_frames(), slow)[1] == []
     assert _select(_frames(), _without(slow, 20.0, 26.0))[1] == []  # two lost in a row
     assert len(_select(_frames(), _without(slow, 20.0, 28.0))[1]) == 1
+
+
+@dataclass
+class Camera:
+    """A log with images at some stamps."""
+
+    stamp_ns: np.ndarray
+    others: tuple[str, ...] = ()
+    name = "/front"
+
+    def stamps(self) -> np.ndarray:
+        return self.stamp_ns
+
+    def camera(self) -> Camera:
+        return self
+
+    def further_cameras(self) -> list[str]:
+        return list(self.others)
+
+
+def test_a_camera_that_stops_or_starts_late_is_told() -> None:
+    moves, stops = _drive(2.0, seconds=120.0), _drive(2.0, seconds=120.0)
+    stops.odom_from_body[800:] = stops.odom_from_body[800]  # parked from 40 s on
+    early, late, every = _frames(40.0), _frames(60.0, start_s=60.0), _frames(120.0)
+    both = np.concatenate([_frames(20.0), _frames(85.0, start_s=35.0)])
+    cut = TopicChoice(stop_s=40.0)
+    for stamp_ns, odometry, topics, words in (
+        (early, moves, TopicChoice(), "no images for 80 s, from 40 s of the odometry on, while"),
+        (late, moves, TopicChoice(), "no images for 60 s, from 0 s of the odometry on, while"),
+        (both, moves, TopicChoice(), "no images for 15 s, from 20 s of the odometry on, while"),
+        (np.delete(both, np.s_[400:600]), moves, TopicChoice(), "20 s, from 55 s of the odometry on, and 1 time more"),
+        (_frames(120.0, rate=1 / 15), moves, TopicChoice(), ""),
+        (every[::4], moves, TopicChoice(), ""),
+        (_frames(112.0), moves, TopicChoice(), ""),
+        (early, stops, TopicChoice(), ""),
+        (early, moves, cut, ""),
+    ):
+        keyframes, _ = _select(stamp_ns, odometry)
+        found = " ".join(ways_without_images(Camera(stamp_ns), topics, keyframes, odometry))  # type: ignore[arg-type]
+        assert words in found
+        assert bool(words) == bool(found)
+    keyframes, _ = _select(early, moves)
+    (line,) = ways_without_images(Camera(early, ("/rear",)), TopicChoice(), keyframes, moves)  # type: ignore[arg-type]
+    assert "the body moves on by 160 m: no place is recognised there. Further cameras count at its images alone" in line
 
 
 def test_samples_beside_a_gap_still_count() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
@@ -13,10 +14,17 @@ from vplog.geometry import se3
 from vplog.logs.stamps import longest_gap_ns
 from vplog.settings import Settings
 
+if TYPE_CHECKING:
+    from vplog.logs import TopicChoice
+    from vplog.stages import Log
+
 _PAPER_SPACING_M = 1.0
 """m; the paper takes views 1-5 m apart (section IV): the near end."""
 _LEAST_SPACING_M = 0.05
 """m; closer views, even indoors, hardly differ (at 2 m distance 5 cm is 1.4 degrees of parallax)."""
+
+_BLIND_S, _BLIND_SHARE, _BLIND_STEPS = 10.0, 0.05, 10
+"""s, share of the odometry's time, and spacings of keyframes from which a way without images is warned of."""
 
 
 class KeyframeSettings(Settings):
@@ -61,6 +69,40 @@ def select_keyframes(
     begins = np.searchsorted(stamp_ns, odometry.stamp_ns[begin])
     rows = _far_enough(poses, _spacing(poses, settings), np.deg2rad(settings.rotation_deg), begins)
     return Keyframes(drive, stamp_ns[rows], poses[rows]), warnings
+
+
+def ways_without_images(log: Log, topics: TopicChoice, keyframes: Keyframes, odometry: Odometry) -> list[str]:
+    """A warning where the odometry moves on and there are no images, as of a camera that stops or starts late; none
+    where --start or --stop leave images out."""
+    known, stamp_ns, position = odometry.stamp_ns, log.stamps(), keyframes.odom_from_body[:, :3, 3]
+    if topics.start_s is not None or topics.stop_s is not None or len(position) < 2:
+        return []
+    edges = np.concatenate([known[:1], np.clip(stamp_ns, known[0], known[-1]), known[-1:]])
+    longest_ns = max(_BLIND_S * 1e9, _BLIND_SHARE * (known[-1] - known[0]), longest_gap_ns(stamp_ns))
+    step_m = max(float(np.median(np.linalg.norm(np.diff(position, axis=0), axis=1))), _LEAST_SPACING_M)
+    found = []
+    for at in np.flatnonzero(np.diff(edges) > longest_ns).tolist():
+        inside = odometry.odom_from_body[
+            np.searchsorted(known, edges[at]) : np.searchsorted(known, edges[at + 1]), :3, 3
+        ]
+        far_m = float(np.linalg.norm(inside - inside[:1], axis=1).max(initial=0.0))
+        if far_m >= _BLIND_STEPS * step_m:
+            found.append((far_m, (edges[at + 1] - edges[at]) / 1e9, (edges[at] - known[0]) / 1e9))
+    if not found:
+        return []
+    (far_m, seconds, since_s), more = (
+        max(found),
+        f", and {plural(len(found) - 1, 'time')} more" if len(found) > 1 else "",
+    )
+    further = (
+        "Further cameras count at its images alone: name one that has more of them first, with --image-topic."
+        if log.further_cameras()
+        else "Did the camera stop, or start late?"
+    )
+    return [
+        f"{log.camera().name} has no images for {seconds:.0f} s, from {since_s:.0f} s of the odometry on{more}, while "
+        f"the body moves on by {far_m:.3g} m: no place is recognised there. {further}"
+    ]
 
 
 def row_of(keyframes: Keyframes, name: int | str) -> int | None:

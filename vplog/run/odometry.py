@@ -19,7 +19,7 @@ from vplog.run.cache.codecs import json_codec
 from vplog.run.cache.stage_cache import Inputs
 from vplog.run.cache.steps import Steps, step
 from vplog.run.feature_extraction import image_topics
-from vplog.run.keyframes import KeyframeSettings, has_odometry, select_keyframes
+from vplog.run.keyframes import KeyframeSettings, has_odometry, select_keyframes, ways_without_images
 from vplog.run.lidar_odometry import lidar_odometry, range_of
 from vplog.run.self_calibration import decoded, self_calibrated
 from vplog.run.visual_odometry.inertial import SURE, with_imu
@@ -70,7 +70,7 @@ def read(
         odometry = _with_scale(odometry, log, camera, use_gps)
     stamp_ns = odometry.stamp_ns if odometry.of_images else log.stamps()  # frames that were followed
     selected, warnings = select_keyframes(log.name, stamp_ns, odometry, settings)
-    for warning in warnings:
+    for warning in warnings + ways_without_images(log, topics, selected, odometry):
         _log.warning(warning)
     if _is_unknown(odometry):
         camera = replace(camera, matrix=None, distortion_model="none", distortion=np.zeros(0))

@@ -22,7 +22,7 @@ from vplog.logs.stamps import rate_hz
 from vplog.results.html import render
 from vplog.results.previews import jpeg
 from vplog.results.run_record import command_of
-from vplog.run.keyframes import KeyframeSettings, select_keyframes
+from vplog.run.keyframes import KeyframeSettings, select_keyframes, ways_without_images
 from vplog.run.lidar_odometry import new_registration
 from vplog.run.odometry import UNIT, gives_visual, is_metric, source_of
 from vplog.run.provenance import arguments
@@ -119,7 +119,7 @@ def _inspect(path: Path, topics: TopicChoice) -> Preflight:
         with _noted(problems):
             new_registration(1.0)
     else:
-        keyframes, missing = _keyframes(log, stamp_ns, odometry, problems)
+        keyframes, missing = _keyframes(log, topics, stamp_ns, odometry, problems)
     warnings = [line for line in dict.fromkeys(found.warnings + log.warnings + missing) if line not in problems]
     named = {**asdict(found), "warnings": warnings}
     timing = _timing(stamp_ns)
@@ -202,7 +202,7 @@ def _small(image: Bytes) -> Bytes:
 
 
 def _keyframes(
-    log: Log, stamp_ns: Ints, odometry: Odometry | None, problems: list[str]
+    log: Log, topics: TopicChoice, stamp_ns: Ints, odometry: Odometry | None, problems: list[str]
 ) -> tuple[int | None, list[str]]:
     """Number of keyframes of a run with the default settings, and warnings of the frames that it would leave out."""
     if not len(stamp_ns):
@@ -217,7 +217,7 @@ def _keyframes(
                 "By the odometry nothing moves far enough for a second keyframe, and a graph needs two. Choose another "
                 "odometry with --odometry-topic or --odometry-file."
             )
-        return len(keyframes.stamp_ns), missing
+        return len(keyframes.stamp_ns), missing + ways_without_images(log, topics, keyframes, odometry)
     return None, []
 
 
