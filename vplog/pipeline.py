@@ -181,7 +181,7 @@ def run(
     ):
         odometry, camera, selected = do(read, log, topics, pipeline.keyframes, pipeline.gps.use)
         features = do(extract, log, topics, selected, pipeline)
-        keyframes = decoded(selected, features, pipeline.features)
+        keyframes, features = decoded(selected, features, pipeline.features, odometry, camera.name)
         decisions = read_decisions(Path(pipeline.decisions.file), keyframes) if pipeline.decisions.file else None
         others = {topic: topics.of_camera(topic) for topic in log.further_cameras() if odometry.metric}
         views = do(read_cameras, log, others, odometry, keyframes, pipeline, library is None) if others else []

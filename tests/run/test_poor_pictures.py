@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 
+from vplog.data import Features, Keyframes, Odometry
+from vplog.errors import LogError
 from vplog.execution.execution import Execution
+from vplog.features.sift import SiftSettings
+from vplog.geometry import se3
 from vplog.pipeline import load_pipeline, run
+from vplog.run.cache.feature_shards import Extracted, packed
+from vplog.run.cache.stage_cache import sealed
+from vplog.run.feature_extraction import decoded
 from vplog.verbs.demo import SMALL, make_drive
 from vplog.verbs.evaluate_run import evaluate
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
 QUICK = (
@@ -44,3 +54,42 @@ def test_good_pictures_are_called_nothing(finished: Path) -> None:
     assert min(features.counts) > 300
     assert [len(features[row]) for row in range(3)] == features.counts[:3]
     assert np.all(["Pictures are" not in line for line in read_run_json(finished / "run.json")["warnings"]])
+
+
+@pytest.mark.parametrize(("frozen", "left_out"), [((), []), ((4, 5), [4, 5]), ((9,), [9]), (range(1, 12), None)])
+@pytest.mark.parametrize("turn", [False, True])
+def test_pictures_of_a_camera_that_froze_are_left_out(
+    turn: bool, frozen: Sequence[int], left_out: list[int] | None, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Each keyframe is 1 m or 10 degrees from the one before, but for 7 and 8, where the body stands; the depth of a
+    picture that repeats may be new. As many features prove nothing."""
+    rng, count = np.random.default_rng(5), 12
+    step = np.array([0, 0, np.radians(10), 0, 0, 0] if turn else [0, 0, 0, 1.0, 0, 0])
+    moved = np.arange(count) - np.clip(np.arange(count) - 6.0, 0, 2)
+    poses = se3.exp(moved[:, None] * step)
+    found = list[tuple[int, Features, bytes]]()
+    for row in range(count):
+        points, descriptors = rng.random((9, 2), np.float32), rng.integers(0, 255, (9, 128)).astype(np.uint8)
+        new = Features(points, np.ones(9, np.float32), descriptors, np.ones(9, np.float32), 64, 48)
+        depth_m = rng.random(9, np.float32)
+        repeats = row in frozen or row in (7, 8)
+        found.append((10**9 * row, replace(found[-1][1], depth_m=depth_m) if repeats else new, b""))
+    (tmp_path / "part").write_bytes(sealed("0" * 64, packed(found, [], [])))
+    features = Extracted()
+    features.add(tmp_path / "part")
+    keyframes = Keyframes("drive", np.arange(count) * 10**9, poses)
+    odometry = Odometry(keyframes.stamp_ns, poses, None)
+    if left_out is None:
+        with pytest.raises(LogError, match=r"11 of 12 keyframes of /cam show .* first of them 1 s .* A graph"):
+            decoded(keyframes, features, SiftSettings(min_features=0), odometry, "/cam")
+        odometry = replace(odometry, metric=False)
+        assert len(decoded(keyframes, features, SiftSettings(min_features=0), odometry, "/cam")[1]) == count
+        return
+    rest, new_features = decoded(keyframes, features, SiftSettings(min_features=0), odometry, "/cam")
+    kept = [row for row in range(count) if row not in left_out]
+    assert rest.stamp_ns.tolist() == new_features.stamp_ns == [10**9 * row for row in kept]
+    assert [new_features[at].points.tolist() for at in range(len(kept))] == [
+        found[row][1].points.tolist() for row in kept
+    ]
+    assert (rest.odom_from_body == poses[kept]).all()
+    assert (new_features.token == features.token) == (not left_out) == (not caplog.messages)

@@ -107,7 +107,8 @@ def read_cameras(
             other = logs.open_drive(files_of(steps.cache.drive), choice)
             row, selected = pictures_at(keyframes, other.stamps(), odometry, settings.keyframes)
             features = extract(other, choice, selected, settings, steps=steps, execution=execution)
-            pictures, camera = decoded(selected, features, settings.features), other.camera()
+            pictures, features = decoded(selected, features, settings.features, odometry, topic)
+            camera = other.camera()
             chosen = (other, pictures, features, settings.library)
             images = steps.part(own_images, *chosen) if own_library else ()
         except LogError as error:

@@ -21,10 +21,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from vplog import logs
-from vplog.data import Features, Frame, Keyframes
+from vplog.data import Bools, Features, Floats, Frame, Keyframes, Odometry
 from vplog.errors import LogError, ResultError
 from vplog.execution.execution import Execution
 from vplog.features.extraction import extract_frames
+from vplog.geometry import se3
 from vplog.results.previews import PictureSettings, preview
 from vplog.run.cache.code_hash import code_of
 from vplog.run.cache.feature_shards import Extracted, packed
@@ -67,6 +68,8 @@ _LOOKED_AT = 16
 _SMALL_PX, _DARK, _FLAT = 160 * 160, 16.0, 40.0
 """Pictures are small below so many px, dark below this mean grey, and low in contrast where 98 % of grey levels lie
 closer: those of drives by day have 10^5 px, a mean of 80 to 130 and 150 to 250 levels, of a lit park at night 240."""
+_STILL_M, _STILL_RAD = 0.02, np.radians(2.0)
+"""Motion that the odometry of a body that stands may claim: less than the least spacing of keyframes."""
 _POOR_SHARE = 0.1
 """Share of keyframes with few features from which there is a warning."""
 
@@ -242,14 +245,38 @@ def extract(
     return found
 
 
-def decoded(keyframes: Keyframes, found: Extracted, settings: FeatureSettings) -> Keyframes:
-    """The keyframes whose images decode, with a warning where that is not all of them, or where they are poor."""
+def decoded(
+    keyframes: Keyframes, found: Extracted, settings: FeatureSettings, odometry: Odometry, camera: str
+) -> tuple[Keyframes, Extracted]:
+    """The keyframes whose images decode and are new, and their features, with a warning where that is not all of them,
+    or where they are poor. Raises LogError where fewer than two are new."""
     rows, total = np.searchsorted(keyframes.stamp_ns, found.stamp_ns), len(keyframes.stamp_ns)
     for why in found.lost[:1]:
         _log.warning("%d of %d keyframes were lost to damaged images. First: %s", total - len(rows), total, why)
+    poses = keyframes.odom_from_body[rows]
+    # without metres the motion is that of the pictures, or not known
+    if odometry.metric and (stale := stale_pictures(poses, found)).any():
+        since_s = (found.stamp_ns[int(stale.argmax())] - found.stamp_ns[0]) / 1e9
+        line = (
+            f"{int(stale.sum())} of {total} keyframes of {camera} show the picture of the one before although the "
+            f"odometry moves on, the first of them {since_s:.0f} s after the start. They are left out: "
+            "did the camera freeze?"
+        )
+        if (~stale).sum() < 2:
+            raise LogError(f"{line} A graph needs two others: choose another camera with --image-topic.")
+        _log.warning(line)
+        rows, found = rows[~stale], found.without(stale)
     if why := poor_pictures(found, getattr(settings, "least_features", 0)):
         _log.warning(why)
-    return Keyframes(keyframes.drive, keyframes.stamp_ns[rows], keyframes.odom_from_body[rows])
+    return Keyframes(keyframes.drive, keyframes.stamp_ns[rows], keyframes.odom_from_body[rows]), found
+
+
+def stale_pictures(poses: Floats, found: Extracted) -> Bools:
+    """(N,) whether each keyframe, of poses (N, 4, 4), shows the picture of the one before although the body has moved
+    or turned since that was new. At a standstill pictures may well be the same."""
+    repeats = found.repeats()
+    moved = se3.between(poses[np.maximum.accumulate(np.where(repeats, 0, np.arange(len(repeats))))], poses)
+    return repeats & ((np.linalg.norm(moved[:, :3, 3], axis=1) > _STILL_M) | (se3.angle(moved) > _STILL_RAD))
 
 
 def poor_pictures(found: Extracted, least: int) -> str:

@@ -6,12 +6,14 @@ import json
 import os
 import struct
 from collections.abc import Iterable, Sequence
+from copy import copy
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from vplog.data import Features
+from vplog.data import Bools, Features
 from vplog.errors import ResultError
 from vplog.features.matching import MatchSettings, PairMatches
 from vplog.features.store import SIFT_BYTES, features_from, features_to, size_of
@@ -62,6 +64,7 @@ class Extracted:
         self.cpu_ms: list[float] = []
         """CPU time of features, where the parts say it."""
         self.files: list[str] = []
+        self._left_out: list[int] = []
         self._rows: list[tuple[Path, int, _Row]] = []
         self._matches: dict[MatchSettings, PairMatches] = {}
 
@@ -97,7 +100,7 @@ class Extracted:
     @property
     def token(self) -> str:
         """Stands for all that the features were made from: the names of the files hold the hashes of that."""
-        return " ".join(self.files)
+        return " ".join([*self.files, *map(str, self._left_out)])
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -107,6 +110,25 @@ class Extracted:
         path, begin, row = self._rows[at]
         data = _bytes_at(path, begin + row.offset, row.size)
         return features_from(data, row.features, row.width, row.height, bool(row.thumbnail), row.values)
+
+    def repeats(self) -> Bools:
+        """(N,) whether each keyframe shows the picture of the one before: features that are the same to the last bit,
+        whatever their depth. Only keyframes whose sizes are alike are read."""
+        found = np.zeros(len(self), bool)
+        for at, ((_, _, before), (_, _, row)) in enumerate(pairwise(self._rows), 1):
+            if row.features and row[2:] == before[2:]:
+                one, other = self[at - 1], self[at]
+                same = np.array_equal(one.points, other.points)
+                found[at] = same and np.array_equal(one.descriptors, other.descriptors)
+        return found
+
+    def without(self, rows: Bools) -> Extracted:
+        """All but some (N,) of the keyframes."""
+        found, kept = copy(self), np.flatnonzero(~rows).tolist()
+        found._left_out = np.array(self.stamp_ns)[rows].tolist()
+        found.stamp_ns, found._rows = [self.stamp_ns[at] for at in kept], [self._rows[at] for at in kept]
+        found._matches = {}
+        return found
 
     def matches(self, settings: MatchSettings) -> PairMatches:
         """Matches of pairs of keyframes, shared by the steps of a run."""
