@@ -76,7 +76,8 @@ def test_fixes_relate_the_pieces_of_a_drive(fixed: bool) -> None:
     noise = np.tile(np.diag([1e-6] * 3 + [1e-4] * 3), (count, 1, 1))
     given = Odometry(stamps, odometry, noise, breaks=np.array([100]), increments=True)
     near = np.random.default_rng(0).normal(true[:, :3, 3], 0.3)
-    fixes = Gps(stamps, *geodesy.geodetic(near, (48.0, 11.0, 500.0)).T, np.tile(0.09 * np.eye(3), (count, 1, 1)))
+    latitude, longitude, altitude = geodesy.geodetic(near, (48.0, 11.0, 500.0)).T
+    fixes = Gps(stamps, latitude, longitude, altitude, np.tile(0.09 * np.eye(3), (count, 1, 1)))
     pipeline = load_pipeline("default", ["gps.use=true"] * fixed)
     found = solve(given, Keyframes("drive", stamps[::2], odometry[::2]), no_closures(), fixes, pipeline)
     assert found.pieces == 2 - fixed

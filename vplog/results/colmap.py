@@ -148,10 +148,8 @@ def _intrinsics(camera: Camera) -> dict[str, Any]:
 def _write_ply(path: Path, images: PosedImages) -> None:
     """Points with their colours, little endian (Turk, The PLY polygon file format, 1994); far from the origin in
     doubles."""
-    number = "double" if se3.far_origin(images.world_from_camera).any() else "float"
-    kind = [(name, "<f8" if number == "double" else "<f4") for name in "xyz"] + [
-        (name, "u1") for name in ("red", "green", "blue")
-    ]
+    number, size = ("double", "<f8") if se3.far_origin(images.world_from_camera).any() else ("float", "<f4")
+    kind = [(name, size) for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
     rows = np.empty(len(images.rgb), kind)
     for at, name in enumerate("xyz"):
         rows[name] = images.structure.world[:, at]
