@@ -82,23 +82,18 @@ def ways_without_images(log: Log, topics: TopicChoice, keyframes: Keyframes, odo
     step_m = max(float(np.median(np.linalg.norm(np.diff(position, axis=0), axis=1))), _LEAST_SPACING_M)
     found = []
     for at in np.flatnonzero(np.diff(edges) > longest_ns).tolist():
-        inside = odometry.odom_from_body[
-            np.searchsorted(known, edges[at]) : np.searchsorted(known, edges[at + 1]), :3, 3
-        ]
+        begin, end = np.searchsorted(known, edges[at : at + 2])
+        inside = odometry.odom_from_body[begin:end, :3, 3]
         far_m = float(np.linalg.norm(inside - inside[:1], axis=1).max(initial=0.0))
         if far_m >= _BLIND_STEPS * step_m:
             found.append((far_m, (edges[at + 1] - edges[at]) / 1e9, (edges[at] - known[0]) / 1e9))
     if not found:
         return []
-    (far_m, seconds, since_s), more = (
-        max(found),
-        f", and {plural(len(found) - 1, 'time')} more" if len(found) > 1 else "",
-    )
-    further = (
-        "Further cameras count at its images alone: name one that has more of them first, with --image-topic."
-        if log.further_cameras()
-        else "Did the camera stop, or start late?"
-    )
+    far_m, seconds, since_s = max(found)
+    more = f", and {plural(len(found) - 1, 'time')} more" if len(found) > 1 else ""
+    further = "Did the camera stop, or start late?"
+    if log.further_cameras():
+        further = "Further cameras count at its images alone: name one that has more of them first, with --image-topic."
     return [
         f"{log.camera().name} has no images for {seconds:.0f} s, from {since_s:.0f} s of the odometry on{more}, while "
         f"the body moves on by {far_m:.3g} m: no place is recognised there. {further}"
