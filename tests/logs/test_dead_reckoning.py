@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -154,3 +154,41 @@ def test_slow_velocities_beside_a_gyroscope_that_starts_late_are_no_gaps(tmp_pat
     odometry = log.odometry()
     assert odometry is not None and not len(odometry.breaks)
     assert way_m(odometry) == pytest.approx(118, abs=0.5)
+
+
+NAN, TWIST = np.nan, (2.0, 0.0, 0.0, 0.0, 0.0, 0.1)
+"""m/s ahead, rad/s about z."""
+
+
+@pytest.mark.parametrize(
+    ("row", "values", "dropped"),
+    [
+        (0, (NAN, 0.0, 0.0, 0.0, 0.0, 0.1), "1 message"),
+        (slice(None), (2.0, 0.0, NAN, NAN, NAN, 0.1), ""),
+        (300, (2.0, 0.0, 0.0, 0.0, 0.0, 1e6), "1 message"),
+        (slice(300, 302), (1e8, 0.0, 0.0, 0.0, 0.0, 0.1), "2 messages"),
+    ],
+)
+def test_velocities_that_are_none_leave_the_others(row: Any, values: tuple, dropped: str, tmp_path: Path) -> None:
+    """A damaged message, and axes that a driver does not measure."""
+    from tests.logs.test_odometry_kinds import header, opened, topic
+
+    at_s, moving = np.arange(0, 30, 0.05), np.tile(TWIST, (600, 1))
+    moving[row] = values
+    fields = [
+        {"header": header(int(stamp), "base_link"),
+         "twist": {"linear": dict(zip("xyz", one[:3], strict=True)), "angular": dict(zip("xyz", one[3:], strict=True))}}
+        for stamp, one in zip(stamps(at_s), moving.tolist(), strict=True)
+    ]  # fmt: skip
+    log = opened(tmp_path, topic("/vel", "geometry_msgs/msg/TwistStamped", fields, stamps(at_s)))
+    odometry = log.odometry()
+    assert odometry is not None
+    turn = 0.1 * (at_s[-1] - at_s[0])
+    end = 20 * np.array([np.sin(turn), 1 - np.cos(turn), 0])
+    within = 0.3 if values[0] != values[0] else 0.02  # the first pose is the second message's
+    np.testing.assert_allclose(odometry.odom_from_body[-1, :3, 3], end, atol=within)
+    assert [line for line in log.warnings if "dropped" in line] == (
+        [f"/vel: {dropped} with a velocity that is not finite, or beyond 1000 m/s or 100 rad/s, dropped."]
+        if dropped
+        else []
+    )

@@ -64,6 +64,8 @@ _LEAST_PATH_M, _BENT, _TURNED = 10.0, 0.02, 1e-6
 """m of a path from which that counts; the part of squared steps off their main direction, as of directions that spread
 evenly over 30 degrees; and the change of a rotation's elements that is more than rounding."""
 _SPARSE, _STILL, _PLACED = "poses a second that differ", "never moves", "is placed in"
+_FASTEST = 1e3, 100.0
+"""m/s and rad/s; a velocity beyond either is damage: integrated, one alone turns or shifts all that follows."""
 _LEAST_FACTOR = 0.01
 """Least factor: nothing measured makes a source impossible where it is the only one."""
 
@@ -151,6 +153,14 @@ def _by_twists(
 ) -> Odometry | None:
     """Velocities (K, 12) added up, turned by the gyroscope where the log has one and says how it is mounted."""
     stamp_ns, rows = track.stamps.order(track.topic, notes)
+    size = np.linalg.norm(twists[rows, :6].reshape(-1, 2, 3), axis=2)
+    sound = np.isfinite(size).all(1) & (size <= _FASTEST).all(1)
+    if dropped := int((~sound).sum()):
+        notes.add(
+            f"{track.topic}: {plural(dropped, 'message')} with a velocity that is not finite, or beyond "
+            f"{_FASTEST[0]:.0f} m/s or {_FASTEST[1]:.0f} rad/s, dropped."
+        )
+    stamp_ns, rows = stamp_ns[sound], rows[sound]
     if len(rows) < 2:
         return None
     moving, variances = twists[rows, :6], twists[rows, 6:]

@@ -131,10 +131,12 @@ class PoseTrack:
     @property
     def twists(self) -> Floats | None:
         """(K, 12) velocities, linear in m/s, then angular in rad/s, and their variances; None where they are no whole,
-        or never change from zero."""
-        found = np.frombuffer(self._twists).reshape(-1, 12)
-        if 7 * len(found) != len(self._poses) or not np.isfinite(found[:, :6]).all() or not found[:, :6].any():
+        or never change from zero. Axes that are never finite are zero: drivers mark so what they do not measure."""
+        found = np.array(self._twists).reshape(-1, 12)
+        finite = np.isfinite(found[:, :6])
+        if 7 * len(found) != len(self._poses) or not found[:, :6][finite].any():
             return None
+        found[:, :6][:, ~finite.any(0)] = 0.0
         factors = np.repeat(self._geometry, 3)
         return found * np.concatenate([factors, factors**2])
 
