@@ -11,7 +11,11 @@ from scipy.spatial.transform import Rotation
 from tests.logs.drives import START_NS, Written, matrices, write_ros2
 from tests.logs.test_motion import image, pose_message, tf
 from vplog import logs
+from vplog.data import Odometry
 from vplog.logs import TopicChoice
+from vplog.logs.formats.container import Channel
+from vplog.logs.odometry_sources import score_source
+from vplog.logs.stamps import NONE
 from vplog.logs.tracks import PoseTrack
 from vplog.verbs.info import preflight
 
@@ -272,3 +276,24 @@ def test_each_source_is_converted_once(tmp_path: Path, monkeypatch: pytest.Monke
     assert log.odometry() is not None
     assert sorted(converted) == ["/a", "/b"]
     assert "carries no covariance" not in " ".join(log.warnings), "what is said of a source that is not taken"
+
+
+@pytest.mark.parametrize("request_it", [False, True])
+def test_two_publishers_of_one_topic_are_not_taken_silently(request_it: bool, tmp_path: Path) -> None:
+    """A filter and the controller of the wheels, of which each has drifted its own way; the other source is sound."""
+    away = matrices(np.tile([3.0, -4.0, 0.0], (COUNT, 1)), Rotation.identity(COUNT)) @ WALK
+    both = [*poses("/odom", ODOMETRY, WALK), *poses("/odom", ODOMETRY, away, STAMPS + PERIOD_NS // 3)]
+    path = drive(tmp_path / "both", both, poses("/pose", POSE, WALK))
+    log = logs.open(path, TopicChoice(odometry="/odom") if request_it else TopicChoice())
+    assert source(log) == ("/odom" if request_it else "/pose")
+    assert ("/odom goes back and forth; do two nodes publish it?" in " ".join(log.warnings)) == request_it
+    assert "goes back and forth" in " ".join(logs.open(drive(tmp_path / "alone", both)).info().warnings)
+
+
+@pytest.mark.parametrize(("speed_m_s", "noise_m", "hz"), [(0.0, 0.02, 20), (1.0, 0.02, 50), (30.0, 0.3, 20)])
+def test_noise_is_no_second_publisher(speed_m_s: float, noise_m: float, hz: int) -> None:
+    at_s = np.arange(0, 120, 1 / hz)
+    place = np.outer(at_s * speed_m_s, [1, 0, 0]) + np.random.default_rng(8).normal(0, noise_m, (len(at_s), 3))
+    one = Odometry((at_s * 1e9).astype(np.int64), matrices(place, Rotation.identity(len(at_s))), None)
+    found = score_source(Channel("/odom", "nav_msgs/Odometry", "cdr"), ["odom", "base_link"], one, one.stamp_ns, NONE)
+    assert not [what for what in found.evidence if "back and forth" in what]

@@ -121,6 +121,14 @@ def still_poses() -> Messages:
     return topic("/odom", "nav_msgs/msg/Odometry", stamped("odom", fields))
 
 
+def turning_poses() -> Messages:
+    """nav_msgs/Odometry whose driver fills in the velocities and the rotation of its IMU."""
+    turns = [pose(matrices(np.zeros((1, 3)), Rotation.from_rotvec([[0, 0, yaw]]))[0]) for yaw in YAW.tolist()]
+    fields = [{"child_frame_id": "base_link", "pose": {"pose": turned}, "twist": {"twist": twist}}
+              for turned, twist in zip(turns, TWISTS, strict=True)]  # fmt: skip
+    return topic("/odom", "nav_msgs/msg/Odometry", stamped("odom", fields))
+
+
 def twists(scale: float = 1.0) -> Messages:
     fields = [{"twist": velocities(*both)} for both in zip(SPEED, scale * TURN, strict=True)]
     return topic("/twist", "geometry_msgs/msg/TwistStamped", stamped("base_link", fields))
@@ -242,6 +250,7 @@ def kind_of(log: Log) -> str:
     ("write", "kind", "choice"),
     [
         (still_poses, "twist", {}),
+        (turning_poses, "twist", {}),
         (twists, "twist", {}),
         (twists_with_covariance, "twist", {}),
         (planar, "poses", {}),
@@ -393,7 +402,9 @@ def test_what_a_receiver_measures_has_no_heading(kind: str, gyro: bool, tmp_path
     assert "moves every way without turning" in " ".join(log.warnings)
     name = "/place" if kind == "positions" else "/vel"
     assert f"--odometry-topic {name} takes it" in " ".join(log.warnings)
-    assert opened(tmp_path, of_receiver(kind), *beside, odometry=name).odometry() is not None
+    log = opened(tmp_path, of_receiver(kind), *beside, odometry=name)
+    assert log.odometry() is not None
+    assert f"{name} moves every way without turning; " in " ".join(log.warnings)
 
 
 @pytest.mark.parametrize("kind", ["velocities", "positions"])
@@ -461,6 +472,12 @@ def test_fixes_that_stand_still_are_not_called_the_odometry(kind: str | None, tm
     assert (log.odometry() is None) == (kind == "gps")
     assert "The odometry is the fixes" not in said
     assert ("do not go far enough for a heading: they are no odometry" in said) == (kind == "gps")
+
+
+def test_what_only_turns_is_not_taken_silently(tmp_path: Path) -> None:
+    fields = [{"pose": pose(matrices(np.zeros((1, 3)), Rotation.from_rotvec([[0, 0, yaw]]))[0])} for yaw in YAW]
+    log = opened(tmp_path, topic("/pose", "geometry_msgs/msg/PoseStamped", stamped("odom", fields)))
+    assert "/pose turns, but never moves; did its estimator run?" in " ".join(log.info().warnings)
 
 
 def test_velocities_have_the_noise_that_they_claim(tmp_path: Path) -> None:

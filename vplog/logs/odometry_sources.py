@@ -64,10 +64,19 @@ _LEAST_PATH_M, _BENT, _TURNED = 10.0, 0.02, 1e-6
 """m of a path from which that counts; the part of squared steps off their main direction, as of directions that spread
 evenly over 30 degrees; and the change of a rotation's elements that is more than rounding."""
 _SPARSE, _STILL, _PLACED = "poses a second that differ", "never moves", "is placed in"
+_TURNS, _FORTH = "turns, but never moves", "goes back and forth"
+_STEP_M, _TIMES, _EXCESS_M = 0.2, 3.0, 10.0
+"""m of a step that is more than noise; and how many times, and m, the path of these is longer than that over poses a
+second apart where two nodes publish what has drifted apart."""
 _FASTEST = 1e3, 100.0
 """m/s and rad/s; a velocity beyond either is damage: integrated, one alone turns or shifts all that follows."""
 _LEAST_FACTOR = 0.01
 """Least factor: nothing measured makes a source impossible where it is the only one."""
+_DOUBTS = {
+    _STILL: "did its estimator run?", _TURNS: "did its estimator run?", _PLACED: "is it a part of the robot?",
+    _FORTH: "do two nodes publish it?", _HEADLESS: "is it a receiver's, which does not know where the body heads?",
+}  # fmt: skip
+"""What to ask where the evidence against the source that is taken begins so."""
 
 
 def score_source(
@@ -80,8 +89,8 @@ def score_source(
     seconds = (int(stamp_ns[-1]) - int(stamp_ns[0])) / 1e9
     rate_hz = moved / seconds if seconds > 0 else None
     coverage, jumps = _coverage(stamp_ns, camera_ns, span_ns), len(find_jumps(stamp_ns, poses))
-    path_m = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
-    camera_hz = _LEAST_HZ
+    step_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    path_m, camera_hz = float(step_m.sum()), _LEAST_HZ
     if len(camera_ns) > 1:
         camera_hz = (len(camera_ns) - 1) * 1e9 / int(camera_ns[-1] - camera_ns[0])
     evidence = _evidence_by_name(topic, kind, frames, source_kind)
@@ -93,6 +102,12 @@ def score_source(
         evidence[what] = max(math.sqrt(share), _LEAST_FACTOR)  # the root: a robot that mostly stands has odometry too
     if rate_hz is None:
         evidence["a single pose"] = _LEAST_FACTOR
+    if moved and path_m == 0:
+        evidence[_TURNS] = _LEAST_FACTOR
+    _, rows = np.unique((stamp_ns - stamp_ns[0]) // 10**9, return_index=True)
+    apart_m = float(np.linalg.norm(np.diff(poses[rows, :3, 3], axis=0), axis=1).sum())
+    if float(step_m[step_m > _STEP_M].sum()) > max(_TIMES * apart_m, apart_m + _EXCESS_M):
+        evidence[_FORTH] = _LEAST_FACTOR
     if source_kind not in ("gps", "truth") and path_m > _LEAST_PATH_M and _is_headless(poses, source_kind == "twist"):
         evidence[_HEADLESS] = _LEAST_FACTOR
     if jumps:
@@ -273,8 +288,7 @@ def _note_doubts(source: OdometrySource, requested: bool, has_images: bool, note
             "interpolated."
         )
     for what in source.evidence:
-        if what == _STILL or what.startswith(_PLACED):
-            doubt = "did its estimator run?" if what == _STILL else "is it a part of the robot?"
+        for doubt in (doubt for start, doubt in _DOUBTS.items() if what.startswith(start)):
             notes.add(f"{source.topic} {what}; {doubt}{'' if requested else ' No other source is better.'}")
     if not requested and _MAYBE_COMMANDED in source.evidence:
         notes.add(

@@ -142,9 +142,13 @@ class PoseTrack:
 
     @property
     def moves(self) -> bool:
-        """Whether the poses change."""
+        """Whether the poses change: the places, where linear velocities lie beside them, as a driver that measures no
+        poses may fill in the rotation of its IMU."""
         poses = np.frombuffer(self._poses).reshape(-1, 7)[self._given]
-        return bool((poses != poses[:1]).any())
+        change = (poses != poses[:1]).any(0)
+        if not change[:3].any() and (twists := self.twists) is not None and twists[:, :3].any():
+            return False
+        return bool(change.any())
 
     @property
     def _given(self) -> Bools:
