@@ -106,17 +106,31 @@ def test_a_gyroscope_agrees_with_the_turns_it_measures(seed: int) -> None:
     assert not gyro_agrees(*both, np.roll(gyro, 1000, axis=0))
 
 
+@pytest.mark.parametrize("first_m", [0.0, 30.0])
 @pytest.mark.parametrize("gap_s", [3.0, 5.0, 20.0])
-def test_an_estimator_that_starts_again_is_a_break(gap_s: float) -> None:
-    """However long the gap is, in which any jump might be a motion."""
+def test_an_estimator_that_starts_again_is_a_break(gap_s: float, first_m: float) -> None:
+    """However long the gap is, in which any jump might be a motion; from the first pose, or from zero."""
     at_s = np.concatenate([np.arange(0, 60, 0.05), np.arange(60 + gap_s, 120, 0.05)])
     poses = np.tile(np.eye(4), (len(at_s), 1, 1))
-    poses[:1200, 0, 3], poses[1200:, 0, 3] = at_s[:1200], at_s[1200:] - at_s[1200]
+    poses[:1200, 0, 3], poses[1200:, 0, 3] = first_m + at_s[:1200], at_s[1200:] - at_s[1200]
     found = without_jumps(Odometry(stamps(at_s), poses, None), "/odom", notes := Notes())
     assert found.breaks.tolist() == [1200]
     assert "starts again" in notes.lines[0]
     assert found.odom_from_body[1200, 0, 3] == pytest.approx(found.odom_from_body[1199, 0, 3])
     assert way_m(found) == pytest.approx(60 + 60 - gap_s, abs=0.2)
+
+
+@pytest.mark.parametrize("moving_s", [60.0, 3.0])
+@pytest.mark.parametrize("gap_s", [3.0, 10.0, 40.0])
+def test_a_drive_that_goes_on_through_a_gap_does_not_start_again(gap_s: float, moving_s: float) -> None:
+    """At 1 m/s, 60 s of it or but 3 s around the gap; at rest the poses shake by a millimetre."""
+    at_s = np.concatenate([np.arange(0, 60, 0.05), np.arange(60 + gap_s, 160, 0.05)])
+    poses = np.tile(np.eye(4), (len(at_s), 1, 1))
+    poses[:, :3, 3] = np.random.default_rng(9).normal(0, 1e-3, (len(at_s), 3))
+    poses[:, 0, 3] += at_s.clip(60 - moving_s / 2, 60 + gap_s + moving_s / 2)
+    found = without_jumps(Odometry(stamps(at_s), poses, None), "/odom", notes := Notes())
+    assert not len(found.breaks)
+    assert notes.lines == []
 
 
 def test_a_robot_that_comes_back_to_its_dock_does_not_start_again() -> None:

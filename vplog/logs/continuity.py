@@ -35,6 +35,8 @@ _SAME = 1e-3
 """m and rad; a pose that is as near the first one is that of an estimator that was started again,"""
 _AWAY_M = 0.5
 """m; unless it was no further from there just before."""
+_FASTEST = 0.99
+"""Quantile of the speed that a body moves at most in a gap, but for a factor: it may stand but for a while."""
 _NAMED = 4
 """Jumps that are named."""
 
@@ -70,8 +72,8 @@ def without_jumps(odometry: Odometry, what: str, notes: Notes) -> Odometry:
     if len(restarts):
         seconds = ", ".join(f"{(stamp_ns[row + 1] - stamp_ns[0]) / 1e9:.1f} s" for row in restarts[:_NAMED].tolist())
         notes.add(
-            f"{what}: it starts again from its first pose after a gap, at {seconds} (a node that was restarted?): only "
-            "closures and fixes relate what is before to what is behind."
+            f"{what}: it starts again from its first pose after a gap, or further off than it moves in the time, at "
+            f"{seconds} (a node that was restarted?): only closures and fixes relate what is before to what is behind."
         )
         poses = _extrapolated(stamp_ns, poses, restarts, held=True)
     starts_ns = np.union1d(stamp_ns[odometry.breaks], stamp_ns[restarts + 1])
@@ -93,12 +95,19 @@ def without_jumps(odometry: Odometry, what: str, notes: Notes) -> Odometry:
 
 
 def _restarts(stamp_ns: Ints, poses: Floats) -> Ints:
-    """Rows behind which, after a gap, the poses begin again at the first one: in so long any jump might be a motion."""
-    rows = np.flatnonzero(np.diff(stamp_ns) > longest_gap_ns(stamp_ns))
+    """Rows behind which, after a gap, the poses begin again at the first one, or further off than they ever move in
+    the time: in so long any jump might be a motion by what bodies can."""
+    seconds, step_m = np.diff(stamp_ns) / 1e9, np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    gap = np.diff(stamp_ns) > longest_gap_ns(stamp_ns)
+    rows = np.flatnonzero(gap)
     away = se3.between(poses[:1], poses)
     far_m, far_rad = np.linalg.norm(away[:, :3, 3], axis=1), se3.angle(away)
     same = (far_m < _SAME) & (far_rad < _SAME)
-    return rows[same[rows + 1] & (far_m[rows] > _AWAY_M)]
+    again = same[rows + 1] & (far_m[rows] > _AWAY_M)
+    if (~gap).sum() >= _LEAST:
+        fastest = float(np.quantile((step_m / seconds)[~gap], _FASTEST))
+        again |= step_m[rows] > np.maximum(_PERIODS * fastest * seconds[rows], _AWAY_M)
+    return rows[again]
 
 
 def _deviation(steps: Floats, seconds: Floats) -> Floats:
