@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from vplog.data import Odometry
+from vplog.data import Gps, Odometry
+from vplog.geometry.geodesy import geodetic
 from vplog.graph.noise import NoiseSettings, edge_covariance
 from vplog.logs.continuity import without_jumps
-from vplog.logs.dead_reckoning import dead_reckoned, gyro_agrees, turned_by_gyro
+from vplog.logs.dead_reckoning import dead_reckoned, gyro_agrees, odometry_of_fixes, turned_by_gyro
 from vplog.logs.formats.container import Notes
 
 if TYPE_CHECKING:
@@ -206,3 +207,25 @@ def test_velocities_that_are_none_leave_the_others(row: Any, values: tuple, drop
         if dropped
         else []
     )
+
+
+@pytest.mark.parametrize("pairs", [1, 298])
+@pytest.mark.parametrize("apart_s", [1e-3, 1e-5, 1e-6, 2e-7])
+def test_fixes_close_in_time_are_odometry(apart_s: float, pairs: int) -> None:
+    """A fix that a driver repeats at once, or the second of two receivers."""
+    at_s = np.arange(300.0)
+    enu = np.stack([10 * at_s, 50 * np.sin(at_s / 20), 0 * at_s], 1) + np.random.default_rng(3).normal(0, 1, (300, 3))
+    again = np.linspace(0, 299, pairs + 2)[1:-1].astype(int)
+    order = np.argsort(np.concatenate([at_s, at_s[again] + apart_s]), kind="stable")
+    stamp_ns = stamps(np.concatenate([at_s, at_s[again]])) + np.repeat([0, int(apart_s * 1e9)], [300, pairs])
+    places = geodetic(np.concatenate([enu, enu[again]])[order], (48.0, 11.0, 500.0)).T
+    covariance = np.tile(np.eye(3), (len(order), 1, 1))
+    alone, found = (
+        odometry_of_fixes(Gps(ns, *at, each))
+        for ns, at, each in (
+            (stamps(at_s), geodetic(enu, (48.0, 11.0, 500.0)).T, covariance[:300]),
+            (stamp_ns[order], places, covariance),
+        )
+    )
+    assert alone is not None and found is not None
+    assert way_m(found) == pytest.approx(way_m(alone), rel=0.02)

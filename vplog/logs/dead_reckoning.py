@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,10 @@ _LEAST_STANDING_S = 1.0
 """s of standing in all, from which the mean of a gyroscope is its bias rather than its noise."""
 _LEAST_FIXES = 5
 """Fixes that a smoothing spline is found for."""
+_TOGETHER, _USUAL = 0.01, 0.75
+"""Share of the time between fixes, by this quantile, within which they are of one moment, and the first is taken: the
+curvature between two grows with the inverse square of the time, beyond what numbers reach. Two receivers have half of
+their fixes close together."""
 _LEAST_WAY = 6.0
 """Sigmas that the fixes extend over at least: noise at rest does not."""
 _PERIOD_NS = 100_000_000
@@ -124,6 +129,11 @@ def odometry_of_fixes(gps: Gps) -> Odometry | None:
     Positions are smoothed, headings the directions of their motion, level. The covariance is that of an increment.
     """
     local = local_enu(gps)
+    if len(local) >= _LEAST_FIXES:
+        steps = np.diff(local.stamp_ns)
+        apart = np.append(True, steps > _TOGETHER * np.quantile(steps, _USUAL))
+        columns = ("stamp_ns", "enu_m", "covariance")
+        local = replace(local, **{name: getattr(local, name)[apart] for name in columns})
     variance = local.covariance[:, range(3), range(3)]
     known = np.isfinite(variance) & (variance > 0)
     variance = np.where(known, variance, np.array([1.0, 1.0, 4.0]) * RECEIVER_SIGMA_M**2)
