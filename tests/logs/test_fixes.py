@@ -90,6 +90,31 @@ def test_what_is_no_position_is_left_out_and_said(seed: int, case: tuple[dict[st
     assert says in said and ("5 " in said or "4 of 40 fixes left out: they repeat" in said)
 
 
+@given(seeds, st.sampled_from(["bursts", "one", "pairs", "same"]), st.booleans())
+def test_stamps_that_crowd_make_no_fix_unreachable(seed: int, how: str, wrong: bool) -> None:
+    """Log times of messages that came together, a stamp 1 ms behind its neighbour's, two receivers; 1 m of noise."""
+    rng = np.random.default_rng(seed)
+    at_s = np.arange(300.0)
+    if how == "bursts":
+        for row in (40, 90, 150, 200, 260):
+            at_s[row - 2 : row] = at_s[row] - [0.002, 0.001]
+    elif how == "pairs":
+        at_s[1::2] = at_s[::2] + 0.01
+    else:
+        at_s[150] = at_s[149] + (1e-3 if how == "one" else 1e-7)
+    north_m = (
+        10.0 * np.arange(300) + rng.normal(0, 1, 300) + 3000.0 * wrong * np.isin(np.arange(300), [70, 71, 72, 180])
+    )
+    fixes = [
+        FixMessage(START_NS + int(round(second * 1e9)), True, 48 + north / DEGREE_M, 11.0, 500.0, np.eye(3), "gps")
+        for second, north in zip(at_s.tolist(), north_m.tolist(), strict=True)
+    ]
+    gps, _ = track(fixes)
+    assert gps is not None
+    left_out = ~np.isin([fix.stamp_ns for fix in fixes], gps.stamp_ns)
+    assert np.flatnonzero(left_out).tolist() == ([70, 71, 72, 180] if wrong else [])
+
+
 @given(seeds, st.floats(0.1, 0.4))
 def test_fixes_that_jump_at_random_are_left_out(seed: int, share: float) -> None:
     """Up to 40 %, by 11 km and more: those that no neighbour confirms are not taken for being in reach."""

@@ -38,6 +38,8 @@ _TIMES_USUAL = 10.0
 _TIMES_HIGH = 2.0
 """times the speed that nine of ten fixes that confirm each other do not exceed, up to which one that jumps off its
 neighbours is reached from those beyond; and times the way between nine of ten, beyond which one was held back."""
+_USUAL = 0.75
+"""Quantile of the time between fixes that no two are taken to be closer than: of two receivers half are closer."""
 
 
 class PoseTrack:
@@ -318,9 +320,11 @@ def _frozen(gps: Gps) -> Bools:
 def _unreachable(gps: Gps) -> Bools:
     """(T,) bool: all but the fixes of the longest run without a jump, of those from where it can be reached, and those
     that no neighbour confirms where they lie on the way between such runs."""
-    place, seconds = local_enu(gps).enu_m, gps.stamp_ns / 1e9
+    place, steps = local_enu(gps).enu_m, np.diff(gps.stamp_ns) / 1e9
     if len(place) < 2:
         return np.zeros(len(place), bool)
+    # stamps crowd, as log times of messages that came together, and of two receivers: by them all would be fast
+    seconds = np.append(0.0, np.cumsum(np.maximum(steps, np.quantile(steps, _USUAL))))
     speed = np.linalg.norm(np.diff(place, axis=0), axis=1) / np.diff(seconds)
     fastest = max(_FASTEST_M_S, _TIMES_USUAL * _usual_speed_m_s(place, seconds))
     bounds = [0, *(np.flatnonzero(speed > fastest) + 1).tolist(), len(place)]
