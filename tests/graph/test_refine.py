@@ -170,13 +170,23 @@ def test_a_jump_that_lasts_is_left_out_whole() -> None:
     assert not solved.refined.inlier[~drawn.fix_sound].any()
 
 
-@pytest.mark.parametrize("covariance", [np.nan, 0.0, -1.0], ids=["nan", "zero", "negative"])
-def test_unknown_covariance_is_assumed_and_said(covariance: float) -> None:
+@pytest.mark.parametrize(
+    ("covariance", "variances"),
+    [
+        (np.nan, [9.0, 9.0, 36.0]),
+        (0.0, [9.0, 9.0, 36.0]),
+        (-1.0, [9.0, 9.0, 36.0]),
+        (np.diag([1.0, 4.0, 0.0]), [1.0, 4.0, 36.0]),
+        (np.array([[0.0, 0.5, 0.0], [0.5, 4.0, 0.0], [0.0, 0.0, 9.0]]), [9.0, 4.0, 9.0]),
+    ],
+    ids=["nan", "zero", "negative", "2d", "no_east"],
+)
+def test_unknown_covariance_is_assumed_and_said(covariance: float | Floats, variances: list[float]) -> None:
     drive = ring(60, 5)
     gps = satellites(drive)
-    gps = replace(gps, covariance=np.full((60, 3, 3), covariance))
+    gps = replace(gps, covariance=np.tile(np.broadcast_to(covariance, (3, 3)), (60, 1, 1)))
     fixes = fixes_on(gps, drive.odometry, drive.keyframes, GpsSettings())
-    np.testing.assert_allclose(fixes.covariance, np.broadcast_to(np.diag([9.0, 9.0, 36.0]), (60, 3, 3)))
+    np.testing.assert_allclose(fixes.covariance, np.broadcast_to(np.diag(variances), (60, 3, 3)))
     assert any("60 of 60 GPS fixes have no usable covariance" in warning for warning in fixes.warnings)
 
 

@@ -106,7 +106,7 @@ def test_stamps_that_crowd_make_no_fix_unreachable(seed: int, how: str, wrong: b
         10.0 * np.arange(300) + rng.normal(0, 1, 300) + 3000.0 * wrong * np.isin(np.arange(300), [70, 71, 72, 180])
     )
     fixes = [
-        FixMessage(START_NS + int(round(second * 1e9)), True, 48 + north / DEGREE_M, 11.0, 500.0, np.eye(3), "gps")
+        FixMessage(START_NS + round(second * 1e9), True, 48 + north / DEGREE_M, 11.0, 500.0, np.eye(3), "gps")
         for second, north in zip(at_s.tolist(), north_m.tolist(), strict=True)
     ]
     gps, _ = track(fixes)

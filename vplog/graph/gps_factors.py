@@ -25,8 +25,6 @@ from vplog.settings import Settings
 NO_FIXES = "The log has no GPS fixes to use. `vplog info` lists the topics; run without --gps."
 _LEAST = 3
 """Fixes that fix where a graph is and how it is turned."""
-
-
 _VERTICAL_SIGMA = 0.1
 """rad; how far a body's vertical is from the plumb line, the mean over a drive: vehicles within some 3 degrees, what is
 held or mounted askew within some 10. It tells the turn about a straight road, which fixes leave open, and little beside
@@ -131,7 +129,8 @@ def fixes_on(gps: Gps | None, odometry: Odometry, keyframes: Keyframes, settings
     covariance, unknown = _usable(local.covariance[inside][near], settings)
     if unknown:
         warnings.append(
-            f"{unknown} of {len(row)} GPS fixes have no usable covariance; {settings.unknown_sigma_m:g} m is assumed."
+            f"{unknown} of {len(row)} GPS fixes have no usable covariance, or a variance of 0 on an axis; "
+            f"{settings.unknown_sigma_m:g} m is assumed there."
         )
     alike = np.bincount(row, minlength=len(keys))[row]
     return Fixes(
@@ -147,15 +146,17 @@ def fixes_on(gps: Gps | None, odometry: Odometry, keyframes: Keyframes, settings
 
 
 def _usable(covariance: Floats, settings: GpsSettings) -> tuple[Floats, int]:
-    """(F, 3, 3) positive definite, and how many were none and are assumed."""
+    """(F, 3, 3) positive definite, and how many are assumed, whole or on an axis: 2D receivers write 0 for altitude."""
+    assumed = np.diag(np.array([1.0, 1.0, 4.0]) * settings.unknown_sigma_m**2)
     finite: Bools = np.asarray(np.isfinite(covariance).all((1, 2)))
     symmetric = np.where(finite[:, None, None], (covariance + np.swapaxes(covariance, 1, 2)) / 2, np.eye(3))
+    missing = np.diagonal(symmetric, axis1=1, axis2=2) == 0
+    symmetric = np.where(missing[:, :, None] | missing[:, None, :], assumed, symmetric)
     values, vectors = np.linalg.eigh(symmetric)
-    sound = finite & (values[:, 0] >= 0) & (values[:, -1] > 0)
+    sound = finite & (values[:, 0] >= 0)
     values = np.maximum(values, settings.least_sigma_m**2)
     fixed = (vectors * values[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-    assumed = np.diag(np.array([1.0, 1.0, 4.0]) * settings.unknown_sigma_m**2)
-    return np.where(sound[:, None, None], fixed, assumed), int((~sound).sum())
+    return np.where(sound[:, None, None], fixed, assumed), int((~sound | missing.any(1)).sum())
 
 
 def _up(poses: Floats) -> Floats:
