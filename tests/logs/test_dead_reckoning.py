@@ -96,7 +96,7 @@ def test_a_gyroscope_agrees_with_the_turns_it_measures(seed: int) -> None:
 
     gyro = rng.normal([0, 0, 0.02], 0.1, (len(gyro_s), 3))
     gyro[:, 2] += rate(gyro_s)
-    turning = ahead(len(wheels_s), 1.0, rate(wheels_s) + rng.normal(0, 0.02, len(wheels_s)))[:, 3:]
+    turning = ahead(len(wheels_s), 1.0, rate(wheels_s) + rng.normal(0, 0.02, len(wheels_s)))
     both = stamps(wheels_s), turning, stamps(gyro_s)
     assert gyro_agrees(*both, gyro)
     assert gyro_agrees(*both[:1], 2 * turning, both[2], gyro)
@@ -105,6 +105,55 @@ def test_a_gyroscope_agrees_with_the_turns_it_measures(seed: int) -> None:
     assert not gyro_agrees(*both, np.degrees(gyro))
     assert not gyro_agrees(*both, -gyro)
     assert not gyro_agrees(*both, np.roll(gyro, 1000, axis=0))
+
+
+@pytest.mark.parametrize("axes", [[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [57.3, 57.3, 57.3], [0.0, 0.0, 0.0]])
+@pytest.mark.parametrize("turns", [True, False])
+def test_a_steady_turn_and_a_speed_alone_tell_a_gyroscope_that_cannot_be(turns: bool, axes: list[float]) -> None:
+    """Upside down or in degrees; but wheels of two sizes turn a straight drive, and a gyroscope does not."""
+    gyro_s, wheels_s = np.arange(0, 60, 0.01), np.arange(0, 60, 0.05)
+    gyro = np.random.default_rng(7).normal([0.01, 0, 0.21], 0.05, (len(gyro_s), 3)) * axes
+    moving = ahead(len(wheels_s), 10.0, 0.2 * turns)
+    impossible = axes[0] > 1 or (turns and axes[2] < 0)
+    assert gyro_agrees(stamps(wheels_s), moving, stamps(gyro_s), gyro) is not impossible
+
+
+def test_turns_on_the_spot_are_no_bias_where_wheels_tell_a_speed_alone() -> None:
+    gyro_s, wheels_s = np.arange(0, 60, 0.01), np.arange(0, 60, 0.05)
+    gyro = np.where(gyro_s < 10, 0.5, 0.1)[:, None] * [0.0, 0.0, 1.0]
+    moving = ahead(len(wheels_s), 1.0)
+    moving[wheels_s < 10, 0] = 0.0
+    found = turned_by_gyro(stamps(wheels_s), moving, stamps(gyro_s), gyro)
+    assert found[2] is None
+    np.testing.assert_allclose(found[1][[100, -100], 5], [0.5, 0.1])
+    moving[wheels_s > 20, 5] = 0.1  # that wheels tell turns makes it one
+    assert turned_by_gyro(stamps(wheels_s), moving, stamps(gyro_s), gyro)[2] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("turns", [True, False])
+@pytest.mark.parametrize(("accel", "upside_down"), [(9.8, False), (-9.8, True), (-9.8, False)])
+def test_an_imu_that_hangs_turns_the_other_way(accel: float, upside_down: bool, turns: bool, tmp_path: Path) -> None:
+    """Or is forward-right-down: without a transform gravity tells, but for the turns of wheels."""
+    from tests.logs.test_odometry_kinds import header, opened, topic, velocities
+
+    at_s, gyro_s = np.arange(0, 60, 0.05), np.arange(0, 60, 0.02)
+    rate = 0.2 * np.sin(gyro_s / 5)
+    wheels = [{"header": header(int(one), "base_link"), "twist": velocities(2.0, turns * 0.2 * np.sin(second / 5))}
+              for one, second in zip(stamps(at_s), at_s.tolist(), strict=True)]  # fmt: skip
+    rate = -rate if upside_down else rate
+    imu = [{"header": header(int(one), "imu"), "angular_velocity": {"z": turn}, "linear_acceleration": {"z": accel}}
+           for one, turn in zip(stamps(gyro_s), rate.tolist(), strict=True)]  # fmt: skip
+    log = opened(
+        tmp_path, topic("/twist", "geometry_msgs/msg/TwistStamped", wheels, stamps(at_s)),
+        topic("/imu", "sensor_msgs/msg/Imu", imu, stamps(gyro_s)),
+    )  # fmt: skip
+    odometry, hangs = log.odometry(), upside_down or (accel < 0 and not turns)
+    assert odometry is not None
+    yaw = np.unwrap(np.arctan2(odometry.odom_from_body[:, 1, 0], odometry.odom_from_body[:, 0, 0]))
+    assert np.ptp(yaw) == pytest.approx(2.0, abs=0.02)
+    assert (yaw.max() > 1.9) == (hangs == upside_down)
+    assert "turns by the gyroscope" in " ".join(log.warnings)
+    assert ("it is taken to have z down" in " ".join(log.warnings)) is hangs
 
 
 @pytest.mark.parametrize("first_m", [0.0, 30.0])
@@ -216,16 +265,14 @@ def test_fixes_close_in_time_are_odometry(apart_s: float, pairs: int) -> None:
     at_s = np.arange(300.0)
     enu = np.stack([10 * at_s, 50 * np.sin(at_s / 20), 0 * at_s], 1) + np.random.default_rng(3).normal(0, 1, (300, 3))
     again = np.linspace(0, 299, pairs + 2)[1:-1].astype(int)
-    order = np.argsort(np.concatenate([at_s, at_s[again] + apart_s]), kind="stable")
     stamp_ns = stamps(np.concatenate([at_s, at_s[again]])) + np.repeat([0, int(apart_s * 1e9)], [300, pairs])
-    places = geodetic(np.concatenate([enu, enu[again]])[order], (48.0, 11.0, 500.0)).T
-    covariance = np.tile(np.eye(3), (len(order), 1, 1))
-    alone, found = (
-        odometry_of_fixes(Gps(ns, *at, each))
-        for ns, at, each in (
-            (stamps(at_s), geodetic(enu, (48.0, 11.0, 500.0)).T, covariance[:300]),
-            (stamp_ns[order], places, covariance),
-        )
-    )
+    order = np.argsort(stamp_ns, kind="stable")
+
+    def fixes(stamp_ns: np.ndarray, enu: np.ndarray) -> Gps:
+        latitude, longitude, altitude = geodetic(enu, (48.0, 11.0, 500.0)).T
+        return Gps(stamp_ns, latitude, longitude, altitude, np.tile(np.eye(3), (len(enu), 1, 1)))
+
+    alone = odometry_of_fixes(fixes(stamps(at_s), enu))
+    found = odometry_of_fixes(fixes(stamp_ns[order], np.concatenate([enu, enu[again]])[order]))
     assert alone is not None and found is not None
     assert way_m(found) == pytest.approx(way_m(alone), rel=0.02)

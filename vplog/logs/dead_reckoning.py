@@ -21,6 +21,10 @@ _SCALES = 0.2, 5.0
 """Its turns by those of the wheels: skid steering turns half as far as wheels tell; degrees are 57 times radians."""
 _STANDING_M_S, _STANDING_RAD_S = 0.01, 0.02
 """m/s and rad/s; below both a vehicle stands: wheels resolve some mm/s, and a gyroscope's bias is below a degree/s."""
+_SIDEWAYS_M_S2 = 30.0
+"""m/s^2; speed times turn rate beyond what any vehicle bears for long: rates in degrees per second."""
+_BIAS_RAD_S = 0.05
+"""rad/s; where wheels tell a speed alone, what turns faster at no speed turns on the spot."""
 _LEAST_STANDING_S = 1.0
 """s of standing in all, from which the mean of a gyroscope is its bias rather than its noise."""
 _LEAST_FIXES = 5
@@ -71,22 +75,27 @@ def dead_reckoned(stamp_ns: Ints, twists: Floats, variances: Floats, longest_ns:
     return Odometry(stamp_ns, poses, covariance, breaks=breaks, increments=True)
 
 
-def gyro_agrees(stamp_ns: Ints, turning: Floats, gyro_ns: Ints, gyro: Floats) -> bool:
-    """Whether rates (K, 3) of a gyroscope are those of the body's turns (T, 3), rad/s in its axes, but for a scale of
-    wheels that slip; where the body does not turn, nothing contradicts them."""
+def gyro_agrees(stamp_ns: Ints, twists: Floats, gyro_ns: Ints, gyro: Floats) -> bool:
+    """Whether rates (K, 3) of a gyroscope are those of the body's velocities (T, 6), rad/s in its axes, but for a scale
+    of wheels that slip; where the body does not turn, nothing contradicts them but a turn that no body bears."""
     since = stamp_ns[0]
     angle = scipy.integrate.cumulative_trapezoid(gyro, (gyro_ns - since) / 1e9, axis=0, initial=0.0)
     inside = (stamp_ns >= gyro_ns[0]) & (stamp_ns <= gyro_ns[-1])
     if inside.sum() < 2:
         return True
-    at_ns, turning = stamp_ns[inside], turning[inside]
+    at_ns, twists = stamp_ns[inside], twists[inside]
     seconds = np.diff(at_ns)[:, None] / 1e9
     turned = np.stack([np.interp(at_ns - since, gyro_ns - since, column) for column in angle.T], axis=1)
-    measured, turning = np.diff(turned, axis=0) / seconds, (turning[1:] + turning[:-1]) / 2
+    measured, moving = np.diff(turned, axis=0) / seconds, (twists[1:] + twists[:-1]) / 2
+    sideways = np.linalg.norm(moving[:, :3], axis=1) * np.linalg.norm(measured, axis=1)
+    if np.quantile(sideways, 0.99) > _SIDEWAYS_M_S2:
+        return False
+    turning = moving[:, 3:]
+    steady = float((measured * turning).sum() / max((turning**2).sum(), len(turning) * _STANDING_RAD_S**2))
     measured, turning = measured - np.median(measured, axis=0), turning - np.median(turning, axis=0)
     axes = np.sqrt((turning**2).mean(0)) > _STANDING_RAD_S
-    if not axes.any():
-        return True
+    if not axes.any():  # less than a fifth may be right: wheels of two sizes turn a straight drive
+        return -_SCALES[0] < steady < _SCALES[1]
     measured, turning = measured[:, axes], turning[:, axes]
     common, own = float((measured * turning).sum()), float((turning**2).sum())
     return _SCALES[0] < common / own < _SCALES[1] and common**2 > _AGREES * own * float((measured**2).sum())
@@ -113,6 +122,8 @@ def turned_by_gyro(stamp_ns: Ints, twists: Floats, gyro_ns: Ints, gyro: Floats) 
     standing &= measured
     seconds = float(np.diff(at_ns)[standing[1:] & standing[:-1]].sum()) / 1e9
     bias = np.median(rates[standing], axis=0) if seconds >= _LEAST_STANDING_S else None
+    if bias is not None and not twists[:, 3:].any() and np.linalg.norm(bias) > _BIAS_RAD_S:
+        bias = None
     turning = np.where(measured[:, None], rates - (0.0 if bias is None else bias), turning)
     return at_ns, np.concatenate([linear, turning], axis=1), None if bias is None else float(np.linalg.norm(bias))
 

@@ -68,6 +68,8 @@ _TURNS, _FORTH = "turns, but never moves", "goes back and forth"
 _STEP_M, _TIMES, _EXCESS_M = 0.2, 3.0, 10.0
 """m of a step that is more than noise; and how many times, and m, the path of these is longer than that over poses a
 second apart where two nodes publish what has drifted apart."""
+_HANGS_M_S2 = -5.0
+"""m/s^2 along the z of an IMU, below which gravity tells that it hangs upside down, or is forward-right-down."""
 _FASTEST = 1e3, 100.0
 """m/s and rad/s; a velocity beyond either is damage: integrated, one alone turns or shifts all that follows."""
 _LEAST_FACTOR = 0.01
@@ -187,11 +189,15 @@ def _by_twists(
     if inside.sum() < len(rows):
         notes.add(f"{text}.")
         return _dead_reckoned(stamp_ns, moving, variances, longest_gap_ns(stamp_ns), track.topic, notes)
-    if placed is None and frame_name(read.imu.frame) not in ("", track.child, "base_link"):
-        notes.add(f"{read.imu.topic}: its frame has no static transform; it is taken to be mounted as the body is.")
-    body_from_imu = np.eye(4) if placed is None else placed
-    gyro = measured[:, :3] @ body_from_imu[:3, :3].T
-    if not gyro_agrees(stamp_ns, moving[:, 3:], gyro_ns, gyro):
+    turns = [measured[:, :3] @ (np.eye(4) if placed is None else placed)[:3, :3].T]
+    if placed is None and np.median(measured[:, 5]) < _HANGS_M_S2:
+        turns.insert(0, measured[:, :3] * [1.0, -1.0, -1.0])
+    gyro = next((one for one in turns if gyro_agrees(stamp_ns, moving, gyro_ns, one)), None)
+    hangs = gyro is not None and gyro is not turns[-1]
+    if hangs or (placed is None and frame_name(read.imu.frame) not in ("", track.child, "base_link")):
+        how = "have z down, as gravity tells" if hangs else "be mounted as the body is"
+        notes.add(f"{read.imu.topic}: its frame has no static transform; it is taken to {how}.")
+    if gyro is None:
         notes.add(
             f"{text}; the gyroscope of {read.imu.topic} is not used, as its turns are not those of the velocities: "
             "its mount (static transform), its unit or its clock is another's."
