@@ -112,14 +112,32 @@ def test_few_messages_with_one_stamp_have_a_clock_that_stands(messages: int, kep
     [
         (lambda true: np.where(np.arange(len(true)) % 3 == 0, true, 0), "has no header stamps"),
         (lambda true: np.full(len(true), true[0]), "has header stamps that do not advance"),
+        (lambda true: true // SECOND * SECOND + true % SECOND // 1000, "has header stamps in whole seconds"),
+        (lambda true: true // SECOND * SECOND + true % SECOND // 10**6, "has header stamps in whole seconds"),
+        (lambda true: true // 1000, "has header stamps in another unit than ns"),
+        (lambda true: true[0] + (true - true[0]) // 1000, "has header stamps in another unit than ns"),
         (lambda true: true + 50 * SECOND * (np.arange(len(true)) // 10) ** 2, "has header stamps that follow no clock"),
     ],
 )
 def test_stamps_that_are_none_give_way_to_the_log_times(header: object, said: str) -> None:
     true_ns, log_ns = times(300)
-    stamp_ns, _ = stamps(header(true_ns), log_ns).order("/t", notes := Notes())  # type: ignore[operator]
+    topic, other = stamps(header(true_ns), log_ns), stamps(true_ns[::2], log_ns[::2])  # type: ignore[operator]
+    set_common_clock([topic, other])
+    stamp_ns, _ = topic.order("/t", notes := Notes())
     np.testing.assert_array_equal(stamp_ns, log_ns)
     assert said in notes.lines[0]
+    np.testing.assert_array_equal(other.order("/other", notes := Notes())[0], true_ns[::2])
+    assert notes.lines == []
+
+
+@pytest.mark.parametrize("rate", [0.05, 0.3, 20.0])
+def test_a_simulation_keeps_its_stamps(rate: float) -> None:
+    """Slow or fast, and of transforms that come in bursts with one stamp."""
+    true_ns, log_ns = times(300)
+    header_ns = ((true_ns - START_NS) * rate).astype(np.int64) + SECOND
+    np.testing.assert_array_equal(stamps(header_ns, log_ns).order("/t", Notes())[0], header_ns)
+    bursts, at_ns = np.repeat(header_ns, 3), (log_ns[:, None] + [0, 20_000, 40_000]).ravel()
+    np.testing.assert_array_equal(stamps(bursts, at_ns).order("/t", Notes())[0], header_ns)
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.2, 3.0), st.booleans())
@@ -166,7 +184,7 @@ def test_topics_end_on_the_clock_that_most_messages_are_on() -> None:
 
 def test_a_topic_on_another_clock_is_moved_where_it_fits_nowhere_and_told_of_where_it_may_be_right() -> None:
     true_ns, log_ns = times(100)
-    for offset, moved in ((-1_000_000 * SECOND, True), (5 * SECOND, False)):
+    for offset, moved in ((-1_000_000 * SECOND, True), (-5 * SECOND, False), (18 * SECOND, True)):
         camera, odometry = stamps(true_ns, log_ns), stamps(true_ns[::2] + offset, log_ns[::2])
         set_common_clock([camera, odometry])
         camera.order("/camera", quiet := Notes())

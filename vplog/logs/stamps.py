@@ -31,6 +31,10 @@ _LAST_NS = 2**63 - 1
 _SECOND_NS = 10**9
 _COARSE_NS = 3 * 10**8
 """ns by which the delay of stamps in whole seconds varies at least where they are not taken on the second."""
+_UNITS_OF_S = 10**6
+"""ms or us are fewer than these in a second."""
+_TIMES_SLOWER = 50
+"""Times that log times advance faster than stamps in another unit do; simulations run at a tenth of the time."""
 _STANDING = 10
 """A topic whose stamps have fewer values than a tenth of its messages has a clock that stands."""
 _REPEATS = 3
@@ -94,10 +98,9 @@ class Stamps:
         if self._found is None or self._found[0] != len(self.log_ns):
             header_ns, log_ns = np.array(self.header_ns, np.int64), np.array(self.log_ns, np.int64)
             stamped = _stamped(header_ns, log_ns)
-            self._found = (
-                len(self.log_ns),
-                align_clock(header_ns[stamped], log_ns[stamped]) if stamped.any() else None,
-            )
+            header_ns, log_ns = header_ns[stamped], log_ns[stamped]
+            none = not len(log_ns) or _no_clock(header_ns, log_ns)
+            self._found = len(self.log_ns), None if none else align_clock(header_ns, log_ns)
         return self._found[1]
 
     def order(self, topic: str, notes: Notes) -> tuple[Ints, Ints]:
@@ -169,8 +172,14 @@ def _no_clock(header_ns: Ints, log_ns: Ints) -> str:
         return "has header stamps that run backwards"
     late_ns = log_ns - header_ns  # whole seconds are later by up to one; a receiver's on the second, by as much always
     spread_ns = float(np.subtract(*np.quantile(late_ns, (0.9, 0.1))))
-    if len(steps) >= _STANDING and not (header_ns % _SECOND_NS).any() and _COARSE_NS < spread_ns < _SECOND_NS:
+    coarse = (header_ns % _SECOND_NS < _UNITS_OF_S).all()  # or with ms or us where ns belong
+    if len(steps) >= _STANDING and coarse and _COARSE_NS < spread_ns < _SECOND_NS:
         return "has header stamps in whole seconds"
+    ahead, log_ahead = (one[one > 0].astype(np.float64) for one in (steps, np.diff(np.sort(log_ns))))
+    if min(len(ahead), len(log_ahead)) >= _STANDING and all(
+        _TIMES_SLOWER * of(ahead) < of(log_ahead) for of in (np.sum, np.median)
+    ):
+        return "has header stamps in another unit than ns"
     return ""
 
 
@@ -195,13 +204,14 @@ def set_common_clock(topics: Iterable[Stamps], shared: Iterable[Stamps] = ()) ->
 
 
 def _on_common(stamp_ns: Ints, offset_ns: int, common: Clock | None, topic: str, notes: Notes) -> Ints:
-    """Stamps of another clock than the common one moved to it by the log times, where they cover no time of it; where
-    they do, they may be right and only recorded late."""
+    """Stamps of another clock than the common one moved to it by the log times, where they cover no time of it, or are
+    those of a future; else they may be right and only recorded late."""
     if common is None or not len(stamp_ns) or abs(offset_ns - common.offset_ns) <= LATE_NS:
         return stamp_ns
     shift = offset_ns - common.offset_ns
     first_ns, last_ns = int(stamp_ns.min()), int(stamp_ns.max())
     apart = first_ns > common.last_ns or last_ns < common.first_ns
+    apart |= offset_ns < -LATE_NS and abs(common.offset_ns) <= LATE_NS  # GPS time: nothing is recorded before its time
     if not apart or first_ns + shift < 0 or last_ns + shift > _LAST_NS:
         notes.add(
             f"{topic}: by the log times, the header stamps are {abs(shift) / 1e9:.1f} s "
