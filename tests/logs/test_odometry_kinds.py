@@ -268,6 +268,15 @@ def test_every_kind_of_message_becomes_the_drive(write: Any, kind: str, choice: 
     assert kind_of(log) == kind
 
 
+def test_a_stamp_of_px4_beyond_the_range_is_a_bad_message(tmp_path: Path) -> None:
+    messages = px4()
+    name, kind, encoding, log_ns, data = messages[300]
+    messages[300] = name, kind, encoding, log_ns, data[:4] + b"\xff" * 8 + data[12:]
+    log = opened(tmp_path, messages)
+    check(log, 0.05, 0.01)
+    assert "1 message" in " ".join(log.warnings)
+
+
 def test_wheels_without_their_measures_are_no_odometry_and_name_them(tmp_path: Path) -> None:
     log = opened(tmp_path, ackermann())
     assert log.odometry() is None

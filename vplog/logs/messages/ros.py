@@ -244,8 +244,8 @@ def _px4(fields: _Fields) -> Record:
     turn = world @ se3.rotation(numbers[[4, 5, 6, 3]]) @ _FLU_FROM_FRD
     variances[:3] = np.abs(world) @ variances[:3]
     return PoseMessage(
-        micros * 1000, "odom", "base_link", (world @ numbers[:3]).tolist(), se3.quaternion(turn).tolist(),
-        np.diag(variances).ravel().tolist(),
+        nanoseconds(*divmod(micros * 1000, 10**9)), "odom", "base_link", (world @ numbers[:3]).tolist(),
+        se3.quaternion(turn).tolist(), np.diag(variances).ravel().tolist(),
     )  # fmt: skip
 
 
