@@ -233,3 +233,13 @@ def test_a_lidar_at_less_than_a_hertz_is_registered() -> None:
     found = lidar_odometry(slow, range_of(scans()[::5]), Lidar("/points", stamps, BODY_FROM_LIDAR))
     assert found is not None and not len(found.breaks)
     assert len(found.stamp_ns) > 0.9 * SCANS
+
+
+@needs_kiss_icp
+def test_times_of_points_that_are_shares_of_a_turn_do_not_move_the_scan() -> None:
+    """0 to 1, which might be seconds but for the period."""
+    shares = [replace(scan, seconds=scan.seconds / PERIOD_S) for scan in scans()[:4] if scan.seconds is not None]
+    stamps = np.array([scan.stamp_ns for scan in shares])
+    found = lidar_odometry(shares, range_of(scans()[::5]), Lidar("/points", stamps, BODY_FROM_LIDAR))
+    assert found is not None
+    np.testing.assert_array_equal(found.stamp_ns, stamps)

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 _FARTHEST_M = 100.0
 """m; KISS-ICP's largest range, whose hundredth is the side of its voxels."""
+_LONGEST_TURN = 1.5
+"""Periods that the times of a scan's points span at most."""
 _RANGES = 3.0, 0.95
 """Times the range that this share of the points is within: KISS-ICP's 100 m outdoors, 20 m in a room of 7 m, where
 voxels of 1 m would leave nothing of it."""
@@ -72,6 +74,8 @@ class _Tracker:
     range_m: float
     patience_ns: int
     """Scans that match nothing are passed over for so long; then, as after a gap as long, the next piece begins."""
+    longest_s: float
+    """Times of points that span as much are shares of a turn or of another unit, and tell their order alone."""
     stamp_ns: list[int] = field(default_factory=list)
     pose: list[Floats] = field(default_factory=list)
     covariance: list[Floats] = field(default_factory=list)
@@ -90,7 +94,8 @@ class _Tracker:
     def add(self, scan: Scan) -> None:
         """Take the next scan."""
         seconds = np.zeros(0) if scan.seconds is None else scan.seconds
-        end_ns = scan.stamp_ns + round(float(seconds.max(initial=-np.inf if len(seconds) else 0.0)) * 1e9)
+        late_s = float(seconds.max()) if len(seconds) and np.ptp(seconds) < self.longest_s else 0.0
+        end_ns = scan.stamp_ns + round(late_s * 1e9)
         since_ns = end_ns - self.stamp_ns[-1] if self.stamp_ns else 0
         if len(scan.points) < _LEAST or (self.stamp_ns and since_ns <= 0):
             return
@@ -158,7 +163,9 @@ def lidar_odometry(scans: Iterable[Scan], range_m: float, lidar: Lidar) -> Odome
     """The motion of the body by the scans of a lidar up to a range; None where fewer than two have a pose. Scans that
     match nothing have none. The covariance is that of each scan's motion since the one before it. Stamps are those of
     the last points. Raises LogError where kiss-icp is not installed."""
-    tracker = _Tracker(range_m, longest_gap_ns(lidar.stamp_ns))
+    periods_ns = np.diff(lidar.stamp_ns)
+    longest_s = _LONGEST_TURN * float(np.median(periods_ns)) / 1e9 if len(periods_ns) else np.inf
+    tracker = _Tracker(range_m, longest_gap_ns(lidar.stamp_ns), longest_s)
     for scan in scans:
         tracker.add(scan)
     return tracker.odometry(lidar.body_from_lidar)

@@ -106,6 +106,15 @@ def test_times_of_points_have_the_unit_that_a_turn_takes(name: str, kind: str, t
     np.testing.assert_allclose(scan.seconds, expected, atol=1e-6)
 
 
+def test_a_row_step_of_the_whole_cloud_is_none() -> None:
+    """As drivers write that take the cloud for one row."""
+    cloud = decode(*by_ros(2, packed(), padding=0))
+    assert isinstance(cloud, CloudMessage)
+    np.testing.assert_array_equal(
+        scan_of(cloud._replace(row_step=len(cloud.data)), 5).points, POINTS[np.arange(COUNT) != 2]
+    )
+
+
 def test_equal_times_are_none() -> None:
     assert read(*by_ros(2, packed(times=np.full(COUNT, 5e6)))).seconds is None
 

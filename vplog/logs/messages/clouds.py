@@ -36,6 +36,8 @@ def _columns(cloud: CloudMessage) -> dict[str, np.ndarray]:
     """(H, W) of every field, views of the message; of several fields of a name the first. Raises BadMessageError."""
     width, height, step = cloud.width, cloud.height, cloud.step
     row_step = cloud.row_step if height > 1 and cloud.row_step else width * step
+    if row_step == height * width * step == len(cloud.data):  # of the whole cloud, as some drivers write it
+        row_step = width * step
     if row_step < width * step or height * row_step > len(cloud.data):
         raise BadMessageError(f"{width} x {height} points of {step} bytes do not fit its {len(cloud.data)} bytes")
     found = {}
