@@ -268,6 +268,26 @@ def test_every_kind_of_message_becomes_the_drive(write: Any, kind: str, choice: 
     assert kind_of(log) == kind
 
 
+@pytest.mark.parametrize("w_first", [True, False])
+@pytest.mark.parametrize("way", ["circle", "straight, spinning", "sideways"])
+def test_quaternions_with_w_first_are_not_taken_silently(way: str, w_first: bool, tmp_path: Path) -> None:
+    """A drive ahead in a bend points ahead with the other order; a platform that spins or goes sideways does not."""
+    place, yaw = POSES[:, :3, 3], YAW
+    if way != "circle":
+        place = np.column_stack([2 * SECONDS, np.sin(SECONDS) * (way == "sideways"), 0 * SECONDS])
+        yaw = 0.5 * SECONDS
+    turns = Rotation.from_rotvec(np.outer(yaw, [0, 0, 1])).as_quat()
+    turns = np.roll(turns, 1, axis=1) if w_first else turns
+    each = zip(place.tolist(), turns.tolist(), strict=True)
+    fields = [
+        {"pose": {name: dict(zip("xyzw", one, strict=False)) for name, one in (("position", at), ("orientation", q))}}
+        for at, q in each
+    ]
+    log = opened(tmp_path, topic("/pose", "geometry_msgs/msg/PoseStamped", stamped("odom", fields)))
+    asked = "are its quaternions in the order w x y z?" in " ".join(log.info().warnings)
+    assert asked == (way == "circle" and w_first)
+
+
 def test_a_stamp_of_px4_beyond_the_range_is_a_bad_message(tmp_path: Path) -> None:
     messages = px4()
     name, kind, encoding, log_ns, data = messages[300]

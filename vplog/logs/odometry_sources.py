@@ -14,6 +14,7 @@ import numpy as np
 
 from vplog.data import Floats, Gps, Ints, Odometry, OdometrySource, Trajectory
 from vplog.errors import plural
+from vplog.geometry import se3
 from vplog.logs.continuity import find_jumps
 from vplog.logs.dead_reckoning import dead_reckoned, gyro_agrees, odometry_of_fixes, turned_by_gyro
 from vplog.logs.formats.container import Channel, Contents, Notes
@@ -63,8 +64,11 @@ _HEADLESS = "moves every way without turning"
 _LEAST_PATH_M, _BENT, _TURNED = 10.0, 0.02, 1e-6
 """m of a path from which that counts; the part of squared steps off their main direction, as of directions that spread
 evenly over 30 degrees; and the change of a rotation's elements that is more than rounding."""
+_ASKEW = 0.2
+"""That part from which steps do not lie along one axis of the body."""
 _SPARSE, _STILL, _PLACED = "poses a second that differ", "never moves", "is placed in"
 _TURNS, _FORTH = "turns, but never moves", "goes back and forth"
+_W_FIRST = "does not point where it goes"
 _STEP_M, _TIMES, _EXCESS_M = 0.2, 3.0, 10.0
 """m of a step that is more than noise; and how many times, and m, the path of these is longer than that over poses a
 second apart where two nodes publish what has drifted apart."""
@@ -76,7 +80,8 @@ _LEAST_FACTOR = 0.01
 """Least factor: nothing measured makes a source impossible where it is the only one."""
 _DOUBTS = {
     _STILL: "did its estimator run?", _TURNS: "did its estimator run?", _PLACED: "is it a part of the robot?",
-    _FORTH: "do two nodes publish it?", _HEADLESS: "is it a receiver's, which does not know where the body heads?",
+    _W_FIRST: "are its quaternions in the order w x y z?", _FORTH: "do two nodes publish it?",
+    _HEADLESS: "is it a receiver's, which does not know where the body heads?",
 }  # fmt: skip
 """What to ask where the evidence against the source that is taken begins so."""
 
@@ -110,6 +115,8 @@ def score_source(
     apart_m = float(np.linalg.norm(np.diff(poses[rows, :3, 3], axis=0), axis=1).sum())
     if float(step_m[step_m > _STEP_M].sum()) > max(_TIMES * apart_m, apart_m + _EXCESS_M):
         evidence[_FORTH] = _LEAST_FACTOR
+    if source_kind in ("poses", "tf") and path_m > _LEAST_PATH_M and _has_w_first(poses):
+        evidence[_W_FIRST] = 0.1
     if source_kind not in ("gps", "truth") and path_m > _LEAST_PATH_M and _is_headless(poses, source_kind == "twist"):
         evidence[_HEADLESS] = _LEAST_FACTOR
     if jumps:
@@ -129,6 +136,15 @@ def _is_headless(poses: Floats, integrated: bool) -> bool:
     velocities = (back @ steps[:, :, None])[:, :, 0]
     ahead = (back @ velocities[:, :, None])[:, :, 0]
     return integrated and _bend(velocities) > max(_BENT, 2 * _bend(ahead))
+
+
+def _has_w_first(poses: Floats) -> bool:
+    """Whether the path bends and the body does not point along it, but does with quaternions read as w x y z."""
+    steps = np.diff(poses[:, :3, 3], axis=0)[:, None]
+    logged = poses[:-1, :3, :3]
+    other = se3.rotation(np.roll(se3.quaternion(logged), -1, axis=1))
+    along = _bend(steps[:, 0]), _bend((steps @ logged)[:, 0]), _bend((steps @ other)[:, 0])
+    return along[0] > _BENT and along[1] > _ASKEW and along[2] < _BENT
 
 
 def _bend(steps: Floats) -> float:
