@@ -14,7 +14,9 @@ from hypothesis.extra.numpy import arrays
 
 from tests.logs.drives import LATENCY_NS, Drive, foxglove_messages, ros_messages, write_foxglove, write_ros2
 from vplog import logs
-from vplog.logs.cameras import body_from_camera, camera_of
+from vplog.data import Odometry
+from vplog.geometry import se3
+from vplog.logs.cameras import AHEAD, body_from_camera, camera_of
 from vplog.logs.formats.container import Notes
 from vplog.logs.messages.records import CalibrationMessage, PoseMessage
 from vplog.logs.stamps import Stamps, increasing, nearest
@@ -23,8 +25,6 @@ from vplog.logs.tracks import PoseTrack
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from vplog.data import Odometry
 
 QUARTER = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
 """A quarter turn about z."""
@@ -142,22 +142,59 @@ def test_frames_chain_through_any_depth_and_both_directions() -> None:
     assert FrameTree([PoseMessage(0, "a", "b", np.zeros(3).tolist(), np.zeros(4).tolist(), None)]).dropped == 1
 
 
-def test_missing_chain_is_a_warning_unless_the_log_names_no_frames() -> None:
+def going(*way: float) -> Odometry:
+    """Twenty metres, straight but for a little of every axis."""
+    steps = np.outer(np.arange(20), way) + np.random.default_rng(0).normal(0, 0.01, (20, 3))
+    return Odometry(np.arange(20), se3.pose(np.tile(np.eye(3), (20, 1, 1)), steps), None)
+
+
+X, Y, Z = going(1, 0, 0), going(0.5, 1, 0.5), going(0, 0, 1)
+"""Odometries: a vehicle's, one carried by hand, a camera's own."""
+
+
+@pytest.mark.parametrize(
+    ("body", "frame", "placed", "odometry", "axis", "warned"),
+    [
+        ("base_link", "camera", True, X, "x", True),
+        ("base_link", "camera", False, X, "x", True),
+        ("robot/base_footprint", "camera", False, Y, "x", True),
+        ("base_link", "camera", False, Z, "z", True),
+        ("base_link", "camera", False, None, "x", True),
+        ("base_link", "", True, X, "x", True),
+        ("vehicle", "camera", False, X, "x", True),
+        ("vehicle", "camera", False, Y, "z", True),
+        ("base_link", "base_link", False, X, "z", False),
+        ("", "camera", False, X, "x", True),
+        ("", "camera", False, Y, "z", False),
+        ("", "", False, Z, "z", False),
+    ],
+)
+def test_a_camera_without_a_chain_to_the_body_looks_ahead(
+    body: str, frame: str, placed: bool, odometry: Odometry | None, axis: str, warned: bool
+) -> None:
+    """By REP 103 along a body's x, or as the odometry goes; a warning unless the log names no frames."""
+    tree = FrameTree([PoseMessage(0, "base_link", "lidar", (1.0, 1.0, 1.0), QUARTER.tolist(), None)] if placed else [])
+    found = body_from_camera(tree, body, frame, notes := Notes(), odometry)
+    np.testing.assert_array_equal(found, AHEAD if axis == "x" else np.eye(4))
+    assert [f"look along its {axis}" in line for line in notes.lines] == [True] * warned
+
+
+def test_a_base_link_of_the_static_transforms_is_the_body_that_odometry_does_not_name() -> None:
     tree = FrameTree([PoseMessage(0, "base_link", "lidar", (1.0, 1.0, 1.0), QUARTER.tolist(), None)])
-    for body, frame, transforms, warned in (
-        ("base_link", "camera", tree, True),
-        ("base_link", "camera", FrameTree([]), True),
-        ("base_link", "base_link", FrameTree([]), False),
-        ("", "camera", FrameTree([]), False),
-        ("", "", FrameTree([]), False),
-        ("base_link", "", tree, True),
-    ):
-        notes = Notes()
-        np.testing.assert_array_equal(body_from_camera(transforms, body, frame, notes), np.eye(4))
-        assert bool(notes.lines) == warned
     found = body_from_camera(tree, "", "lidar", notes := Notes())
     np.testing.assert_array_equal(found[:3, 3], np.ones(3))
     assert "base_link" in notes.lines[0]
+
+
+@pytest.mark.parametrize(("change", "count"), [((0.0, 0.001, 0.0), 0), ((0.0, 0.02, 0.0), 2)])
+def test_a_mount_that_changes_is_said(change: tuple[float, ...], count: int) -> None:
+    """That of another sensor is nobody's concern."""
+    unit = (0.0, 0.0, 0.0, 1.0)
+    moves = [((0.0, 0.0, 0.0), unit), (change, unit), (change, QUARTER.tolist() if count else unit)]
+    mounts = [PoseMessage(0, "base_link", child, *move, None) for child in ("mast", "lidar") for move in moves]
+    tree = FrameTree([*mounts, PoseMessage(0, "mast", "camera", (0.0, 0.0, 0.0), unit, None)])
+    body_from_camera(tree, "base_link", "camera", notes := Notes())
+    assert [f"base_link -> mast changes {count} times" in line for line in notes.lines] == [True] * bool(count)
 
 
 def calibration(model: str = "plumb_bob", distortion: Any = (), **fields: Any) -> CalibrationMessage:

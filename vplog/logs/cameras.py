@@ -28,8 +28,11 @@ BODY = "base_link"
 """The body's frame where the odometry names none: ROS REP 105."""
 AHEAD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """body_from_camera of a camera that looks along the body's x, upright: ROS REP 103."""
-_UP = 0.9
-"""Least z of an axis that points up, within 25 degrees: cameras are pitched by less."""
+_UP = 0.7
+"""Least z of an axis that points up, within 45 degrees: cameras are pitched by less."""
+_STRAIGHT = 0.9
+"""Share of an odometry's way along the x of a body that goes ahead along it, as wheels do. A camera carried by hand has
+less along any axis."""
 _LARGEST_PX = 1e7
 """px; a longer focal length is damage: telescopes have 1e6."""
 _SAME_PX = 1.0
@@ -145,13 +148,15 @@ def optical_frame(tree: FrameTree, body: str, frame: str, odometry: Odometry | N
     """Frame of a camera, z ahead. Where `frame`, that of its images, has x ahead, as of drivers that know no other and
     are placed without a turn, it is added to the tree, with a note. z is up in a base_link (REP 103), unless it is the
     way that the odometry mostly goes."""
-    placed = tree.between(body, frame) if body.rsplit("/", 1)[-1] in BODIES and "optical" not in frame else None
-    if placed is None or placed[2, 2] < _UP:
+    placed = tree.between(body, frame) if _is_base(body) and "optical" not in frame else None
+    if placed is None or abs(placed[2, 2]) < _UP or np.argmax(_along(odometry)) == 2:
         return frame
-    if odometry is not None:
-        steps = np.abs(se3.between(odometry.odom_from_body[:-1], odometry.odom_from_body[1:])[:, :3, 3]).sum(0)
-        if np.argmax(steps) == 2 and steps.any():
-            return frame
+    if placed[2, 2] < 0:
+        notes.add(
+            f"{frame} looks down by the static transforms. Where it has x ahead (REP 103) and hangs upside down, "
+            "give its mount with --calibration."
+        )
+        return frame
     notes.add(
         f"{frame} looks up by the static transforms; it is taken for a frame with x ahead (REP 103), not an optical "
         "one. Where the camera does look up, give its mount with --calibration."
@@ -160,16 +165,30 @@ def optical_frame(tree: FrameTree, body: str, frame: str, odometry: Odometry | N
     return optical
 
 
-def body_from_camera(tree: FrameTree, body: str, frame: str, notes: Notes, ahead: bool = False) -> Floats:
-    """(4, 4) through the static transforms; without a chain the identity, noted where that is a guess, or, with
-    `ahead`, a camera that looks along x. `body` is the odometry's child frame, empty where its type has none; `frame`
-    is the image's frame_id."""
+def _is_base(body: str) -> bool:
+    return body.rsplit("/", 1)[-1] in BODIES
+
+
+def _along(odometry: Odometry | None) -> Floats:
+    """(3,) shares of an odometry's way along the body's axes; zero where it does not move."""
+    if odometry is None:
+        return np.zeros(3)
+    steps = se3.between(odometry.odom_from_body[:-1], odometry.odom_from_body[1:])[:, :3, 3]
+    return np.abs(steps).sum(0) / max(float(np.linalg.norm(steps, axis=1).sum()), 1e-9)
+
+
+def body_from_camera(
+    tree: FrameTree, body: str, frame: str, notes: Notes, odometry: Odometry | None = None, ahead: bool = False
+) -> Floats:
+    """(4, 4) through the static transforms; without a chain a guess, noted: a camera that looks along x where `ahead`,
+    on a base_link (REP 103), and where `odometry` goes along x; else, and where it goes along z, the identity. `body`
+    is the odometry's child frame, empty where its type has none; `frame` is the image's frame_id."""
     if not body and BODY in tree:
         body = BODY
         if not ahead:
             notes.add(f"The odometry names no body frame; {BODY} of the static transforms is taken.")
-    found = tree.between(body, frame) if body and frame else None
-    if found is not None:
+    if body and frame and (found := tree.between(body, frame)) is not None:
+        tree.note_changes(body, frame, notes)
         return found
     if ahead:
         if len(tree):  # a folder of images has none
@@ -177,9 +196,12 @@ def body_from_camera(tree: FrameTree, body: str, frame: str, notes: Notes, ahead
                 "The static transforms do not place the camera; it is assumed at the body's origin, looking ahead."
             )
         return AHEAD.copy()
-    if len(tree) or (body and frame):
+    along = _along(odometry)
+    along_x = np.argmax(along) != 2 if _is_base(body) else along[0] > _STRAIGHT
+    if len(tree) or (body and frame) or along_x:
         notes.add(
             f"No static transforms lead from the body {body or '(not named)'} to the camera's frame "
-            f"{frame or '(not named)'}; the camera is taken to sit at the body and look along its z."
+            f"{frame or '(not named)'}; the camera is taken to sit at the body and look along its "
+            f"{'x' if along_x else 'z'}. Where it does not, give its mount with --calibration."
         )
-    return np.eye(4)
+    return AHEAD.copy() if along_x else np.eye(4)

@@ -358,7 +358,8 @@ class RecordedLog:
         elif self.odometry() is not None or content.chosen.lidar is not None or visual:
             ahead = self.odometry() is None  # it is computed then
             ahead |= any(source.used and source.kind in ("gps", "twist") for source in content.sources)
-            placed = body_from_camera(content.tree, body, frame, notes, ahead)
+            remarks = Notes() if camera.matrix is None and not ahead else notes  # no closure is metric
+            placed = body_from_camera(content.tree, body, frame, remarks, self.odometry(), ahead)
             camera = replace(camera, body_from_camera=placed)
         return camera, frame
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from array import array
-from collections import defaultdict, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import reduce
+from itertools import pairwise
+from operator import matmul
 
 import numpy as np
 
 from vplog.data import Floats, Ints, Odometry
+from vplog.errors import plural
 from vplog.geometry import se3
 from vplog.logs.formats.container import Notes
 from vplog.logs.messages.records import PoseMessage
@@ -23,6 +27,8 @@ _FARTHEST_M = 1e9
 """m; positions in map coordinates reach 1e7, so a coordinate beyond this is damage."""
 _SMALLEST = 1e-6
 """Largest component of a quaternion below which none was set; real ones have length 1, to a few digits."""
+_SAME_M, _SAME_RAD = 0.01, np.radians(1.0)
+"""Differences of two transforms that are one: a calibration is published again with other roundings."""
 Edge = tuple[str, str]
 """Parent and child."""
 
@@ -32,8 +38,10 @@ class FrameTree:
 
     def __init__(self, transforms: Iterable[PoseMessage]) -> None:
         self._from: defaultdict[str, dict[str, Floats]] = defaultdict(dict)
-        self.edges: list[tuple[str, str]] = []
+        self.edges: list[Edge] = []
         """Parent and child of each transform."""
+        self._changes: Counter[Edge] = Counter()
+        """Times that the transform of a pair was replaced by another."""
         self.dropped = 0
         """Transforms that were NaN, infinite or without rotation."""
         for transform in transforms:
@@ -42,7 +50,12 @@ class FrameTree:
             if parent == child or not are_usable(pose[None]).all():
                 self.dropped += 1
                 continue
-            self.add(parent, child, se3.pose(se3.rotation(pose[3:]), pose[:3]))
+            parent_from_child = se3.pose(se3.rotation(pose[3:]), pose[:3])
+            if (before := self._from[parent].get(child)) is not None:
+                moved = se3.between(before, parent_from_child)
+                if np.linalg.norm(moved[:3, 3]) > _SAME_M or se3.angle(moved) > _SAME_RAD:
+                    self._changes[parent, child] += 1
+            self.add(parent, child, parent_from_child)
 
     def add(self, parent: str, child: str, parent_from_child: Floats) -> None:
         self.edges.append((parent, child))
@@ -56,16 +69,30 @@ class FrameTree:
 
     def between(self, a: str, b: str) -> Floats | None:
         """a_from_b (4, 4) by the shortest chain, up and down the tree; None where there is none."""
+        chain = self._frames_between(a, b)
+        return reduce(matmul, (self._from[x][y] for x, y in pairwise(chain)), np.eye(4)) if chain else None
+
+    def note_changes(self, a: str, b: str, notes: Notes) -> None:
+        """Note the transforms between two frames that were replaced by others."""
+        for x, y in pairwise(self._frames_between(a, b)):
+            if count := self._changes[x, y] + self._changes[y, x]:
+                notes.add(
+                    f"The static transform {x} -> {y} changes {plural(count, 'time')}; the last is used for the whole "
+                    "drive. Where that is wrong, run a part by --start and --stop with the mount in --calibration."
+                )
+
+    def _frames_between(self, a: str, b: str) -> tuple[str, ...]:
+        """The shortest chain of frames, both ends included; empty where there is none."""
         start, goal = frame_name(a), frame_name(b)
-        reached = {start: np.eye(4)}
+        reached: dict[str, tuple[str, ...]] = {start: (start,)}
         queue = deque([start])
         while queue and goal not in reached:
             here = queue.popleft()
-            for frame, here_from_frame in sorted(self._from.get(here, {}).items()):
+            for frame in sorted(self._from.get(here, ())):
                 if frame not in reached:
-                    reached[frame] = reached[here] @ here_from_frame
+                    reached[frame] = (*reached[here], frame)
                     queue.append(frame)
-        return reached.get(goal)
+        return reached.get(goal, ())
 
 
 def frame_name(frame: str) -> str:

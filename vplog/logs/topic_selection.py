@@ -76,7 +76,7 @@ class TopicChoice(Settings):
     """Topic of the odometry, or of a lidar that gives it, or a source of SOURCES; an empty string uses none."""
     odometry_file: Path | None = None
     """TUM file of poses beside the log that is the odometry: of the body, or of the camera where the log's static
-    transforms have no base_link; its clock is that of the images' stamps."""
+    transforms have no base_link and the poses do not go along x; its clock is that of the images' stamps."""
     calibration_file: Path | None = None
     """YAML file beside the log that calibrates the camera, or both of a pair: ROS camera_info, a Kalibr camchain or
     EuRoC's sensor.yaml; and those further cameras that it names."""
