@@ -133,3 +133,33 @@ def test_a_calibration_without_a_size_is_that_of_cropped_images() -> None:
     notes = Notes()
     assert camera_of("cam", pinhole(np.full(2, 700.0), np.array([640.0, 360.0])), (1280, 480), notes).matrix is not None
     assert not notes.lines
+
+
+KITTI = (np.array([984.2, 980.8]), np.array([690.0, 233.2]), np.array([721.5, 721.5]), np.array([609.6, 172.9]))
+"""Focal lengths and centres of K_00 and P_rect_00 of 26 September 2011."""
+
+
+@pytest.mark.parametrize(
+    ("focal", "centre", "rectified_focal", "rectified_centre", "rectified"),
+    [
+        (*KITTI, True),
+        (np.array([959.8, 956.9]), np.array([696.0, 224.2]), *KITTI[2:], True),  # the colour camera's
+        (KITTI[0], np.array([610.0, 190.0]), *KITTI[2:], False),
+        (KITTI[0], KITTI[1], KITTI[2], np.array([671.0, 221.5]), False),  # a window of the sensor, by alpha 0
+        (KITTI[0], KITTI[1], KITTI[0] / 3, np.array([644.0, 202.7]), False),  # and of a wide lens
+        (KITTI[0], KITTI[1], np.zeros(2), np.zeros(2), False),
+    ],
+)
+def test_rectified_images_beside_a_raw_calibration_have_its_projection(
+    focal: np.ndarray, centre: np.ndarray, rectified_focal: np.ndarray, rectified_centre: np.ndarray, rectified: bool
+) -> None:
+    """As kitti2bag writes them; raw images have K and its distortion."""
+    own, other = pinhole(focal, centre), pinhole(rectified_focal, rectified_centre)
+    p = np.column_stack([other.matrix * (rectified_focal[0] > 0), np.zeros(3)])
+    lens = np.array([-0.37, 0.2, 0.002, 0.001, -0.07])
+    calibration = CalibrationMessage(0, "", 1242, 375, "plumb_bob", lens, own.matrix, p)
+    camera = camera_of("/kitti/camera_gray_left/image_raw", calibration, (1242, 375), notes := Notes())
+    assert camera.matrix is not None
+    np.testing.assert_array_equal(camera.matrix, other.matrix if rectified else own.matrix)
+    assert camera.distortion_model == ("none" if rectified else "plumb_bob")
+    assert ["kitti2bag" in line for line in notes.lines] == [True] * rectified

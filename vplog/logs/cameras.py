@@ -40,6 +40,9 @@ _SAME_PX = 1.0
 _CENTRED = 0.2
 """Share of an image that its principal point may lie off the middle in both axes: lenses are a few % off, images that
 were cropped in one of them; in images of half or twice the size it lies off by 0.5 or 0.25."""
+_OFF = 0.08
+"""Share of an image that a principal point is off the middle in one axis where K is that of larger ones: KITTI's by .1
+to .18; lenses are a few % off."""
 _SAME_SHAPE = 0.01
 """Relative difference of the scales in x and y below which a resized image still fits its calibration: rounding."""
 
@@ -52,8 +55,13 @@ def camera_of(name: str, calibration: CalibrationMessage | None, size: tuple[int
     if calibration is None:
         return unknown
     matrix, model, distortion = calibration.matrix, calibration.model, calibration.distortion
-    if is_rectified(name) and calibration.projection[0, 0] > 0:
+    if is_rectified(name, calibration) and calibration.projection[0, 0] > 0:
         matrix, model, distortion = calibration.projection[:, :3], "", np.zeros(0)
+        if not is_rectified(name):
+            notes.add(
+                f"The images of {name} are taken to be rectified, as those of kitti2bag: the centre of K is not that "
+                "of the images, that of P is. Where they are raw, give another calibration with --calibration."
+            )
     if not ((np.abs(matrix) < _LARGEST_PX).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
         notes.add(f"{name} is uncalibrated: its K is not set (K[0] = {matrix[0, 0]:g}). Give one with --calibration.")
         return unknown
@@ -97,9 +105,19 @@ def resized(x: float, y: float) -> Floats:
     return np.array([[x, 0.0, (x - 1) / 2], [0.0, y, (y - 1) / 2], [0.0, 0.0, 1.0]])
 
 
-def is_rectified(topic: str) -> bool:
-    """image_proc and stereo_image_proc name their output so."""
-    return "image_rect" in topic
+def is_rectified(topic: str, calibration: CalibrationMessage | None = None) -> bool:
+    """image_proc and stereo_image_proc name their output so. kitti2bag does not, and its `calibration` has K of the raw
+    images, which are larger: its axis is far off the middle, that of P is not. Of cropped raw images both axes are off
+    by one angle."""
+    if "image_rect" in topic or calibration is None:
+        return "image_rect" in topic
+    raw, rectified = calibration.matrix, calibration.projection[:, :3]
+    size = np.array([calibration.width, calibration.height], np.float64)
+    if not size.all() or min(*raw[[0, 1], [0, 1]], *rectified[[0, 1], [0, 1]]) <= 0:
+        return False
+    off_px = [k[:2, 2] - size / 2 for k in (raw, rectified)]
+    angles = [np.linalg.norm(off / k[[0, 1], [0, 1]]) for off, k in zip(off_px, (raw, rectified), strict=True)]
+    return bool((np.abs(off_px[0]) > _OFF * size).any() and angles[1] < angles[0] / 2)
 
 
 def lens_of(name: str) -> str | None:

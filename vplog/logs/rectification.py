@@ -50,8 +50,8 @@ class Side:
 
     @property
     def rectified(self) -> bool:
-        """The images are named as rectified already."""
-        return is_rectified(self.camera.name)
+        """The images are rectified already."""
+        return is_rectified(self.camera.name, self.calibration)
 
 
 @dataclass(frozen=True, eq=False)
