@@ -12,7 +12,7 @@ from vplog.errors import LogError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.loops.landmarks import LandmarkSettings
-from vplog.loops.verify import VerifySettings
+from vplog.loops.verify import VerifySettings, calibration_share, drive_of
 from vplog.loops.verify_epipolar import EpipolarSettings, epipolar_inliers
 from vplog.loops.verify_metric import MetricSettings
 
@@ -258,6 +258,38 @@ def test_a_wall_is_no_obstacle_where_depth_is_measured() -> None:
     ledger = verify(proposals([(1, 0)]), keyframes(list(poses)), lens, seen.__getitem__, EXACT)
     assert ledger.verdict == [Verdict.ACCEPTED]
     assert sigmas(ledger, poses)[0] < 2.5
+
+
+TURNED = se3.pose(se3.so3_exp(np.array([0.0, 0.0, 1.2])), np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("turned", "focal", "depth", "warned"),
+    [
+        (np.eye(4), 1.0, 1.0, ""),
+        (np.eye(4), 1.12, 1.0, "focal length"),
+        (np.eye(4), 1.3, 1.0, "by 20 % or more"),
+        (TURNED, 1.0, 1.0, "turns about another axis than the odometry, 69 degrees off. Check its mount"),
+        (np.eye(4), 1.0, 1.8, "moves 1.8 times as far by its depth"),
+        (np.eye(4), 1.0, 0.2, "moves 0.2 times as far by its depth"),
+    ],
+)
+def test_a_camera_that_disagrees_with_the_odometry_is_said_to_be_wrong_in_the_way_it_is(
+    turned: np.ndarray, focal: float, depth: float, warned: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    rng = np.random.default_rng(15)
+    lens, place = camera(), scene(rng, 4000)
+    assert lens.matrix is not None
+    poses = [pose(0.1 * i, yaw=0.35 * np.sin(i / 3)) for i in range(40)]
+    seen = [view(place, p, lens, rng, depth=True) for p in poses]
+    seen = [replace(one, depth_m=depth * one.depth_m) for one in seen]
+    wrong = replace(
+        lens,
+        matrix=lens.matrix * [[focal, 1, 1], [1, focal, 1], [1, 1, 1]],
+        body_from_camera=lens.body_from_camera @ turned,
+    )
+    calibration_share(drive_of(keyframes(poses), wrong, seen.__getitem__, EXACT), Execution())
+    assert [warned in record.getMessage() for record in caplog.records] == [True] * bool(warned)
 
 
 def test_a_wrong_focal_length_is_noticed_and_claims_less(caplog: pytest.LogCaptureFixture) -> None:

@@ -7,11 +7,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import Camera, Closures, Floats, Int32s, Ints, Keyframes, Verdict
+from vplog.data import Camera, Closures, Floats, Int32s, Ints, Keyframes
 from vplog.features.matching import PairMatches
 from vplog.geometry import se3
 from vplog.loops import undistort
-from vplog.loops.calibration import body_twists, motion_covariance, rotation_share, stamp_covariance, turning_pairs
+from vplog.loops.calibration import (
+    axes_apart,
+    body_twists,
+    motion_covariance,
+    rotation_share,
+    stamp_covariance,
+    times_as_far,
+    turning_pairs,
+)
 from vplog.loops.candidate import Drive, Row, VerifySettings, check_queries, check_reverse
 from vplog.loops.landmarks import FeaturesOf, for_stereo
 from vplog.loops.propose import Proposals
@@ -22,6 +30,11 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 _WARNED_SHARE = 0.05
 """Relative disagreement of camera and odometry that is warned of: five times a careful calibration's error."""
+_WARNED_AXES_RAD = np.radians(30.0)
+"""Angle between the axes of their rotations that is a wrong mount's: noise has some degrees."""
+_WARNED_SCALES = 0.6, 1.6
+"""Ratio of the metres of depth and odometry beyond which one is in another unit: wheels slip by less, and a focal
+length that is 30 % off makes 0.7."""
 
 
 def drive_of(
@@ -91,20 +104,34 @@ def calibration_share(drive: Drive, execution: Execution) -> float:
     keyframes, camera, settings = drive.keyframes, drive.camera, drive.settings.calibration
     pairs = turning_pairs(keyframes, settings)
     turns = execution.map(lambda pair: check_queries(drive, drive, pair[0], pair[1:]), pairs.tolist())
-    poses = [row.pose for (row,) in turns]
-    good = [at for at, pose in enumerate(poses) if pose.verdict is Verdict.ACCEPTED]
-    earlier, later = pairs[good].T
-    odometry_motion = se3.between(keyframes.odom_from_body[earlier], keyframes.odom_from_body[later])
-    image_motion = np.array(
-        [body_pose(found, camera, camera) for at in good if (found := poses[at].match_from_query) is not None]
-    )
-    share = rotation_share(odometry_motion, image_motion, settings)
-    if share > _WARNED_SHARE:
+    good = [(at, row) for at, (row,) in enumerate(turns) if row.pose.match_from_query is not None]
+    earlier, later = pairs[[at for at, _ in good]].T
+    by_images = np.array([row.pose.match_from_query for _, row in good]).reshape(-1, 4, 4)
+    by_odometry = se3.between(*(keyframes.odom_from_body[rows] @ camera.body_from_camera for rows in (earlier, later)))
+    share = rotation_share(by_odometry, by_images, settings)
+    metric = [row.scale != "odometry" for _, row in good]
+    far = times_as_far(by_odometry[metric], by_images[metric])
+    if (apart := axes_apart(by_odometry, by_images)) > _WARNED_AXES_RAD:
         _LOG.warning(
-            "Camera %r and odometry disagree by %.0f %% on rotations, so closures get a larger covariance. "
+            "Camera %r turns about another axis than the odometry, %.0f degrees off. Check its mount: the static "
+            "transforms, or --calibration.",
+            camera.name,
+            np.degrees(apart),
+        )
+    elif not _WARNED_SCALES[0] < far < _WARNED_SCALES[1]:
+        _LOG.warning(
+            "Camera %r moves %.2g times as far by its depth as by odometry. Check the unit of the depth, or the "
+            "baseline, and the scale of the odometry.",
+            camera.name,
+            far,
+        )
+    elif share > _WARNED_SHARE:
+        _LOG.warning(
+            "Camera %r and odometry disagree by %.0f %%%s on rotations, so closures get a larger covariance. "
             "Check the focal length.",
             camera.name,
             100.0 * share,
+            " or more" if share == settings.most_share else "",
         )
     return share
 
