@@ -287,6 +287,13 @@ def test_cameras_to_two_sides_are_no_pair_but_two_cameras(tmp_path: Path) -> Non
     assert "57 degrees" in " ".join(log.warnings)
 
 
+def test_a_calibrated_camera_that_nothing_places_is_said(tmp_path: Path) -> None:
+    log = logs.open(drive(tmp_path, PINHOLES, RIGHT_FROM_LEFT, names=("front", "rear")))
+    assert log.further_cameras() == []
+    (line,) = [line for line in log.warnings if "not used" in line]
+    assert "/stereo/rear/image_raw is calibrated but not used: no static transforms lead from base_link" in line
+
+
 def test_what_is_no_pair_is_said_and_left_out(tmp_path: Path) -> None:
     def why(name: str, right_from_left: np.ndarray = RIGHT_FROM_LEFT, **options: Any) -> str:
         log = logs.open(drive(tmp_path / name, PINHOLES, right_from_left, **options))

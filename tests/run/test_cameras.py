@@ -20,7 +20,7 @@ from vplog.data import Keyframes, Odometry, Verdict
 from vplog.errors import LogError
 from vplog.geometry import se3
 from vplog.geometry.tum import read_tum
-from vplog.logs.formats.container import Channel
+from vplog.logs.formats.container import Channel, Notes
 from vplog.logs.topic_selection import Candidate, Selection, TopicChoice, further_cameras
 from vplog.loops.propose import Proposals
 from vplog.pipeline import load_pipeline, run
@@ -170,11 +170,15 @@ def test_further_cameras_are_calibrated_and_have_frames_of_their_own() -> None:
     found += [candidate(f"{name}/camera_info", "camera_info", calibrated=True) for name in known]
     found += [candidate("dark/camera_info", "camera_info")]
     front = Selection(image=found[0].channel)
-    beside = further_cameras(found, front, TopicChoice())
+    found += [candidate("low/image", frame="front"), candidate("low/camera_info", "camera_info", calibrated=True)]
+    beside = further_cameras(found, front, TopicChoice(), notes := Notes())
     others = {one.channel.topic: left and left.channel.topic for one, left in beside}
     assert others == {"/left/image": None, "/right/image": "/left/image", "/rear/image": None}
+    low, top = notes.lines
+    assert low.startswith("/low/image is calibrated but not used: it has the frame_id front of another camera.")
+    assert top.startswith("/top/image is calibrated but not used: it has no frame_id.")
     for choice in (TopicChoice(mask="/left/image"), TopicChoice(mask_topics={"/rear/image": "/left/image"})):
-        assert "/left/image" not in [one.channel.topic for one, _ in further_cameras(found, front, choice)]
+        assert "/left/image" not in [one.channel.topic for one, _ in further_cameras(found, front, choice, Notes())]
 
 
 def poses_of(rng: np.random.Generator, count: int) -> np.ndarray:

@@ -144,9 +144,15 @@ class RecordedLog:
             return list(choice.cameras or ())
         tree, used = self._content.tree, self._candidate(self._selection.image)
         found, frames = list[str](), [used.frame] if used else []
-        for c, left in further_cameras(self._candidates, self._selection, choice):
-            apart = left is None or self._are_apart(left.frame, c.frame)
-            if apart and tree.between(body, c.frame) is not None and not self._is_same_view(frames, c.frame):
+        for c, left in further_cameras(self._candidates, self._selection, choice, self._notes):
+            if left is not None and not self._are_apart(left.frame, c.frame):
+                continue
+            if tree.between(body, c.frame) is None:
+                self._notes.add(
+                    f"{c.channel.topic} is calibrated but not used: no static transforms lead from {body} to its frame "
+                    f"{c.frame}. Take it with a further --image-topic, its mount from --calibration."
+                )
+            elif not self._is_same_view(frames, c.frame):
                 found.append(c.channel.topic)
                 frames.append(c.frame)
         return found

@@ -32,7 +32,7 @@ from typing import Any
 from pydantic import Field
 
 from vplog.errors import LogError, nearest
-from vplog.logs.formats.container import Channel
+from vplog.logs.formats.container import Channel, Notes
 from vplog.logs.messages.records import GEOMETRY, NMEA, TWISTS, WHEELS, short_type
 from vplog.settings import Settings
 
@@ -301,19 +301,30 @@ def _lidar(usable: list[Candidate], choice: TopicChoice) -> Candidate | None:
 
 
 def further_cameras(
-    candidates: list[Candidate], used: Selection, choice: TopicChoice
+    candidates: list[Candidate], used: Selection, choice: TopicChoice, notes: Notes
 ) -> list[tuple[Candidate, Candidate | None]]:
     """Calibrated cameras beside the one in use, each by its best topic: with another frame_id than any before it; and,
-    where its name is that of the right one of a pair, the left one."""
+    where its name is that of the right one of a pair, the left one. Other cameras, by their calibrations, are noted."""
     usable = sorted((c for c in candidates if c.count), key=lambda c: (-c.count, c.channel))
     requested = used.right if choice.right else None  # any other is a pair by its name, and may look elsewhere
-    taken = {c.frame for c in usable if c.channel in (used.image, requested)}
+    first = [c for c in usable if c.channel in (used.image, requested)]
+    taken, infos = {c.frame for c in first}, {_calibration(c, usable) for c in first}
     found = []
     for c in usable:
         info = _calibration(c, usable) if c.role == "image" and c.supported else None
-        if info and info.calibrated and c.frame and c.frame not in taken and not _is_mask(c, choice):
-            taken.add(c.frame)
-            found.append((c, _partner(c, usable, back=True)))
+        if not (info and info.calibrated) or _is_mask(c, choice):
+            continue
+        left = _partner(c, usable, back=True)
+        if c.frame and c.frame not in taken:
+            found.append((c, left))
+        elif info not in infos and left is None:
+            named = f"the frame_id {c.frame} of another camera" if c.frame else "no frame_id"
+            notes.add(
+                f"{c.channel.topic} is calibrated but not used: it has {named}. Take it with a further --image-topic, "
+                "its mount from --calibration."
+            )
+        taken.add(c.frame)
+        infos.add(info)
     return found
 
 
