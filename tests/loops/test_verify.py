@@ -281,14 +281,14 @@ def test_a_camera_that_disagrees_with_the_odometry_is_said_to_be_wrong_in_the_wa
     lens, place = camera(), scene(rng, 4000)
     assert lens.matrix is not None
     poses = [pose(0.1 * i, yaw=0.35 * np.sin(i / 3)) for i in range(40)]
-    seen = [view(place, p, lens, rng, depth=True) for p in poses]
-    seen = [replace(one, depth_m=depth * one.depth_m) for one in seen]
+    views = [view(place, p, lens, rng, depth=True) for p in poses]
+    views = [replace(one, depth_m=depth * one.depth_m) for one in views]
     wrong = replace(
         lens,
         matrix=lens.matrix * [[focal, 1, 1], [1, focal, 1], [1, 1, 1]],
         body_from_camera=lens.body_from_camera @ turned,
     )
-    calibration_share(drive_of(keyframes(poses), wrong, seen.__getitem__, EXACT), Execution())
+    calibration_share(drive_of(keyframes(poses), wrong, views.__getitem__, EXACT), Execution())
     assert [warned in record.getMessage() for record in caplog.records] == [True] * bool(warned)
 
 
