@@ -26,6 +26,7 @@ from vplog.run import provenance, run_folder
 from vplog.run.reference_library import build_library
 from vplog.run.run_folder import CacheOptions, staged_run
 from vplog.storage.folders import numbered
+from vplog.storage.remote_path import RemotePath
 from vplog.verbs.export import export
 
 if TYPE_CHECKING:
@@ -110,6 +111,14 @@ def test_a_run_is_not_written_into_its_log(tmp_path: Path) -> None:
         with pytest.raises(SettingsError, match="is within the log"):
             complete(out, folder)
     complete(tmp_path / "drive-out", folder)
+
+
+def test_a_log_on_an_object_store_may_be_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RemotePath, "is_dir", lambda _: True)
+    head: dict[str, Any] = {"settings": {}, "log": "s3://bucket/drive"}
+    with staged_run(tmp_path / "out", head, [RemotePath("s3://bucket/drive")], cache=CacheOptions(force=True)) as made:
+        (made / "run.json").write_text("{}")
+    assert (tmp_path / "out" / "run.json").is_file()
 
 
 def test_the_same_log_is_known(log: Path, other: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -93,7 +93,7 @@ class _Stage:
 
     def count(self, done: int, total: int) -> None:
         """Take another number of items."""
-        if done < self.done:
+        if done < self.done and total != self.total:
             self.counted_s, self.known = time.monotonic(), done
         self.done, self.total = done, total
 

@@ -17,6 +17,9 @@ from vplog.geometry import se3
 _OTHER_MOTION = 1.0 / 3.0
 """Disagreement with the odometry from which the truth may not be this drive's: the right one of a drive whose odometry
 drifts has a tenth, another drive's or one whose stamps are 2 s off two thirds."""
+_ALIKE_NS, _ALIKE_M = 30 * 10**9, 0.1
+"""Longest time of the motions that tell that, over which the odometry hardly drifts; and their least mean length: of
+turns on the spot the shifts are noise."""
 _BETTER = 0.5
 """Another frame must halve the disagreement with the odometry to be taken: chance does not."""
 _MOTIONS = 400
@@ -70,7 +73,8 @@ class BodyTruth:
     offset_s: float = 0.0
     """s to add to the truth's stamps for its motions to be those of the odometry; 0 where that is not clear."""
     disagreement: float = 0.0
-    """Median of what its motions and those of the odometry differ by, rad and shares of their length."""
+    """Median of what its motions of up to `_ALIKE_NS` and those of the odometry differ by, rad and shares of their
+    length; 0 where they are shorter than `_ALIKE_M`."""
 
     @property
     def is_of_other_motion(self) -> bool:
@@ -115,7 +119,11 @@ def body_truth(truth: Trajectory, odometry: Trajectory, body_from_camera: Floats
     turned = [se3.angle(se3.between(poses[:1], poses)).max() for poses in (true, moved)]
     if turned[0] < np.radians(0.01) and turned[1] > np.radians(_LEAST_TURN_DEG):
         return BodyTruth(truth, oriented=False)
-    frame, truth_from_body, scale, apart = _frame(true, moved, body_from_camera)
+    frame, truth_from_body, scale = _frame(true, moved, body_from_camera)
+    period_ns = max(int(np.median(np.diff(truth.stamp_ns[rows]))), 1)
+    a, b = _motions(true, moved, min(max(1, _ALIKE_NS // period_ns), _longest(len(rows))))
+    long = np.linalg.norm(a[:, :3, 3], axis=1).mean() > _ALIKE_M
+    apart = _disagreement(a, b, truth_from_body, _weights(a))[0] if long else 0.0
     poses = odometry.world_from_body.copy()
     poses[:, :3, 3] *= scale if scale > 0 else 1.0
     odometry = Trajectory(odometry.stamp_ns, poses)
@@ -173,20 +181,29 @@ def _at(trajectory: Trajectory, stamp_ns: Ints) -> Floats:
     return se3.interpolate_at(trajectory.stamp_ns, trajectory.world_from_body, within)
 
 
-def _frame(true: Floats, moved: Floats, body_from_camera: Floats | None) -> tuple[str, Floats, float, float]:
-    """Frame of the truth's poses (T, 4, 4), by those of the odometry: a name, truth_from_body (4, 4), the true metres
-    of one of the odometry's, which has no metres of its own where a single camera made it, and the disagreement."""
-    step = max(1, len(true) // _MOTION_SHARE)
+def _longest(count: int) -> int:
+    """Samples that a motion takes at most, of so many."""
+    return max(1, count // _MOTION_SHARE)
+
+
+def _motions(true: Floats, moved: Floats, step: int) -> tuple[Floats, Floats]:
+    """(W, 4, 4) motions of the truth and of the odometry, poses (T, 4, 4), over `step` samples, spread over both."""
     first = np.unique(np.linspace(0, len(true) - 1 - step, _MOTIONS).astype(np.int64))
-    a, b = (se3.between(poses[first], poses[first + step]) for poses in (true, moved))
+    return se3.between(true[first], true[first + step]), se3.between(moved[first], moved[first + step])
+
+
+def _frame(true: Floats, moved: Floats, body_from_camera: Floats | None) -> tuple[str, Floats, float]:
+    """Frame of the truth's poses (T, 4, 4), by those of the odometry: a name, truth_from_body (4, 4), and the true
+    metres of one of the odometry's, which has no metres of its own where a single camera made it."""
+    a, b = _motions(true, moved, _longest(len(true)))
     weight, frames = _weights(a), [("body", np.eye(4)), ("estimated", _hand_eye(a, b, _weights(b)))]
     if body_from_camera is not None:
         frames.insert(1, ("camera", se3.inverse(body_from_camera)))
-    best, least = ("body", np.eye(4), 1.0, np.inf), np.inf
+    best, least = ("body", np.eye(4), 1.0), np.inf
     for name, truth_from_body in frames:
         apart, scale = _disagreement(a, b, truth_from_body, weight)
         if apart < least:
-            best, least = (name, truth_from_body, scale, apart), _BETTER * apart
+            best, least = (name, truth_from_body, scale), _BETTER * apart
     return best
 
 

@@ -117,7 +117,7 @@ def is_rectified(topic: str, calibration: CalibrationMessage | None = None) -> b
         return False
     off_px = [k[:2, 2] - size / 2 for k in (raw, rectified)]
     angles = [np.linalg.norm(off / k[[0, 1], [0, 1]]) for off, k in zip(off_px, (raw, rectified), strict=True)]
-    return bool((np.abs(off_px[0]) > _OFF * size).any() and angles[1] < angles[0] / 2)
+    return bool((off_px[0] > 0).all() and (off_px[0] > _OFF * size).any() and angles[1] < angles[0] / 2)
 
 
 def lens_of(name: str) -> str | None:
@@ -195,6 +195,16 @@ def _along(odometry: Odometry | None) -> Floats:
     return np.abs(steps).sum(0) / max(float(np.linalg.norm(steps, axis=1).sum()), 1e-9)
 
 
+def _drives(odometry: Odometry | None) -> bool:
+    """Whether the body goes ahead along its x and turns about its z, as a vehicle; a camera that looks aside and goes
+    along x turns about its y."""
+    if odometry is None or _along(odometry)[0] < _STRAIGHT:
+        return False
+    steps = se3.between(odometry.odom_from_body[:-1], odometry.odom_from_body[1:])
+    turned = np.abs(se3.so3_log(steps[:, :3, :3])).sum(0)
+    return bool(steps[:, 0, 3].sum() > 0 and turned[2] == turned.max())
+
+
 def body_from_camera(
     tree: FrameTree, body: str, frame: str, notes: Notes, odometry: Odometry | None = None, ahead: bool = False
 ) -> Floats:
@@ -214,8 +224,7 @@ def body_from_camera(
                 "The static transforms do not place the camera; it is assumed at the body's origin, looking ahead."
             )
         return AHEAD.copy()
-    along = _along(odometry)
-    along_x = np.argmax(along) != 2 if _is_base(body) else along[0] > _STRAIGHT
+    along_x = np.argmax(_along(odometry)) != 2 if _is_base(body) else "optical" not in body and _drives(odometry)
     if len(tree) or (body and frame) or along_x:
         notes.add(
             f"No static transforms lead from the body {body or '(not named)'} to the camera's frame "

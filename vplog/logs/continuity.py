@@ -72,7 +72,7 @@ def without_jumps(odometry: Odometry, what: str, notes: Notes) -> Odometry:
     if len(restarts):
         seconds = ", ".join(f"{(stamp_ns[row + 1] - stamp_ns[0]) / 1e9:.1f} s" for row in restarts[:_NAMED].tolist())
         notes.add(
-            f"{what}: it starts again from its first pose after a gap, or further off than it moves in the time, at "
+            f"{what}: it starts again from its first pose, or from zero, after a gap, at "
             f"{seconds} (a node that was restarted?): only closures and fixes relate what is before to what is behind."
         )
         poses = _extrapolated(stamp_ns, poses, restarts, held=True)
@@ -95,8 +95,8 @@ def without_jumps(odometry: Odometry, what: str, notes: Notes) -> Odometry:
 
 
 def _restarts(stamp_ns: Ints, poses: Floats) -> Ints:
-    """Rows behind which, after a gap, the poses begin again at the first one, or further off than they ever move in
-    the time: in so long any jump might be a motion by what bodies can."""
+    """Rows behind which, after a gap, the poses begin again at the first one, or at zero, as estimators do, further
+    than they ever move in the time: in so long any jump might be a motion by what bodies can."""
     seconds, step_m = np.diff(stamp_ns) / 1e9, np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     gap = np.diff(stamp_ns) > longest_gap_ns(stamp_ns)
     rows = np.flatnonzero(gap)
@@ -106,7 +106,10 @@ def _restarts(stamp_ns: Ints, poses: Floats) -> Ints:
     again = same[rows + 1] & (far_m[rows] > _AWAY_M)
     if (~gap).sum() >= _LEAST:
         fastest = float(np.quantile((step_m / seconds)[~gap], _FASTEST))
-        again |= step_m[rows] > np.maximum(_PERIODS * fastest * seconds[rows], _AWAY_M)
+        zero = (np.linalg.norm(poses[rows + 1, :3, 3], axis=1) < _AWAY_M) & (
+            se3.angle(poses[rows + 1]) < _LEAST_TURN_RAD
+        )
+        again |= zero & (step_m[rows] > np.maximum(_PERIODS * fastest * seconds[rows], _AWAY_M))
     return rows[again]
 
 

@@ -24,7 +24,9 @@ _STANDING_M_S, _STANDING_RAD_S = 0.01, 0.02
 _SIDEWAYS_M_S2 = 30.0
 """m/s^2; speed times turn rate beyond what any vehicle bears for long: rates in degrees per second."""
 _BIAS_RAD_S = 0.05
-"""rad/s; where wheels tell a speed alone, what turns faster at no speed turns on the spot."""
+"""rad/s; where wheels tell a speed alone, what turns faster at no speed, and not always, turns on the spot."""
+_UNEVEN_RAD_S = 0.1
+"""rad/s; as fast as wheels of two sizes, 1 % apart, turn a straight drive at 15 m/s."""
 _LEAST_STANDING_S = 1.0
 """s of standing in all, from which the mean of a gyroscope is its bias rather than its noise."""
 _LEAST_FIXES = 5
@@ -87,15 +89,17 @@ def gyro_agrees(stamp_ns: Ints, twists: Floats, gyro_ns: Ints, gyro: Floats) -> 
     seconds = np.diff(at_ns)[:, None] / 1e9
     turned = np.stack([np.interp(at_ns - since, gyro_ns - since, column) for column in angle.T], axis=1)
     measured, moving = np.diff(turned, axis=0) / seconds, (twists[1:] + twists[:-1]) / 2
-    sideways = np.linalg.norm(moving[:, :3], axis=1) * np.linalg.norm(measured, axis=1)
-    if np.quantile(sideways, 0.99) > _SIDEWAYS_M_S2:
+    sideways = np.linalg.norm(np.cross(moving[:, :3], measured), axis=1)
+    if np.quantile(sideways, 0.9) > _SIDEWAYS_M_S2:
         return False
     turning = moving[:, 3:]
     steady = float((measured * turning).sum() / max((turning**2).sum(), len(turning) * _STANDING_RAD_S**2))
-    measured, turning = measured - np.median(measured, axis=0), turning - np.median(turning, axis=0)
+    turned_by = np.median(turning, axis=0)
+    measured, turning = measured - np.median(measured, axis=0), turning - turned_by
     axes = np.sqrt((turning**2).mean(0)) > _STANDING_RAD_S
-    if not axes.any():  # less than a fifth may be right: wheels of two sizes turn a straight drive
-        return -_SCALES[0] < steady < _SCALES[1]
+    if not axes.any():  # of a slow turn less than a fifth may be right: wheels of two sizes turn a straight drive
+        slow = np.linalg.norm(turned_by) < _UNEVEN_RAD_S
+        return (-_SCALES[0] if slow else _SCALES[0]) < steady < _SCALES[1]
     measured, turning = measured[:, axes], turning[:, axes]
     common, own = float((measured * turning).sum()), float((turning**2).sum())
     return _SCALES[0] < common / own < _SCALES[1] and common**2 > _AGREES * own * float((measured**2).sum())
@@ -122,8 +126,11 @@ def turned_by_gyro(stamp_ns: Ints, twists: Floats, gyro_ns: Ints, gyro: Floats) 
     standing &= measured
     seconds = float(np.diff(at_ns)[standing[1:] & standing[:-1]].sum()) / 1e9
     bias = np.median(rates[standing], axis=0) if seconds >= _LEAST_STANDING_S else None
-    if bias is not None and not twists[:, 3:].any() and np.linalg.norm(bias) > _BIAS_RAD_S:
-        bias = None
+    if bias is not None and not twists[:, 3:].any():
+        going = rates[measured & ~standing] - bias
+        spread = np.subtract(*np.quantile(rates[standing], (0.95, 0.05), axis=0)).max()
+        spread = max(spread, np.abs(np.median(going, axis=0)).max() if len(going) else 0.0)
+        bias = None if min(spread, np.linalg.norm(bias)) > _BIAS_RAD_S else bias
     turning = np.where(measured[:, None], rates - (0.0 if bias is None else bias), turning)
     return at_ns, np.concatenate([linear, turning], axis=1), None if bias is None else float(np.linalg.norm(bias))
 

@@ -72,6 +72,8 @@ _W_FIRST = "does not point where it goes"
 _STEP_M, _TIMES, _EXCESS_M = 0.2, 3.0, 10.0
 """m of a step that is more than noise; and how many times, and m, the path of these is longer than that over poses a
 second apart where two nodes publish what has drifted apart."""
+_NEAR = 0.3
+"""Share of such a step within which the poses two apart lie."""
 _HANGS_M_S2 = -5.0
 """m/s^2 along the z of an IMU, below which gravity tells that it hangs upside down, or is forward-right-down."""
 _FASTEST = 1e3, 100.0
@@ -113,7 +115,8 @@ def score_source(
         evidence[_TURNS] = _LEAST_FACTOR
     _, rows = np.unique((stamp_ns - stamp_ns[0]) // 10**9, return_index=True)
     apart_m = float(np.linalg.norm(np.diff(poses[rows, :3, 3], axis=0), axis=1).sum())
-    if float(step_m[step_m > _STEP_M].sum()) > max(_TIMES * apart_m, apart_m + _EXCESS_M):
+    long = np.flatnonzero(step_m > _STEP_M)
+    if float(step_m[long].sum()) > max(_TIMES * apart_m, apart_m + _EXCESS_M) and _returns(poses[:, :3, 3], long):
         evidence[_FORTH] = _LEAST_FACTOR
     if source_kind in ("poses", "tf") and path_m > _LEAST_PATH_M and _has_w_first(poses):
         evidence[_W_FIRST] = 0.1
@@ -136,6 +139,16 @@ def _is_headless(poses: Floats, integrated: bool) -> bool:
     velocities = (back @ steps[:, :, None])[:, :, 0]
     ahead = (back @ velocities[:, :, None])[:, :, 0]
     return integrated and _bend(velocities) > max(_BENT, 2 * _bend(ahead))
+
+
+def _returns(position: Floats, steps: Ints) -> bool:
+    """Whether the pose before or behind a step is mostly near the one at its other end: noise and circles do not go
+    back to where they were."""
+    two = np.linalg.norm(position[2:] - position[:-2], axis=1)
+    steps = steps[(steps > 0) & (steps < len(two))]
+    back = np.minimum(two[steps], two[steps - 1])
+    length = np.linalg.norm(position[steps + 1] - position[steps], axis=1)
+    return bool(len(steps)) and bool(np.median(back / length) < _NEAR)
 
 
 def _has_w_first(poses: Floats) -> bool:
@@ -211,7 +224,11 @@ def _by_twists(
     gyro = next((one for one in turns if gyro_agrees(stamp_ns, moving, gyro_ns, one)), None)
     hangs = gyro is not None and gyro is not turns[-1]
     if hangs or (placed is None and frame_name(read.imu.frame) not in ("", track.child, "base_link")):
-        how = "have z down, as gravity tells" if hangs else "be mounted as the body is"
+        how = (
+            "have z down, as its accelerometer tells (or is that of the other sign?)"
+            if hangs
+            else "be mounted as the body is"
+        )
         notes.add(f"{read.imu.topic}: its frame has no static transform; it is taken to {how}.")
     if gyro is None:
         notes.add(
@@ -221,7 +238,7 @@ def _by_twists(
         return _dead_reckoned(stamp_ns, moving, variances, longest_gap_ns(stamp_ns), track.topic, notes)
     longest_ns = longest_gap_ns(stamp_ns)
     stamp_ns, turned, off = turned_by_gyro(stamp_ns, moving, gyro_ns, gyro)
-    bias = "its bias unknown, as the body never stands still for a second"
+    bias = "its bias unknown, as the body does not stand still for a second, but for turns on the spot"
     bias = bias if off is None else f"less a bias of {np.degrees(off):.3f} deg/s at rest"
     notes.add(f"{text}; it turns by the gyroscope of {read.imu.topic}, {bias}.")
     return _dead_reckoned(stamp_ns, turned, np.full_like(turned, np.nan), longest_ns, track.topic, notes)

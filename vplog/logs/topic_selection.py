@@ -320,8 +320,8 @@ def further_cameras(
         elif info not in infos and left is None:
             named = f"the frame_id {c.frame} of another camera" if c.frame else "no frame_id"
             notes.add(
-                f"{c.channel.topic} is calibrated but not used: it has {named}. Take it with a further --image-topic, "
-                "its mount from --calibration."
+                f"{c.channel.topic} is calibrated but not used: it has {named}. Where it is no other picture "
+                "of that one, take it with a further --image-topic, its mount from --calibration."
             )
         taken.add(c.frame)
         infos.add(info)

@@ -33,13 +33,16 @@ _HIGHEST_M = 1e5
 """m; above it is space, so an altitude beyond is damage. As a sigma it gives an altitude no weight."""
 _FASTEST_M_S = 100.0
 """m/s; ground robots and low flights are slower. Faster drives are measured by their own speed:"""
+_SNAP_M = 30.0
+"""m; a nearer one is multipath's, and too little to split a drive by: its residual tells it."""
 _TIMES_USUAL = 10.0
 """times the usual speed between fixes, beyond which they jump."""
 _TIMES_HIGH = 2.0
 """times the speed that nine of ten fixes that confirm each other do not exceed, up to which one that jumps off its
 neighbours is reached from those beyond; and times the way between nine of ten, beyond which one was held back."""
-_USUAL = 0.75
-"""Quantile of the time between fixes that no two are taken to be closer than: of two receivers half are closer."""
+_USUAL, _CROWDED = 0.75, 0.05
+"""Quantile of the time between fixes, half of which are close together where they are of two receivers, and the share
+of it within which two are taken to be as far apart as others."""
 
 
 class PoseTrack:
@@ -324,17 +327,19 @@ def _unreachable(gps: Gps) -> Bools:
     if len(place) < 2:
         return np.zeros(len(place), bool)
     # stamps crowd, as log times of messages that came together, and of two receivers: by them all would be fast
-    seconds = np.append(0.0, np.cumsum(np.maximum(steps, np.quantile(steps, _USUAL))))
+    usual_s = float(np.quantile(steps, _USUAL))
+    seconds = np.append(0.0, np.cumsum(np.where(steps < _CROWDED * usual_s, usual_s, steps)))
     speed = np.linalg.norm(np.diff(place, axis=0), axis=1) / np.diff(seconds)
     fastest = max(_FASTEST_M_S, _TIMES_USUAL * _usual_speed_m_s(place, seconds))
-    bounds = [0, *(np.flatnonzero(speed > fastest) + 1).tolist(), len(place)]
+    jumps = speed > np.maximum(fastest, _SNAP_M / np.diff(seconds))
+    bounds = [0, *(np.flatnonzero(jumps) + 1).tolist(), len(place)]
     every = [(a, b - 1) for a, b in pairwise(bounds)]
     runs = [(a, b) for a, b in every if a < b] or every
     first, last = main = max(runs, key=lambda run: (run[1] - run[0], -run[0]))
     reached = np.zeros(len(place), bool)
     for a, b in [main, *(run for run in runs[::-1] if run < main), *(run for run in runs if run > main)]:
         near, end = (b, first) if b < first else (a, last) if a > last else (a, a)
-        if np.linalg.norm(place[near] - place[end]) <= fastest * abs(seconds[near] - seconds[end]):
+        if np.linalg.norm(place[near] - place[end]) <= max(fastest * abs(seconds[near] - seconds[end]), _SNAP_M):
             reached[a : b + 1] = True
             first, last = min(first, a), max(last, b)
     sure, known = np.flatnonzero(reached), speed[reached[1:] & reached[:-1] & (speed <= fastest)]

@@ -101,7 +101,7 @@ def solve(
     refined = refine(bounded(graph), decision.solution, of_odometry, settings.refine, fixes, decision.sigmas, scale)
     warnings = noise_warnings + build_warnings + (fixes.warnings if fixes else [])
     warnings += about_jump(decision, np.arange(len(keyframes.stamp_ns)))
-    apart = _apart(broken, graph, refined)
+    apart, pieces = _apart(broken, graph, refined)
     if len(apart):
         seconds = (keyframes.stamp_ns[apart[0] + 1] - odometry.stamp_ns[0]) / 1e9
         warnings.append(
@@ -115,21 +115,21 @@ def solve(
     trajectory = correct_trajectory.correct_trajectory(odometry, keyframes, refined.solution.world_from_body)
     return BackEndResult(
         judged_ledger(closures, graph, refined, rows), refined, trajectory, source, warnings, odometry.of_images,
-        1 + len(apart),
+        pieces,
     )  # fmt: skip
 
 
-def _apart(broken: Ints, graph: PoseGraph, refined: Refined) -> Ints:
-    """The breaks of the odometry (edges) that no accepted closure spans, and without fixes on both sides."""
+def _apart(broken: Ints, graph: PoseGraph, refined: Refined) -> tuple[Ints, int]:
+    """The breaks of the odometry (edges) whose sides no accepted closure and no fixes relate, directly or by other
+    pieces, and the number of pieces that remain."""
     accepted = ~graph.odometry & (refined.solution.weight > 0.5)
-    begin, end = (np.sort(rows[accepted]) for rows in (graph.a, graph.b))
-    open_ = begin.searchsorted(broken, "right") == end.searchsorted(broken, "right")  # as many ended as had begun
-    apart = broken[open_]
-    if refined.fixes is None:
-        return apart
-    piece = apart.searchsorted(refined.fixes.row[refined.inlier > 0.5])
-    placed = np.bincount(piece, minlength=len(apart) + 1) >= _FIXES_OF_A_PIECE
-    return apart[~(placed[:-1] & placed[1:])]
+    a, b, earth = broken.searchsorted(graph.a[accepted]), broken.searchsorted(graph.b[accepted]), len(broken) + 1
+    if refined.fixes is not None:
+        fixes = np.bincount(broken.searchsorted(refined.fixes.row[refined.inlier > 0.5]), minlength=earth)
+        placed = np.flatnonzero(fixes >= _FIXES_OF_A_PIECE)
+        a, b = np.append(a, placed), np.append(b, np.full(len(placed), earth))
+    label = build.parts(earth + 1, a, b)[:earth]
+    return broken[label[1:] != label[:-1]], len(np.unique(label))
 
 
 def _contradicted(graph: PoseGraph, solve: Callable[[PoseGraph], Decision]) -> list[str]:

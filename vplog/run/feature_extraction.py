@@ -248,27 +248,23 @@ def extract(
 def decoded(
     keyframes: Keyframes, found: Extracted, settings: FeatureSettings, odometry: Odometry, camera: str
 ) -> tuple[Keyframes, Extracted]:
-    """The keyframes whose images decode and are new, and their features, with a warning where that is not all of them,
-    or where they are poor. Raises LogError where fewer than two are new."""
+    """The keyframes whose images decode, and their features, none where a picture is the one before once more, with a
+    warning where that is so, where images are lost, or where they are poor."""
     rows, total = np.searchsorted(keyframes.stamp_ns, found.stamp_ns), len(keyframes.stamp_ns)
     for why in found.lost[:1]:
         _log.warning("%d of %d keyframes were lost to damaged images. First: %s", total - len(rows), total, why)
+    if why := poor_pictures(found, getattr(settings, "least_features", 0)):
+        _log.warning(why)
     poses = keyframes.odom_from_body[rows]
     # without metres the motion is that of the pictures, or not known
     if odometry.metric and (stale := stale_pictures(poses, found)).any():
-        since_s = (found.stamp_ns[int(stale.argmax())] - found.stamp_ns[0]) / 1e9
-        line = (
-            f"{int(stale.sum())} of {total} keyframes of {camera} show the picture of the one before although the "
-            f"odometry moves on, the first of them {since_s:.0f} s after the start. They are left out: "
-            "did the camera freeze?"
-        )
-        if (~stale).sum() < 2:
-            raise LogError(f"{line} A graph needs two others: choose another camera with --image-topic.")
-        _log.warning(line)
-        rows, found = rows[~stale], found.without(stale)
-    if why := poor_pictures(found, getattr(settings, "least_features", 0)):
-        _log.warning(why)
-    return Keyframes(keyframes.drive, keyframes.stamp_ns[rows], keyframes.odom_from_body[rows]), found
+        _log.warning(
+            "%d of %d keyframes of %s show the picture of the one before although the odometry moves on, the first of "
+            "them %.0f s after the start. They are matched with nothing: did the camera freeze?",
+            int(stale.sum()), total, camera, (found.stamp_ns[int(stale.argmax())] - found.stamp_ns[0]) / 1e9,
+        )  # fmt: skip
+        found = found.blank(stale)
+    return Keyframes(keyframes.drive, keyframes.stamp_ns[rows], poses), found
 
 
 def stale_pictures(poses: Floats, found: Extracted) -> Bools:

@@ -19,7 +19,7 @@ from vplog.run import provenance
 from vplog.run.cache.stage_cache import CACHE_FILES, ENDING
 from vplog.storage.folders import check_no_picture, check_regular, check_replaceable
 from vplog.storage.input_hashes import bytes_of, hash_inputs
-from vplog.storage.remote_path import located, original, stands_for
+from vplog.storage.remote_path import RemotePath, located, original, stands_for
 
 _RUN_FILES = (
     "run.json", "report.html", "result.mcap", "graph.g2o", "trajectory.tum", "keyframes.parquet", "descriptors.parquet",
@@ -90,7 +90,8 @@ def staged_run(
         if out.absolute().name in _drives_in(_read(above / "run.json") or {}) or (out / "drive.json").exists():
             raise SettingsError(f"{out} is a drive of the run or map in {above}. Choose another folder with -o.")
         for file in files:
-            if file.is_dir() and out.resolve().is_relative_to(file.resolve()):
+            local = file.is_dir() and not isinstance(file, RemotePath)
+            if local and out.resolve().is_relative_to(file.resolve()):
                 raise SettingsError(f"{out} is within the log {file}, which would change by it. Name another with -o.")
         if not cache.force:
             _check_same_logs(out, files)

@@ -131,8 +131,9 @@ def exceeded(found: dict[str, Any], limits: Sequence[str]) -> list[str]:
 
 
 def _are_of_one_log(records: Sequence[dict[str, Any]]) -> bool:
-    """Whether the runs share a file, by its sha256, or a record does not tell."""
-    one, other = ({*map(str, mapping(each.get("inputs")).values())} for each in records)
+    """Whether the runs share a file, by its sha256, or a record does not tell, as of a log on an object store."""
+    inputs = (map(str, mapping(each.get("inputs")).values()) for each in records)
+    one, other = ({sha256 for sha256 in each if " " not in sha256} for each in inputs)
     return not one or not other or not one.isdisjoint(other)
 
 

@@ -64,7 +64,7 @@ class Extracted:
         self.cpu_ms: list[float] = []
         """CPU time of features, where the parts say it."""
         self.files: list[str] = []
-        self._left_out: list[int] = []
+        self._blank: frozenset[int] = frozenset()
         self._rows: list[tuple[Path, int, _Row]] = []
         self._matches: dict[MatchSettings, PairMatches] = {}
 
@@ -100,7 +100,7 @@ class Extracted:
     @property
     def token(self) -> str:
         """Stands for all that the features were made from: the names of the files hold the hashes of that."""
-        return " ".join([*self.files, *map(str, self._left_out)])
+        return " ".join([*self.files, *map(str, sorted(self._blank))])
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -109,7 +109,8 @@ class Extracted:
         """The features of keyframe `at`. Raises ResultError where its file is gone."""
         path, begin, row = self._rows[at]
         data = _bytes_at(path, begin + row.offset, row.size)
-        return features_from(data, row.features, row.width, row.height, bool(row.thumbnail), row.values)
+        found = features_from(data, row.features, row.width, row.height, bool(row.thumbnail), row.values)
+        return found.rows(slice(0)) if at in self._blank else found
 
     def repeats(self) -> Bools:
         """(N,) whether each keyframe shows the picture of the one before: features that are the same to the last bit,
@@ -122,12 +123,10 @@ class Extracted:
                 found[at] = same and np.array_equal(one.descriptors, other.descriptors)
         return found
 
-    def without(self, rows: Bools) -> Extracted:
-        """All but some (N,) of the keyframes."""
-        found, kept = copy(self), np.flatnonzero(~rows).tolist()
-        found._left_out = np.array(self.stamp_ns)[rows].tolist()
-        found.stamp_ns, found._rows = [self.stamp_ns[at] for at in kept], [self._rows[at] for at in kept]
-        found._matches = {}
+    def blank(self, rows: Bools) -> Extracted:
+        """The keyframes, some (N,) of them without features."""
+        found = copy(self)
+        found._blank, found._matches = frozenset(np.flatnonzero(rows).tolist()), {}
         return found
 
     def matches(self, settings: MatchSettings) -> PairMatches:
@@ -137,7 +136,7 @@ class Extracted:
     @property
     def counts(self) -> list[int]:
         """Number of features of each keyframe."""
-        return [row.features for _, _, row in self._rows]
+        return [0 if at in self._blank else row.features for at, (_, _, row) in enumerate(self._rows)]
 
     @property
     def has_pictures(self) -> bool:
