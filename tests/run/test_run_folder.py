@@ -116,7 +116,8 @@ def test_a_run_is_not_written_into_its_log(tmp_path: Path) -> None:
 def test_a_log_on_an_object_store_may_be_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RemotePath, "is_dir", lambda _: True)
     head: dict[str, Any] = {"settings": {}, "log": "s3://bucket/drive"}
-    with staged_run(tmp_path / "out", head, [RemotePath("s3://bucket/drive")], cache=CacheOptions(force=True)) as made:
+    paths: list[Any] = [RemotePath("s3://bucket/drive")]
+    with staged_run(tmp_path / "out", head, paths, cache=CacheOptions(force=True)) as made:
         (made / "run.json").write_text("{}")
     assert (tmp_path / "out" / "run.json").is_file()
 
