@@ -130,7 +130,7 @@ def test_stamps_that_are_none_give_way_to_the_log_times(header: object, said: st
     assert notes.lines == []
 
 
-@pytest.mark.parametrize("rate", [0.05, 0.3, 20.0])
+@pytest.mark.parametrize("rate", [0.01, 0.05, 0.3, 20.0])
 def test_a_simulation_keeps_its_stamps(rate: float) -> None:
     """Slow or fast, and of transforms that come in bursts with one stamp."""
     true_ns, log_ns = times(300)

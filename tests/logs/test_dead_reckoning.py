@@ -126,6 +126,8 @@ def test_turns_on_the_spot_are_no_bias_where_wheels_tell_a_speed_alone() -> None
     found = turned_by_gyro(stamps(wheels_s), moving, stamps(gyro_s), gyro)
     assert found[2] is None
     np.testing.assert_allclose(found[1][[100, -100], 5], [0.5, 0.1])
+    biased = turned_by_gyro(stamps(wheels_s), moving, stamps(gyro_s), np.full((len(gyro_s), 3), 0.07))
+    assert biased[2] == pytest.approx(0.07 * 3**0.5)  # a cheap gyroscope's, all the way
     moving[wheels_s > 20, 5] = 0.1  # that wheels tell turns makes it one
     assert turned_by_gyro(stamps(wheels_s), moving, stamps(gyro_s), gyro)[2] == pytest.approx(0.5)
 
@@ -181,6 +183,16 @@ def test_a_drive_that_goes_on_through_a_gap_does_not_start_again(gap_s: float, m
     found = without_jumps(Odometry(stamps(at_s), poses, None), "/odom", notes := Notes())
     assert not len(found.breaks)
     assert notes.lines == []
+
+
+def test_a_drive_that_is_faster_within_a_gap_does_not_start_again() -> None:
+    """From one yard to another, while the recorder was paused."""
+    at_s = np.concatenate([np.arange(0, 60, 0.05), np.arange(160, 220, 0.05)])
+    poses = np.tile(np.eye(4), (len(at_s), 1, 1))
+    poses[:, 0, 3] = np.where(at_s < 100, 2.0 * at_s, 920.0 + 2.0 * (at_s - 160))
+    assert not len(without_jumps(Odometry(stamps(at_s), poses, None), "/odom", Notes()).breaks)
+    poses[1200:, 0, 3] -= 920.0  # as of an estimator that was restarted
+    assert len(without_jumps(Odometry(stamps(at_s), poses, None), "/odom", Notes()).breaks) == 1
 
 
 def test_a_robot_that_comes_back_to_its_dock_does_not_start_again() -> None:

@@ -90,6 +90,20 @@ def test_what_is_no_position_is_left_out_and_said(seed: int, case: tuple[dict[st
     assert says in said and ("5 " in said or "4 of 40 fixes left out: they repeat" in said)
 
 
+@given(seeds)
+def test_a_snap_of_some_metres_splits_no_drive(seed: int) -> None:
+    """At 10 Hz 14 m are 140 m/s: multipath, which the residuals of the fixes tell."""
+    rng = np.random.default_rng(seed)
+    north_m = 0.5 * np.arange(600) + rng.normal(0, 0.5, 600)
+    north_m[rng.choice(600, 3, replace=False)] += 14.0
+    gps, _ = track([
+        FixMessage(START_NS + row * 10**8, True, 48 + north / DEGREE_M, 11.0, 500.0, np.eye(3), "gps")
+        for row, north in enumerate(north_m.tolist())
+    ])  # fmt: skip
+    assert gps is not None
+    assert len(gps.stamp_ns) >= 597
+
+
 @given(seeds, st.sampled_from(["bursts", "one", "pairs", "same"]), st.booleans())
 def test_stamps_that_crowd_make_no_fix_unreachable(seed: int, how: str, wrong: bool) -> None:
     """Log times of messages that came together, a stamp 1 ms behind its neighbour's, two receivers; 1 m of noise."""

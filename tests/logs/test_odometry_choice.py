@@ -290,10 +290,16 @@ def test_two_publishers_of_one_topic_are_not_taken_silently(request_it: bool, tm
     assert "goes back and forth" in " ".join(logs.open(drive(tmp_path / "alone", both)).info().warnings)
 
 
-@pytest.mark.parametrize(("speed_m_s", "noise_m", "hz"), [(0.0, 0.02, 20), (1.0, 0.02, 50), (30.0, 0.3, 20)])
-def test_noise_is_no_second_publisher(speed_m_s: float, noise_m: float, hz: int) -> None:
+@pytest.mark.parametrize("circles", [False, True])
+@pytest.mark.parametrize(
+    ("speed_m_s", "noise_m", "hz"), [(0.0, 0.02, 20), (1.0, 0.02, 50), (30.0, 0.3, 20), (0.0, 0.2, 10), (0.0, 0.1, 50)]
+)
+def test_noise_is_no_second_publisher(speed_m_s: float, noise_m: float, hz: int, circles: bool) -> None:
+    """Nor are circles that take a second each."""
     at_s = np.arange(0, 120, 1 / hz)
     place = np.outer(at_s * speed_m_s, [1, 0, 0]) + np.random.default_rng(8).normal(0, noise_m, (len(at_s), 3))
+    if circles:
+        place[:, :2] += np.stack([np.cos(2 * np.pi * at_s), np.sin(2 * np.pi * at_s)], axis=1)
     one = Odometry((at_s * 1e9).astype(np.int64), matrices(place, Rotation.identity(len(at_s))), None)
     found = score_source(Channel("/odom", "nav_msgs/Odometry", "cdr"), ["odom", "base_link"], one, one.stamp_ns, NONE)
     assert not [what for what in found.evidence if "back and forth" in what]

@@ -148,6 +148,17 @@ def going(*way: float) -> Odometry:
     return Odometry(np.arange(20), se3.pose(np.tile(np.eye(3), (20, 1, 1)), steps), None)
 
 
+def turning(axis: int) -> Odometry:
+    """Along x, turning about an axis."""
+    twist = np.zeros((20, 6))
+    twist[:, 3], twist[:, axis] = 1.0, 0.05
+    steps = se3.exp(twist)
+    poses = [steps[0]]
+    for step in steps[1:]:
+        poses.append(poses[-1] @ step)
+    return Odometry(np.arange(20), np.array(poses), None)
+
+
 X, Y, Z = going(1, 0, 0), going(0.5, 1, 0.5), going(0, 0, 1)
 """Odometries: a vehicle's, one carried by hand, a camera's own."""
 
@@ -166,6 +177,10 @@ X, Y, Z = going(1, 0, 0), going(0.5, 1, 0.5), going(0, 0, 1)
         ("base_link", "base_link", False, X, "z", False),
         ("", "camera", False, X, "x", True),
         ("", "camera", False, Y, "z", False),
+        ("", "camera", False, turning(2), "x", True),
+        ("", "camera", False, turning(1), "z", False),  # of a camera that looks aside
+        ("", "camera", False, going(-1, 0, 0), "z", False),
+        ("left_optical_frame", "camera", False, X, "z", True),
         ("", "", False, Z, "z", False),
     ],
 )
