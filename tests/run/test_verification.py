@@ -79,7 +79,7 @@ def test_candidates_behind_the_best_are_verified_where_better_ones_show_the_view
 def test_where_enough_of_the_best_are_accepted_the_others_are_left_out(
     enough: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of three keyframes with four candidates each, so many of the best two are accepted: 0, 1 and 2."""
+    """Three keyframes have four candidates each, of whose best two 0, 1 and 2 are accepted."""
     query, rank = (grid.ravel().astype(np.int32) for grid in np.mgrid[10:13, 0:4])
     proposals = Proposals(query, rank * 2, rank, np.ones(12, np.float32), rank)
     known = make_run(3).closures

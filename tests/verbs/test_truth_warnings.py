@@ -1,5 +1,5 @@
-"""What bears on the figures against the truth is said wherever they stand: on the terminal, in JSON, in a report and in
-a comparison of runs."""
+"""Warnings about the truth stand wherever its figures do: on the terminal, in JSON, in a report and in a comparison of
+runs."""
 
 from __future__ import annotations
 

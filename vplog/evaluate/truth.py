@@ -66,7 +66,7 @@ def ate_to_gps(estimate: Trajectory, gps: Gps, alignment: str = "se3") -> Ate:
 
 
 def truth_warnings(found: dict[str, Any]) -> list[str]:
-    """What bears on the figures that `evaluate` found of one drive, by the record of them."""
+    """Warnings that bear on the figures of one drive, by the record of `evaluate`."""
     truth, warnings = found["truth_is"], []
     if found["scale"] is not None:
         warnings.append(

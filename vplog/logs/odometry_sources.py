@@ -85,7 +85,7 @@ _DOUBTS = {
     _W_FIRST: "are its quaternions in the order w x y z?", _FORTH: "do two nodes publish it?",
     _HEADLESS: "is it a receiver's, which does not know where the body heads?",
 }  # fmt: skip
-"""What to ask where the evidence against the source that is taken begins so."""
+"""Question to the user where the evidence against the source that is taken begins so."""
 
 
 def score_source(
