@@ -52,23 +52,13 @@ def test_candidates_behind_the_best_are_verified_where_better_ones_show_the_view
     """Of six keyframes with four candidates each the third has one that shares enough matches, at rank 1."""
     query, rank = (grid.ravel().astype(np.int32) for grid in np.mgrid[10:16, 0:4])
     proposals = Proposals(query, rank * 2, rank, np.ones(24, np.float32), rank)
-    known = make_run(3).closures
 
-    def verified(_: Any, parts: list[Any]) -> list[Closures]:
-        return [ledger(part) for part, *_ in parts]
-
-    def ledger(part: Proposals) -> Closures:
+    def verdicts(part: Proposals) -> list[Verdict]:
         alike = (part.query == 12) & (part.rank == 1)
-        verdict = [Verdict.TOO_FEW_INLIERS if one else Verdict.TOO_FEW_MATCHES for one in alike]
-        return replace(known.rows(np.zeros(len(part.query), np.int64)), **vars(part), verdict=verdict)
+        return [Verdict.TOO_FEW_INLIERS if one else Verdict.TOO_FEW_MATCHES for one in alike]
 
-    monkeypatch.setattr(verification, "calibrated", lambda *_: 0.0)
     for always, expected in ((1, {0}), (2, {0, 1}), (9, {0, 1, 2, 3})):
-        drive: Any = SimpleNamespace(
-            settings=VerifySettings(always=always), keyframes=SimpleNamespace(stamp_ns=range(16))
-        )
-        steps: Any = SimpleNamespace(in_parts=verified)
-        found = verification.verify(proposals, drive, steps=steps)
+        found = _verified(proposals, VerifySettings(always=always), verdicts, monkeypatch)
         ranks = {one: set(found.rank[found.query == one].tolist()) for one in range(10, 16)}
         near = {0, 1, 2, 3} if always > 1 else expected
         assert [ranks[one] for one in range(10, 16)] == [expected, near, near, near, expected, expected]
@@ -82,21 +72,32 @@ def test_where_enough_of_the_best_are_accepted_the_others_are_left_out(
     """Three keyframes have four candidates each, of whose best two 0, 1 and 2 are accepted."""
     query, rank = (grid.ravel().astype(np.int32) for grid in np.mgrid[10:13, 0:4])
     proposals = Proposals(query, rank * 2, rank, np.ones(12, np.float32), rank)
-    known = make_run(3).closures
 
-    def verified(_: Any, parts: list[Any]) -> list[Closures]:
-        return [ledger(part) for part, *_ in parts]
+    def verdicts(part: Proposals) -> list[Verdict]:
+        return [Verdict.ACCEPTED if one else Verdict.TOO_FAR for one in part.rank < part.query - 10]
 
-    def ledger(part: Proposals) -> Closures:
-        verdict = [Verdict.ACCEPTED if one else Verdict.TOO_FAR for one in part.rank < part.query - 10]
-        return replace(known.rows(np.zeros(len(part.query), np.int64)), **vars(part), verdict=verdict)
-
-    monkeypatch.setattr(verification, "calibrated", lambda *_: 0.0)
-    settings, count = VerifySettings(always=2, enough=enough), SimpleNamespace(stamp_ns=range(13))
-    drive: Any = SimpleNamespace(settings=settings, keyframes=count)
-    found = verification.verify(proposals, drive, steps=SimpleNamespace(in_parts=verified))  # type: ignore[arg-type]
+    found = _verified(proposals, VerifySettings(always=2, enough=enough), verdicts, monkeypatch)
     counts = np.bincount(found.query)[10:].tolist()
     assert counts == [2 if enough and accepted >= enough else 4 for accepted in range(3)]
+
+
+def _verified(
+    proposals: Proposals, settings: VerifySettings, verdicts: Callable[[Proposals], list[Verdict]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> Closures:  # fmt: skip
+    """The ledger of candidates whose verdicts are given."""
+    known = make_run(3).closures
+
+    def ledgers(_: Any, parts: list[Any]) -> list[Closures]:
+        return [
+            replace(known.rows(np.zeros(len(part.query), np.int64)), **vars(part), verdict=verdicts(part))
+            for part, *_ in parts
+        ]
+
+    monkeypatch.setattr(verification, "calibrated", lambda *_: 0.0)
+    drive: Any = SimpleNamespace(settings=settings, keyframes=SimpleNamespace(stamp_ns=range(16)))
+    steps: Any = SimpleNamespace(in_parts=ledgers)
+    return verification.verify(proposals, drive, steps=steps)
 
 
 def _taken(closures: Closures, rows: Any) -> Closures:

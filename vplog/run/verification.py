@@ -58,9 +58,11 @@ def verify(proposals: Proposals, drive: DriveFeatures, *, steps: Steps) -> Closu
     first = verified(np.flatnonzero(best))
     alike = first.query[~first.of(Verdict.TOO_FEW_MATCHES)]
     near = np.isin(proposals.query, np.concatenate([alike - 1, alike, alike + 1]))
-    accepted = np.bincount(first.query[first.accepted], minlength=len(drive.keyframes.stamp_ns))
-    few = accepted[proposals.query] < drive.settings.enough if drive.settings.enough else True
-    more = np.flatnonzero(~best & near & few)
+    others = ~best & near
+    if drive.settings.enough:
+        accepted = np.bincount(first.query[first.accepted], minlength=len(drive.keyframes.stamp_ns))
+        others &= accepted[proposals.query] < drive.settings.enough
+    more = np.flatnonzero(others)
     return merged([first, verified(more)], [np.flatnonzero(best), more]) if len(more) else first
 
 
