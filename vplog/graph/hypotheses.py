@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from vplog.data import Bools, Floats, Ints, PoseGraph
-    from vplog.stages import Optimiser
 
     Cost = Callable[[Factors, Floats, Floats], float]
 
@@ -62,8 +61,7 @@ _SHARES = (1.0, 0.25, 0.0625)
 """Shares of the odometry's sigmas by which families are told apart."""
 _VERY_STRONG = 5.0
 """Log of the odds by which closures must be likelier true than all false to be used, as a false one does more harm than
-a true one good: Kass and Raftery, Bayes Factors, 1995, call it very strong. What another method that was chosen makes
-of them is used where the odds are even."""
+a true one good: Kass and Raftery, Bayes Factors, 1995, call it very strong."""
 _STRONG = 3.0
 """Likewise, where recognition tells the closures of this drive from its pairs that are none: there, 20 to 1 is strong
 evidence, and more cannot be counted from some hundred pairs."""
@@ -93,9 +91,9 @@ class Hypothesis:
 
 
 def best_hypothesis(
-    graph: PoseGraph, optimiser: Optimiser, cost: Cost | None = None, log_odds: Floats | None = None
+    graph: PoseGraph, gnc: GncSettings, cost: Cost | None = None, log_odds: Floats | None = None
 ) -> Hypothesis:
-    """The hypothesis of greatest evidence: the optimiser's, with `gnc` from several starts, or that none is true.
+    """Return the hypothesis of greatest evidence: a result of `gnc` from several starts, or that no closure is true.
 
     `cost` is what other measurements cost more with factors, weights and poses: by how much their log likelihood falls.
     `log_odds` (E,) are of being false by recognition and geometry; where they are sure, odometry alone is best only if
@@ -106,22 +104,15 @@ def best_hypothesis(
     claimed = Factors.of(graph)
     none = np.where(is_loop(graph), 0.0, 1.0)
     chain = OdometryChain.of(graph)
-    found: list[Hypothesis] = []
-    if isinstance(optimiser, GncSettings):
-        found = _searched(claimed, optimiser, loops, chain)
-        found += _at_the_sigmas_of_others(claimed, found)
-    else:
-        solution = optimiser(graph)
-        weight = np.where(solution.weight > 0.5, 1.0, 0.0)
-        found.append(_refit(claimed, weight, solution.world_from_body, Sigmas()))
+    found = _searched(claimed, gnc, loops, chain)
+    found += _at_the_sigmas_of_others(claimed, found)
     likeliest = [one.sigmas for one in _likeliest(found)]
     for sigmas in dict.fromkeys([Sigmas(), *likeliest]):  # others would be of what false closures happen to share
         alone = hypothesis_of(claimed, none, chain.poses, sigmas)
-        margin = _VERY_STRONG if isinstance(optimiser, GncSettings) else 0.0
-        found.append(replace(alone, log_evidence=alone.log_evidence + margin))
+        found.append(replace(alone, log_evidence=alone.log_evidence + _VERY_STRONG))
     best = _likeliest(found)[0] if cost is None else _least_cost(claimed, found, cost)
     if best.weight[loops].any():
-        others = attempted(lambda: _readmitted(claimed, best, optimiser, cost))
+        others = attempted(lambda: _readmitted(claimed, best, gnc, cost))
         others = others or attempted(lambda: _undisputed(claimed, best, found, cost))
     elif log_odds is not None:
         some = _likeliest([one for one in found if one.weight[loops].any()])
@@ -153,7 +144,7 @@ def _contradict(one: Hypothesis, other: Hypothesis) -> bool:
     return bool((one.weight > other.weight).any() and (one.weight < other.weight).any())
 
 
-def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: Cost | None) -> list[Hypothesis]:
+def _readmitted(claimed: Factors, best: Hypothesis, gnc: GncSettings, cost: Cost | None) -> list[Hypothesis]:
     """The hypothesis with the closures that it predicts within the noise that the log claims, unless that is very
     unlikely where noise has heavy tails: estimated from those that fit best, noise is too small for the others.
 
@@ -164,10 +155,10 @@ def _readmitted(claimed: Factors, best: Hypothesis, optimiser: Optimiser, cost: 
     unlikely, the least likely ones are left out.
     """
     loops, rejected = is_loop(claimed.graph), np.flatnonzero(best.weight == 0)
-    if not len(rejected) or not isinstance(optimiser, GncSettings):
+    if not len(rejected):
         return []
     d = degrees_of_freedom(claimed.graph)
-    quantile = chi2_quantile(optimiser.inlier_probability, d)
+    quantile = chi2_quantile(gnc.inlier_probability, d)
     poses = descend(claimed, best.weight, best.poses, _STEPS, _TOLERANCE).world_from_body
     apart, _ = distance(claimed, best.weight, poses, rejected)
     within = rejected[apart <= quantile]

@@ -46,14 +46,17 @@ class Decision(NamedTuple):
 def decided(
     graph: PoseGraph, optimiser: Optimiser, cost: Cost | None = None, log_odds: Floats | None = None
 ) -> Decision:
-    """The hypothesis of greatest evidence, less what it costs other measurements, solved.
+    """Decide which closures are true, and solve the graph with them.
 
-    `log_odds` (E,) are of being false by what else is known of a closure. Raises GraphError where the graph cannot be
-    solved.
+    With `gnc` the decision is the hypothesis of greatest evidence, less the cost of other measurements (`cost`). Every
+    other optimiser decides by itself, and its solution is returned unchanged. `log_odds` (E,) are the log odds that an
+    edge is false, by recognition and geometry.
+
+    Raises GraphError if the graph cannot be solved.
     """
     graph, _ = checked(graph)
     loops = is_loop(graph)
-    if not loops.any():
+    if not isinstance(optimiser, GncSettings) or not loops.any():
         return Decision(graph, optimiser(graph), Sigmas())
     best = best_hypothesis(graph, optimiser, cost, log_odds)
     if best.sigmas.at_bound:  # beyond it true closures are lost
@@ -66,8 +69,6 @@ def decided(
         before, after = (half_chi2(graph, best.weight, poses) for poses in (graph.world_from_body, best.poses))
         solution = Solution(best.poses, best.weight, before, after, 0, True, why)
         return Decision(graph, solution, Sigmas())  # nothing tells
-    if not isinstance(optimiser, GncSettings):
-        return Decision(graph, optimiser(graph), best.sigmas)
     found = f"{inliers} of {count} closures were kept. "
     solution = solve_weighted(
         Factors.of(graph), best.weight, best.poses, optimiser.max_iterations, optimiser.tolerance, found
