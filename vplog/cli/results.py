@@ -236,7 +236,7 @@ def add_results(
     option(sub, "graph", parser.local_file, "GRAPH.g2o")
     option(sub, "-o --output", _graph, "OUT", "the graph at its solved poses, as g2o", required=True)
     sub.add_argument("--method", choices=_SOLVERS, default="gnc", help="robust method, or lm (default: gnc)")
-    text = "report whether the solution is the global optimum of the accepted edges, and look for a better one if not"
+    text = "report whether the solution is the global optimum of the accepted edges"
     sub.add_argument("--certify", action="store_true", help=text)
 
 

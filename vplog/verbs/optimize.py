@@ -46,8 +46,8 @@ def optimize(path: Path, out: Path, method: str = "gnc", certify: bool = False) 
     closures are judged by the noise that they imply, which the record has as `sigmas` of each part.
 
     Parts that no edge joins are solved each by itself. The pose that FIX names, else the first of each part, stays
-    where it is. With `certify` the record has a `certificate`: whether the solution is the global optimum of the edges
-    accepted. Where it is not and a better one is found, that is taken.
+    where it is. With `certify` the record has a `certificate`: whether the solution is the global optimum of the
+    accepted edges. If the check finds better poses on its way, these are returned.
 
     Raises GraphError where the graph cannot be read or solved, ResultError where `out` cannot be written.
     """
