@@ -16,4 +16,5 @@ done = vplog.batch(logs, place, settings=settings)
 for drive in done["drives"]:
     print(drive["drive"], drive["state"], drive["error"])
 answers = vplog.open_map(place).query(query, top=3)
-print(answers.table.to_pandas()[["query", "rank", "drive", "keyframe", "score"]].head(9).to_string(index=False))
+for answer in answers.table.slice(0, 9).to_pylist():
+    print(*(answer[name] for name in ("query", "rank", "drive", "keyframe", "score")))

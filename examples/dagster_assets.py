@@ -1,5 +1,6 @@
 """Assets for Dagster: a map of the drives of a manifest, and a check of it against the truth.
 
+pip install . dagster dagster-webserver
 dagster dev -f examples/dagster_assets.py
 """
 

@@ -1,5 +1,6 @@
 """A network in an ONNX file as a recogniser. A small one is made here; yours comes from torch.onnx.export.
 
+pip install '.[onnx]' onnx
 python examples/own_network.py LOG FOLDER [SETTING=VALUE ...]
 """
 

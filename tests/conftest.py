@@ -16,6 +16,7 @@ import pytest
 from hypothesis import settings
 
 from tests import durations
+from tests.plain_install import make_environment
 from tests.remembered import remember
 from vplog.cli import main, progress
 from vplog.execution.execution import Execution
@@ -191,6 +192,18 @@ def made_once(shared_folder: Path) -> Callable[[str, Callable[[Path], object]], 
         return folder
 
     return made
+
+
+@pytest.fixture(scope="session")
+def environment(made_once: Callable[..., Path]) -> Callable[..., Path]:
+    """Return a virtual environment with the checkout and these requirements, and without any other package."""
+
+    def installed(*requirements: str) -> Path:
+        wanted = sorted({".", *requirements})
+        name = "-".join(["environment", *wanted]).replace("/", "")
+        return made_once(name, lambda folder: make_environment(folder, *wanted))
+
+    return installed
 
 
 @pytest.fixture(scope="session")

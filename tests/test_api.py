@@ -3,44 +3,27 @@
 from __future__ import annotations
 
 import inspect
-import json
 import multiprocessing
 import os
 import pydoc
-import runpy
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 import vplog
 from tests.batch.test_batch import QUICK
 from tests.maps.bucket import serving
 from vplog import errors
-from vplog.batch.worker import DriveState
 from vplog.execution.process_pool import OwnProcesses
 from vplog.results.run_record import read_run_json
 from vplog.storage.remote_path import local_output, located
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 TOP = Path(vplog.__file__).parents[1]
-EXAMPLES = TOP / "examples"
-CELLS = """
-import json, sys
-with open(sys.argv[1]) as file:
-    cells = json.load(file)["cells"]
-for cell in cells:
-    if cell["cell_type"] == "code":
-        exec("".join(cell["source"]))
-"""
-"""As a notebook has them: in order, in a main module that is no file."""
 
 
 def python(*arguments: object, folder: Path) -> str:
@@ -198,121 +181,3 @@ def test_a_daemonic_process_is_refused_a_batch(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)  # pyrefly: ignore[missing-attribute]
     with pytest.raises(vplog.SettingsError, match="daemonic"):
         OwnProcesses(1).begin()
-
-
-def test_from_a_script_without_a_guard(tiny: Tiny, tmp_path: Path) -> None:
-    """examples/batch_and_query.py: if it ran again in the processes of the drives, these would fail."""
-    out = python(EXAMPLES / "batch_and_query.py", tmp_path / "map", tiny.log, tiny.log, *QUICK, folder=tmp_path)
-    assert out.splitlines()[0].split() == ["drive", "computed"]
-    assert out.count("computed") == 1
-    found = vplog.open_map(tmp_path / "map")
-    assert [one["drive"] for one in found.info(check=True)["drives"]] == ["drive"]
-    answers = found.query(tiny.log, 2, sequence=1)
-    assert isinstance(answers.table, pa.Table)
-    columns = answers.table.column_names  # the record has what decided the best ones, too
-    assert answers.table.to_pylist() == [{name: one[name] for name in columns} for one in answers.record["answers"]]
-    own = vplog.open_run(tmp_path / "map" / "runs" / "drive=drive")
-    assert len(answers.table) == 2 * len(own.keyframes)
-
-
-def test_from_a_notebook(tmp_path: Path) -> None:
-    notebook = EXAMPLES / "tour.ipynb"
-    assert "frames" in python("-c", CELLS, notebook, folder=tmp_path)
-    cells = json.loads(notebook.read_text())["cells"]
-    assert not [cell for cell in cells if cell.get("outputs")], "outputs are not part of the checkout"
-
-
-EXAMPLE_CALLS = {
-    "run_and_evaluate.py": (lambda drive, run, out: [drive.log, drive.truth, out / "run", *QUICK], "ATE after"),
-    "closures_to_pandas.py": (lambda drive, run, out: [run.folder], "keyframes"),
-    "compare_recognisers.py": (lambda drive, run, out: [drive.log, "features.max_features=300"], "recall at 1"),
-    "own_network.py": (lambda drive, run, out: [drive.log, out, "features.max_features=50"], "means.onnx recall"),
-    "own_vectors.py": (lambda drive, run, out: [drive.log, out / "v.parquet", "features.max_features=50"], "recall"),
-    "plot_result.py": (lambda drive, run, out: [run.folder, out / "picture.png"], ""),
-}
-
-
-@pytest.mark.parametrize("name", sorted(EXAMPLE_CALLS))
-def test_examples(
-    name: str, tiny: Tiny, run: vplog.RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
-    if name == "own_network.py":
-        pytest.importorskip("onnx", reason="onnx, which makes the network, is not installed")
-        pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed: pip install 'vplog[onnx]'")
-    arguments, said = EXAMPLE_CALLS[name]
-    monkeypatch.setattr(sys, "argv", [name, *map(str, arguments(tiny, run, tmp_path))])
-    runpy.run_path(str(EXAMPLES / name), run_name="__main__")
-    assert said in capsys.readouterr().out
-
-
-class Scheduler:
-    """Stands for Airflow and for Dagster: calls what is decorated, and keeps what it answers."""
-
-    def __init__(self) -> None:
-        self.answers: dict[str, Any] = {}
-        self.log = self
-
-    def __getattr__(self, name: str) -> Any:
-        """A class of Dagster: the values that it is made of."""
-        return lambda **values: values
-
-    def info(self, _: str) -> None: ...
-
-    def asset(self, function: Callable[..., Any]) -> None:
-        self.answers[function.__name__] = function(*[self] * len(inspect.signature(function).parameters))
-
-    def task(self, function: Any = None, **_: Any) -> Any:
-        if function is None:
-            return self.task
-        return lambda: self.answers.update({function.__name__: function()}) or self
-
-    def __rshift__(self, _: object) -> None: ...
-
-    def dag(self, **_: Any) -> Any:
-        return lambda function: function
-
-    def asset_check(self, **_: Any) -> Any:
-        return self.asset
-
-
-@pytest.mark.parametrize(
-    ("name", "module", "answers"),
-    [
-        ("airflow_dag.py", "airflow.sdk", {"compute": 1, "check": 0.5}),
-        (
-            "dagster_assets.py",
-            "dagster",
-            {
-                "fleet_map": {"metadata": {"drives": 1, "failed": 0}},
-                "accuracy": {"passed": True, "metadata": {"ATE in m": "0.5"}},
-            },
-        ),
-    ],
-)
-def test_examples_for_schedulers(
-    name: str, module: str, answers: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Without the schedulers; what they call takes these arguments and answers so."""
-    batch, evaluate = inspect.signature(vplog.batch), inspect.signature(vplog.evaluate)
-
-    def computed(*arguments: Any, **more: Any) -> dict[str, Any]:
-        on_drive = batch.bind(*arguments, **more).arguments.get("on_drive", lambda _: None)
-        on_drive(DriveState("a", "a.mcap", "computed"))
-        return {"drives": [{"drive": "a", "state": "computed", "error": ""}], "failed": 0}
-
-    def evaluated(*arguments: Any, **more: Any) -> dict[str, Any]:
-        evaluate.bind(*arguments, **more)
-        return {"groups": {"all": {"ate_m": 0.5}}}
-
-    scheduler: Any = Scheduler()
-    monkeypatch.setattr(vplog, "batch", computed)
-    monkeypatch.setattr(vplog, "evaluate", evaluated)
-    monkeypatch.setitem(sys.modules, module.partition(".")[0], scheduler)
-    monkeypatch.setitem(sys.modules, module, scheduler)
-    runpy.run_path(str(EXAMPLES / name))
-    assert scheduler.answers == answers
-
-
-def test_every_example_is_run() -> None:
-    others = {"batch_and_query.py", "airflow_dag.py", "dagster_assets.py"}
-    assert {path.name for path in EXAMPLES.glob("*.py")} == {*EXAMPLE_CALLS, *others}

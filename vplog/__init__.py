@@ -3,7 +3,7 @@
     import vplog
 
     run = vplog.run("drive.mcap", "out")          # as `vplog run drive.mcap -o out`
-    run.closures.to_pandas()                      # tables are Arrow tables
+    run.closures.to_pylist()                      # tables are Arrow tables
     vplog.evaluate(run, "truth.tum")["ate_after"]
 
 Files and folders are a str, a Path or a URL: s3://, gs://, az://, http(s):// to read. What cannot be done raises a

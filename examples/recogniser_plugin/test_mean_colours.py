@@ -1,4 +1,8 @@
-"""Run with `pytest`: the tests that every recogniser of vplog passes."""
+"""The tests that every recogniser of vplog passes.
+
+pip install . ./examples/recogniser_plugin pytest
+pytest examples/recogniser_plugin
+"""
 
 from mean_colours import MeanColours
 

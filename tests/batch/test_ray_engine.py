@@ -38,7 +38,7 @@ from vplog.verbs.demo import SMALL, make_drive
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-ray = pytest.importorskip("ray", reason="needs Ray: pip install 'vplog[ray]'")
+ray = pytest.importorskip("ray", reason="needs Ray: pip install ray")
 
 LONG = TINY.model_copy(update={"frame_rate_hz": 4.5, "width": 160, "height": 90})
 """Three times the frames of the others, which is more than one part, on a quarter of their pixels."""

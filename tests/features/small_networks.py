@@ -19,7 +19,7 @@ YAML = f"size: [{SIZE}, {SIZE}]\nmean: [0, 0, 0]\nstd: [1, 1, 1]\n"
 
 
 def helper() -> type[onnx.helper]:  # type: ignore[name-defined]
-    pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed: pip install 'vplog[onnx]'")
+    pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed: pip install onnxruntime")
     return pytest.importorskip("onnx", reason="onnx, which makes the networks, is not installed").helper
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-av = pytest.importorskip("av", reason="PyAV is not installed: pip install 'vplog[video]'")
+av = pytest.importorskip("av", reason="PyAV is not installed: pip install av")
 
 COUNT, RATE = 40, 10
 

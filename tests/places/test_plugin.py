@@ -23,7 +23,6 @@ from vplog.pipeline import Pipeline, pipeline_from, run
 from vplog.places.library_files import read_library_record
 from vplog.run.cache.code_hash import code_of
 from vplog.run.reference_library import build_library, check_library
-from vplog.testing.recogniser_contract import RecogniserContract
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -52,20 +51,6 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     (folder / f"{NAME}.py").write_text((EXAMPLE / f"{NAME}.py").read_text())
     yield
     sys.modules.pop(NAME, None)
-
-
-@pytest.fixture(scope="class")
-def example(request: Any) -> Iterator[None]:
-    sys.path.insert(0, str(EXAMPLE))
-    request.cls.settings = __import__(NAME).MeanColours(blocks=4)
-    yield
-    sys.path.remove(str(EXAMPLE))
-    sys.modules.pop(NAME, None)
-
-
-@pytest.mark.usefixtures("example")
-class TestExample(RecogniserContract):
-    """What is shipped for third parties, on what they are shown."""
 
 
 @pytest.mark.usefixtures("installed")

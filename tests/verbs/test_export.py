@@ -227,7 +227,7 @@ def test_without_rerun_one_line_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     said = verb("export", finished, "--format", "rrd", "-o", tmp_path / "a.rrd")
-    assert "pip install 'vplog[rerun]'" in said.error
+    assert "pip install rerun-sdk" in said.error
     assert not list(tmp_path.iterdir())
 
 

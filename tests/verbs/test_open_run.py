@@ -66,7 +66,7 @@ def test_where_nothing_opens_the_path_is_said(
     said = verb("open", finished, "--with", "foxglove")
     assert "foxglove is not installed" in said.out
     assert said.out.endswith(f"{finished}/result.mcap\n")
-    assert "vplog[rerun]" in verb("open", finished, "--with", "rerun").out
+    assert "pip install rerun-sdk" in verb("open", finished, "--with", "rerun").out
     monkeypatch.delenv("DISPLAY")
     said = verb("open", finished, "--json").json
     assert (said["opened"], said["path"]) == (False, f"{finished}/report.html")

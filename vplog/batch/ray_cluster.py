@@ -121,7 +121,7 @@ def _imported() -> Any:
     try:
         import ray
     except ImportError:
-        raise SettingsError("--engine ray needs Ray. Install it: pip install 'vplog[ray]'") from None
+        raise SettingsError("--engine ray needs Ray. Install it: pip install ray") from None
     return ray
 
 

@@ -193,7 +193,7 @@ def serve_map(arguments: argparse.Namespace) -> None:
     try:
         from vplog.maps.service.http import Limits, serve
     except ImportError:
-        raise SettingsError("`map serve` needs FastAPI and uvicorn. Install them: pip install 'vplog[serve]'") from None
+        raise SettingsError("FastAPI or uvicorn is not installed. Install both: pip install fastapi uvicorn") from None
     from vplog.maps.service.open_state import NewestState
 
     cache = None if isinstance(arguments.map, Path) else cache_in(arguments.cache, arguments.cache_gb)

@@ -178,7 +178,7 @@ def _session(model: str, sha256: str) -> Any:
         import onnxruntime
     except ImportError:
         raise SettingsError(
-            f"{model} needs ONNX Runtime, which is not installed. Install vplog[onnx] (pip install 'vplog[onnx]')."
+            f"{model} needs ONNX Runtime, which is not installed. Install it: pip install onnxruntime"
         ) from None
     data = _content(Path(model))
     if sha256 and hashlib.sha256(data).hexdigest() != sha256:

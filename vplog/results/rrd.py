@@ -34,7 +34,7 @@ def write_rrd(
         import rerun as rr
     except ImportError:
         raise ResultError(
-            "The .rrd format is written by rerun's SDK, which is not installed: pip install 'vplog[rerun]'"
+            "The .rrd format is written by rerun's SDK, which is not installed. Install it: pip install rerun-sdk"
         ) from None
     recording = rr.RecordingStream(_APPLICATION, recording_id=f"vplog-{tracks.keyframes.drive}")
     with replacing(path) as file:  # rerun's own writer hides a full disk

@@ -187,8 +187,7 @@ def new_registration(range_m: float) -> Any:
         from kiss_icp.kiss_icp import KissICP
     except ImportError:
         raise LogError(
-            "Odometry of a lidar needs kiss-icp, which is not installed. Install vplog[lidar] "
-            "(pip install 'vplog[lidar]')."
+            "Odometry of a lidar needs KISS-ICP, which is not installed. Install it: pip install kiss-icp"
         ) from None
     voxel_m = range_m / 100
     config = KISSConfig(  # all parts given, or environment variables would set them

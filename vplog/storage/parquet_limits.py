@@ -162,7 +162,7 @@ def check_version(path: Path, version: object, newest: int, maker: object = None
         by = f"by vplog {maker}" if isinstance(maker, str) and maker else "by another vplog"
         raise NewerError(
             f"{path} was written {by} in version {str(version)[:20]} of its format, and this vplog reads up to version "
-            f"{newest}. Update vplog: pip install --upgrade vplog"
+            f"{newest}. Update vplog: run `pip install .` in a newer checkout."
         )
 
 

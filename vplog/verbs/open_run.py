@@ -64,7 +64,7 @@ def opening(folder: Path, viewer: str | None = None) -> Iterator[Opening]:
     elif viewer == "foxglove" and program is not None:
         yield Opening(viewer, path, lambda: _run(program, str(path.absolute())))
     else:
-        get = "pip install 'vplog[rerun]'" if viewer == "rerun" else "https://foxglove.dev/download"
+        get = "pip install rerun-sdk" if viewer == "rerun" else "https://foxglove.dev/download"
         yield Opening(viewer, path, None, f"{viewer} is not installed ({get})")
 
 

@@ -302,7 +302,6 @@ def pyav(subject: str, advice: str = "") -> Any:
         import av
     except ImportError:
         raise LogError(
-            f"{subject}, and PyAV, which decodes it, is not installed. Install vplog[video] "
-            f"(pip install 'vplog[video]'){advice}."
+            f"{subject}, and PyAV, which decodes it, is not installed. Install PyAV (pip install av){advice}."
         ) from None
     return av
