@@ -20,6 +20,7 @@ from vplog.logs.datasets import colmap, euroc, kitti, tum_rgbd, utm_images, vide
 from vplog.logs.datasets.images import read as read_images
 from vplog.logs.datasets.streams import DataSet, DataSetContainer
 from vplog.logs.formats import mcap_layout, ros1_layout, sqlite_bag
+from vplog.logs.formats.budget import Budget
 from vplog.logs.formats.compression import fetched, unpacked
 from vplog.logs.formats.container import Container, Contents, Notes
 from vplog.logs.formats.mcap_file import McapFile
@@ -183,9 +184,10 @@ def open_container(path: Path, notes: Notes, name: str = "") -> tuple[Container,
     """The messages of one file, unpacked first where it is compressed as a whole, and its kind. `name` is what it is
     called in notes, its own name where empty. Raises LogError."""
     kind, inside = _magic(path), path
+    budget = Budget(str(path), path.stat().st_size)
     with ExitStack() as copies:
         if kind == "zstd":
-            inside = copies.enter_context(unpacked(path))
+            inside = copies.enter_context(unpacked(path, budget))
             kind = _magic(inside)
         if kind not in _READERS:
             raise LogError(
@@ -193,7 +195,7 @@ def open_container(path: Path, notes: Notes, name: str = "") -> tuple[Container,
             )
         if kind == "ros2-db3" and isinstance(inside, RemotePath):  # SQLite reads local files only
             inside = copies.enter_context(fetched(inside))
-        container = _READERS[kind](inside, notes, name or path.name)
+        container = _READERS[kind](inside, notes, name or path.name, budget)
         weakref.finalize(container, copies.pop_all().close)  # a process may read thousands of logs
     return container, kind
 
