@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 import statistics
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import datetime
 from functools import partial
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -146,7 +148,8 @@ def by_folder(root: Path, files: list[Path]) -> Group:
     """Groups by the folder below `root`, where these are fewer than the images of each and run side by side. Empty
     where they follow each other, or hold a few views of a place each."""
     groups = grouped(files, lambda file: file.relative_to(root).parent.as_posix())
-    large = [group for group in groups.values() if len(group) >= max(len(groups), _LEAST)]  # others may be strays
+    numbers = _numbers_of_large(groups)
+    large = [*numbers.values()]
     pairs = [*pairwise(large), *((large[0], other) for other in large[2:])]
     return groups if 2 * len(large) > len(groups) and any(_are_parallel(a, b) for a, b in pairs) else {}
 
@@ -155,8 +158,9 @@ def _by_name(files: list[Path]) -> Group:
     """Groups whose names differ in more than numbers and whose numbers run side by side: `left_*.png`, `right_*.png`.
     Empty where there is one, or one follows the other."""
     groups = grouped(files, lambda file: _pattern(file.name))
-    groups = {name: group for name, group in groups.items() if len(group) >= _LEAST}
-    parallel = {a for a in groups for b in groups if a != b and _are_parallel(groups[a], groups[b])}
+    numbers = _numbers_of_large({name: group for name, group in groups.items() if len(group) >= _LEAST})
+    pairs = ((a, b) for a, b in combinations(numbers, 2) if _are_parallel(numbers[a], numbers[b]))
+    parallel = {name for pair in pairs for name in pair}
     found = {name: group for name, group in groups.items() if name in parallel}
     return found if sum(map(len, found.values())) >= _IN_GROUPS * len(files) else {}
 
@@ -166,11 +170,32 @@ def _pattern(name: str) -> str:
     return _NUMBER.sub(lambda found: found[1] or "*", name)
 
 
-def _are_parallel(a: list[Path], b: list[Path]) -> bool:
-    x, y = ([tuple(int(n) for _, n in _NUMBER.findall(file.stem) if n) for file in group] for group in (a, b))
-    if _pattern(a[0].stem) == _pattern(b[0].stem):  # one camera's, in two formats
+class _Numbers(NamedTuple):
+    """The numbers in the names of a group of images."""
+
+    pattern: str
+    """Of the names, without their endings."""
+    values: list[tuple[int, ...]]
+    """In order."""
+
+
+def _numbers_of_large(groups: Group) -> dict[str, _Numbers]:
+    """Return the numbers of the groups that have at least as many images as there are groups, because a drive has more
+    images than cameras. All of these can be compared with each other in about the time that their names take."""
+    large = {name: group for name, group in groups.items() if len(group) >= max(len(groups), _LEAST)}
+    return {
+        name: _Numbers(
+            _pattern(group[0].stem), sorted(tuple(int(n) for _, n in _NUMBER.findall(file.stem) if n) for file in group)
+        )
+        for name, group in large.items()
+    }
+
+
+def _are_parallel(a: _Numbers, b: _Numbers) -> bool:
+    x, y = a.values, b.values
+    if a.pattern == b.pattern:  # one camera's, in two formats
         return len({*x} & {*y}) >= _SHARE * min(len(x), len(y))
-    within = [sum(min(other) <= one <= max(other) for one in own) / len(own) for own, other in ((x, y), (y, x))]
+    within = [(bisect_right(own, other[-1]) - bisect_left(own, other[0])) / len(own) for own, other in ((x, y), (y, x))]
     return max(within) >= _SHARE
 
 
