@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import sqlite3
 import struct
 from contextlib import closing
@@ -14,6 +15,7 @@ import pytest
 import zstandard
 from mcap.writer import CompressionType, Writer
 
+from tests.logs.drives import Drive, ros_messages, store, write_raw, write_ros2
 from vplog import logs
 from vplog.errors import LogError
 from vplog.logs.formats.budget import Budget
@@ -149,6 +151,34 @@ def test_a_chunk_is_read_without_a_look_at_every_channel() -> None:
     for wanted in (None, {channel}):
         reader = ChunkReader(0, len(EMPTY_MESSAGE), Channels({1: channel}), lambda *_: None, wanted)
         assert [message.channel for message in reader.read(EMPTY_MESSAGE)] == [channel]
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("seed", range(8))
+def test_forged_times_are_read_or_refused(seed: int, tmp_path: Path) -> None:
+    """numpy's integers overflow with an error or, as a warning, without one."""
+    rng, storage = random.Random(seed), "mcap" if seed % 2 else "sqlite3"
+    extremes = (0, 1, 2**32, 2**62, 2**63 - 1) + ((2**63, 2**64 - 1) if storage == "mcap" else (-1, -(2**63)))
+    messages = 6 * ros_messages(Drive(), 2)
+    folder = write_ros2(tmp_path / "a", messages, storage)
+    if storage == "sqlite3":
+        path = next(folder.glob("*.db3"))
+        with closing(sqlite3.connect(path)) as db:
+            for row in range(1, len(messages), rng.choice([2, 9])):
+                db.execute("UPDATE messages SET timestamp = ? WHERE id = ?", (rng.choice(extremes), row))
+            db.commit()
+    else:
+        path = write_raw(tmp_path / "b.mcap", [
+            (one.topic, one.type, "cdr", rng.choice(extremes) if rng.random() < 0.3 else one.stamp_ns + row, data)
+            for row, one in enumerate(messages)
+            for data in [bytes(store(2).serialize_cdr(one.message, one.type))]
+        ])  # fmt: skip
+    log = logs.open(path)
+    log.odometry()
+    log.gps()
+    stamps = log.stamps()
+    assert (stamps[:-1] < stamps[1:]).all()
+    assert stamps[0] >= 0
 
 
 def write_bag(path: Path, messages: str, values: int) -> Path:

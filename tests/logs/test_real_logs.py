@@ -198,3 +198,11 @@ def test_files_that_took_minutes_are_refused(name: str) -> None:
     with pytest.raises(LogError, match=r"claims more content|generated columns") as error:
         logs.open(data(f"damaged/{name}"))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["overflow_traceback.mcap", "ovf.mcap"])
+def test_forged_log_times_leave_the_header_stamps(name: str) -> None:
+    log = logs.open(data(f"damaged/{name}"))
+    odometry = log.odometry()
+    assert odometry is not None
+    assert any("log times jump" in warning for warning in log.warnings)

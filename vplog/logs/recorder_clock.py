@@ -15,7 +15,7 @@ import numpy as np
 from vplog.data import Floats, Ints
 from vplog.logs.clocks import GAP_NS, GAP_PERIODS, STEP_PERIODS
 from vplog.logs.formats.container import Notes
-from vplog.logs.stamps import Stamps
+from vplog.logs.stamps import LAST_NS, Stamps
 
 _ALTERNATIONS = 3
 """Turns from one side of a step to the other in the order of time that mere neighbours make: A B A B."""
@@ -66,8 +66,8 @@ def correct_clock_steps(topics: Iterable[Stamps], notes: Notes) -> None:
             fastest = min(group, key=lambda drop: (drop.period_ns, drop.elapsed_ns))
             sizes = (drop.back_ns + drop.moved_ns for drop in group)
             steps.append((position, max(fastest.back_ns + fastest.elapsed_ns, *sizes)))
-    if not 0 < len(steps) <= _MOST_STEPS:
-        return
+    if not 0 < len(steps) <= _MOST_STEPS or sum(size_ns for _, size_ns in steps) > LAST_NS:
+        return  # a forged time steps further than any clock
     positions, sizes = np.transpose(np.array(steps, np.int64))
     total_ns = np.append(0, np.cumsum(sizes))
     for one in topics:
