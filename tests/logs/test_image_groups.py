@@ -211,6 +211,32 @@ def test_the_work_is_in_proportion_to_the_images(side: int, tmp_path: Path) -> N
     assert looks[1] <= 1.1 * looks[0]
 
 
+@pytest.mark.parametrize("rate_hz", [0.3, 2, 30, 190])
+@pytest.mark.parametrize("start_s", [10, 640, 980.128, 4000, 20_000, 600_000])
+@pytest.mark.parametrize("unit_ns", [1, 1000])
+def test_times_of_a_simulation_are_read_in_the_unit_of_a_camera(rate_hz: float, start_s: float, unit_ns: int) -> None:
+    """980 s in ns may be ms of the year 2001, but no camera takes an image every nine hours."""
+    stamp_ns = (start_s * 1e9 + np.arange(40) * 1e9 / rate_hz).astype(np.int64) // unit_ns * unit_ns
+    assert stamps_of([f"{stamp // unit_ns}" for stamp in stamp_ns.tolist()]) == stamp_ns.tolist()
+
+
+def test_an_image_folder_of_a_simulation_lasts_as_long_as_the_drive(tmp_path: Path) -> None:
+    write(tmp_path, [f"{980_128_000_000 + 33_333_333 * row}.jpg" for row in range(12)])
+    log = logs.open(tmp_path)
+    np.testing.assert_array_equal(log.stamps(), 980_128_000_000 + 33_333_333 * np.arange(12))
+    assert not log.warnings
+
+
+@pytest.mark.parametrize("step_s", [10, 3000, 4000])
+def test_times_that_give_no_frame_rate_are_named_in_a_warning(step_s: int, tmp_path: Path) -> None:
+    write(tmp_path, [f"{1_600_000_000 + step_s * row}.jpg" for row in range(6)])
+    log = logs.open(tmp_path)
+    np.testing.assert_array_equal(np.diff(log.stamps()), step_s * 10**9)
+    [warning] = log.warnings
+    assert f"{step_s:.4g} s apart" in warning
+    assert "\n" not in warning
+
+
 @pytest.mark.parametrize("few", ["cam0", "cam2"])
 def test_a_camera_of_few_images_leaves_the_others_cameras(few: str, tmp_path: Path) -> None:
     folders = ("cam0", "cam1", "cam2")

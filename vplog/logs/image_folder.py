@@ -17,6 +17,7 @@ import numpy as np
 
 from vplog.data import Ints
 from vplog.errors import LogError
+from vplog.logs.clocks import LONGEST_PAUSE_NS
 from vplog.logs.topic_selection import EVERY_IMAGE
 from vplog.storage.image_file import PNG, image_size
 
@@ -78,31 +79,68 @@ def stamps_of(names: list[str]) -> list[int] | None:
     """ns from file stems that are times, or hold one beside words that all have (`frame_1403715273262142976`); None
     where they count the images.
 
-    Times are decimal seconds, or whole s, ms, us or ns, that all lie between 1990 and 2100, or a date and a time of day
-    to the ms (`PXL_20230512_143015123`). Others are decimal seconds, us or ns since some start, as of a machine's boot,
-    where all differ and their median step is the period of a camera: counters go in steps of a few, with leading zeros
-    or without, also behind the number of a camera and a dot (`cam0.17`).
+    Times are a date and a time of day to the ms (`PXL_20230512_143015123`), decimal seconds, or whole numbers, whose
+    unit `_unit_of` chooses. Numbers in small steps count the images, with leading zeros or without, also behind the
+    number of a camera and a dot (`cam0.17`).
     """
+    if not names:
+        return None
     dates = [_DATE.search(name) for name in names]
     with suppress(ValueError):  # no such day
         found = [datetime.strptime(f"{one[1]}{one[2]}Z", "%Y%m%d%H%M%S%f%z") for one in dates if one]
         if 2 * len({*found}) > len(found):  # else of a burst, or of the clip that they are the frames of
             return [round(at.timestamp() * 1e3) * 10**6 for at in found] if len(found) == len(names) else None
-    names, units, (least_ns, most_ns) = _changing(names), (10**9, 10**6, 10**3, 1), _PERIODS_NS
+    names = _changing(names)
     if all(re.fullmatch(r"[0-9]{1,10}\.[0-9]{1,9}", name) for name in names):
-        parts, units, (least_ns, most_ns) = [name.split(".") for name in names], (1,), (_LEAST_DECIMAL_NS, 2**63)
+        parts = [name.split(".") for name in names]
         if len({whole for whole, _ in parts}) == 1 and int(parts[0][0]) < _SINCE_1970_S[0]:
             return None  # a camera's number before a counter, rather than a drive of less than a second
-        names = [whole + fraction.ljust(9, "0") for whole, fraction in parts]
-    if not (names and all(re.fullmatch(r"[0-9]{1,30}", name) for name in names)):
+        values = [int(whole + fraction.ljust(9, "0")) for whole, fraction in parts]
+        unit_ns = int(_is_since_1970(values, 1) or _median_step(values) >= _LEAST_DECIMAL_NS)
+    elif all(re.fullmatch(r"[0-9]{1,30}", name) for name in names):
+        values = [int(name) for name in names]
+        unit_ns = _unit_of(values)
+    else:
         return None
-    values = sorted({int(name) for name in names})
-    low_ns, high_ns = (bound * 10**9 for bound in _SINCE_1970_S)
-    unit = next((ns for ns in units if low_ns <= values[0] * ns and values[-1] * ns < high_ns), 0)
-    if not unit and 1 < len(values) == len(names):
-        step = statistics.median(b - a for a, b in pairwise(values))
-        unit = next((ns for ns in units[-2:] if least_ns <= step * ns < most_ns), 0)
-    return [int(name) * unit for name in names] if unit and values[-1] * unit < 2**63 else None
+    return [value * unit_ns for value in values] if unit_ns and max(values) * unit_ns < 2**63 else None
+
+
+def _unit_of(values: list[int]) -> int:
+    """Return the ns in the unit of whole numbers that are times, or 0 if they count the images.
+
+    Times since 1970 have the unit that puts all of them between 1990 and 2100, if images follow each other within
+    LONGEST_PAUSE_NS. Times of a simulation in ns may lie between these years as ms, but hours apart. Other times, since
+    the start of a computer or of a simulation, have the unit that gives a frame rate of a camera. Only us and ns are
+    told from counters by this.
+    """
+    step = _median_step(values)
+    dated = next((unit for unit in (10**9, 10**6, 10**3, 1) if _is_since_1970(values, unit)), 0)
+    if dated and step * dated < LONGEST_PAUSE_NS:
+        return dated
+    return next((unit for unit in (10**3, 1) if _PERIODS_NS[0] <= step * unit < _PERIODS_NS[1]), dated)
+
+
+def _is_since_1970(values: list[int], unit_ns: int) -> bool:
+    first_ns, last_ns = (bound * 10**9 for bound in _SINCE_1970_S)
+    return first_ns <= min(values) * unit_ns and max(values) * unit_ns < last_ns
+
+
+def _median_step(values: list[int]) -> float:
+    """Return the median difference between numbers in order; 0 for a single one, or if two are the same."""
+    steps = [b - a for a, b in pairwise(sorted(values))]
+    return statistics.median(steps) if steps and min(steps) else 0
+
+
+def frame_rate_remarks(folder: Path, stamp_ns: Sequence[int]) -> list[str]:
+    """Return a remark on times in names that are further apart than the images of a camera; none without."""
+    period_s = _median_step([*stamp_ns]) / 1e9
+    if period_s * 1e9 < _PERIODS_NS[1]:
+        return []
+    return [
+        f"The names of the images in {folder.name} are read as times, which are {period_s:.4g} s apart. No unit gives "
+        "a frame rate of a camera, so speeds and gaps are wrong if this is not how the images were taken. If the names "
+        "are not times, number the images: 0001, 0002, ..."
+    ]
 
 
 def _changing(names: list[str]) -> list[str]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vplog.data import Floats, Ints
-from vplog.logs.clocks import GAP_NS, GAP_PERIODS, STEP_PERIODS
+from vplog.logs.clocks import GAP_NS, GAP_PERIODS, LONGEST_PAUSE_NS, STEP_PERIODS
 from vplog.logs.formats.container import Notes
 from vplog.logs.stamps import LAST_NS, Stamps
 
@@ -27,8 +27,6 @@ _AROUND = 10
 """Messages on either side of a step by which its speed is known."""
 _LONGEST_GAP_NS = 10 * 10**9
 """ns; a way that takes longer at that speed is a jump of the poses."""
-_LONGEST_PAUSE_NS = 3600 * 10**9
-"""ns; between parts of one drive in another order lies no more."""
 _FURTHEST_STEP = 3
 """Times nine tenths of the steps from one message to the next: a drive that goes on does not step further."""
 
@@ -106,7 +104,7 @@ def _drops(one: Stamps) -> list[_Drop]:
                 -int(step[row - 1]), elapsed if elapsed > 0 else period,
                 0 if elapsed > 0 or one.xyz_m is None else _time_by_motion(one.xyz_m, row, period),
                 max(_alternations(log_ns[before], log_ns[behind]) - _ALTERNATIONS, 0),
-                last_ns < log_ns[:row].min() - _LONGEST_PAUSE_NS or _is_continuous(log_ns, one.xyz_m, row),
+                last_ns < log_ns[:row].min() - LONGEST_PAUSE_NS or _is_continuous(log_ns, one.xyz_m, row),
             )
         )  # fmt: skip
     return found
