@@ -7,8 +7,10 @@ into a gap the motion decides, which leads on from one message to the next in th
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 
@@ -54,14 +56,16 @@ class _Drop:
 def correct_clock_steps(topics: Iterable[Stamps], notes: Notes) -> None:
     """Shift all log times behind each step back of the recorder's clock on by its size."""
     topics = [one for one in topics if len(one.log_ns)]
-    drops = sorted((drop for one in topics for drop in _drops(one)), key=lambda drop: (drop.behind, drop.before))
+    drops = sorted((drop for one in topics for drop in _drops(one)), key=lambda drop: drop.before)
+    behind = [*accumulate((drop.behind for drop in reversed(drops)), min)][::-1]
     steps: list[tuple[int, int]] = []
-    while drops:  # all topics go back at the same place: each group has its first message behind
-        position = drops[0].behind
-        group = [drop for drop in drops if drop.before < position]
-        drops = [drop for drop in drops if drop.before >= position]
+    start = 0
+    while start < len(drops):  # all topics go back at the same place: each group has its first message behind
+        position = behind[start]
+        stop = max(bisect_left(drops, position, key=lambda drop: drop.before), start + 1)  # a path has one position
+        group, start = drops[start:stop], stop
         if sum(drop.overlap for drop in group) >= _OVERLAP or any(drop.continuous for drop in group):
-            fastest = min(group, key=lambda drop: (drop.period_ns, drop.elapsed_ns))
+            fastest = min(group, key=lambda drop: (drop.period_ns, drop.elapsed_ns, drop.behind))
             sizes = (drop.back_ns + drop.moved_ns for drop in group)
             steps.append((position, max(fastest.back_ns + fastest.elapsed_ns, *sizes)))
     if not 0 < len(steps) <= _MOST_STEPS or sum(size_ns for _, size_ns in steps) > LAST_NS:

@@ -68,7 +68,9 @@ class McapFile:
         if layout.summary_definitions or by_id.keys() - self._channels.keys():
             self._define_all()
             by_id, times = self._counted(unpack_all=False)
-        listed = sum((Counter(chunk.counts) for chunk in layout.missing), +by_id)
+        listed = +by_id
+        for chunk in layout.missing:
+            listed.update(chunk.counts)
         if layout.recorded and layout.recorded != dict(listed) and layout.chunks:
             by_id, times = self._counted(unpack_all=True)
         for number in self._unread:  # more channels may be defined by now
