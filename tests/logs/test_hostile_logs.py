@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import sqlite3
 import struct
-from contextlib import closing
+import sys
+from contextlib import closing, suppress
+from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import lz4.frame
@@ -15,18 +18,21 @@ import pytest
 import zstandard
 from mcap.writer import CompressionType, Writer
 
-from tests.logs.drives import Drive, ros_messages, store, write_raw, write_ros2
+from tests.logs.drives import START_NS, Drive, ros_messages, store, write_raw, write_ros2
 from vplog import logs
 from vplog.errors import LogError
+from vplog.logs import topic_selection
 from vplog.logs.formats.budget import Budget
+from vplog.logs.formats.chunk_layout import ResyncSearch
 from vplog.logs.formats.container import Channel, Message, Notes
 from vplog.logs.formats.mcap_file import ChunkReader, McapFile
 from vplog.logs.formats.ros2_folder import ZstdMessages
 from vplog.logs.formats.sqlite_bag import SqliteBag
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
+    from types import FrameType
 
 EMPTY_MESSAGE = struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0)
 """An MCAP message record of channel 1 without data."""
@@ -68,9 +74,9 @@ def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
         logs.open(tmp_path / "a.mcap")
 
 
-def mcap_chunk(data: bytes, compression: bytes = b"zstd") -> bytes:
+def mcap_chunk(data: bytes, compression: bytes = b"zstd", time_ns: int = 0) -> bytes:
     packed = zstandard.compress(data) if compression else data
-    body = struct.pack("<QQQII", 0, 0, len(data), 0, len(compression)) + compression
+    body = struct.pack("<QQQII", time_ns, time_ns, len(data), 0, len(compression)) + compression
     body += struct.pack("<Q", len(packed)) + packed
     return struct.pack("<BQ", 6, len(body)) + body
 
@@ -179,6 +185,84 @@ def test_forged_times_are_read_or_refused(seed: int, tmp_path: Path) -> None:
     stamps = log.stamps()
     assert (stamps[:-1] < stamps[1:]).all()
     assert stamps[0] >= 0
+
+
+def steps_of(action: Callable[[], object]) -> int:
+    """Return the number of Python's instructions that an action takes."""
+    steps = 0
+
+    def count(frame: FrameType, event: str, _: Any) -> Any:
+        nonlocal steps
+        frame.f_trace_opcodes, frame.f_trace_lines = True, False
+        steps += event == "opcode"
+        return count
+
+    traced = sys.gettrace()
+    sys.settrace(count)
+    try:
+        with suppress(LogError):
+            action()
+    finally:
+        sys.settrace(traced)
+    return steps
+
+
+def chunk_index(offset: int) -> bytes:
+    return struct.pack("<BQQQQQIQIQQ", 8, 64, 0, 0, offset, 80, 0, 0, 0, 0, 0)
+
+
+def damaged_chunks(count: int) -> bytes:
+    return mcap(*[mcap_chunk(bytes(100), time_ns=START_NS + number) for number in range(count)])
+
+
+def listed_in_damage(count: int) -> bytes:
+    """Chunks that the index lists in damaged bytes, behind as many sound ones."""
+    sound = mcap(*[mcap_chunk(EMPTY_MESSAGE, time_ns=START_NS + number) for number in range(count)])
+    start = len(sound) + 100 * count
+    index = b"".join(chunk_index(len(sound) + 100 * number) for number in range(count))
+    return sound + 100 * count * b"\xff" + index + struct.pack("<BQQQI", 2, 20, start, 0, 0) + b"\x89MCAP0\r\n"
+
+
+def topics_of_images(count: int) -> bytes:
+    with BytesIO() as stream:
+        writer = Writer(stream, compression=CompressionType.NONE)
+        writer.start()
+        schema = writer.register_schema("sensor_msgs/msg/CompressedImage", "ros2msg", b"")
+        for number in range(count):
+            channel = writer.register_channel(f"/left/{number}", "cdr", schema)
+            writer.add_message(channel, number, bytes(20), number)
+        writer.finish()
+        return stream.getvalue()
+
+
+@pytest.mark.parametrize("write", [damaged_chunks, listed_in_damage, topics_of_images])
+def test_the_work_is_in_proportion_to_the_file(
+    write: Callable[[int], bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """8,000 damaged chunks took 29 CPU seconds, and as many that an index lists in damaged bytes some minutes."""
+    monkeypatch.setattr(topic_selection, "MOST_TOPICS", 20)
+    steps = []
+    for count in (10, 150, 300):  # once to import modules
+        path = tmp_path / f"{count}.mcap"
+        path.write_bytes(write(count))
+        steps.append(steps_of(lambda path=path: logs.open(path).info()))
+    assert steps[2] < 2.2 * steps[1]
+
+
+def test_a_search_that_succeeds_nearby_reads_no_more() -> None:
+    class Counted(BytesIO):
+        total = 0
+
+        def read(self, size: int | None = -1, /) -> bytes:
+            data = super().read(size)
+            self.total += len(data)
+            return data
+
+    file = Counted(1000 * (99 * b" " + b"x"))
+    search = ResyncSearch(file, 100_000)
+    assert [search.first(re.compile(b"x"), 100 * number) for number in range(900)] == [*range(99, 90_000, 100)]
+    assert file.total < 900 * 10_000
+    assert search.first(re.compile(b"y"), 0) is None
 
 
 def write_bag(path: Path, messages: str, values: int) -> Path:

@@ -228,7 +228,7 @@ class SqliteBag:
         if not {("topics",), ("messages",)} <= {*self._rows(_TABLES)}:
             raise LogError(
                 f"{self._path} is an SQLite file, but not a ROS 2 bag: it has no tables topics and messages, or they "
-                "are views or have generated columns."
+                "are views or have generated columns. Give a file that `ros2 bag record` wrote."
             )
         # All columns, as SQLite holds the lengths of a row's against its own only where it reads the last.
         rows = [row[:4] for row in self._rows("SELECT id, name, type, serialization_format, * FROM topics")]
