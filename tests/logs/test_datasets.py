@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from fractions import Fraction
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
@@ -21,8 +22,7 @@ from vplog.logs.datasets.video import VideoFrames
 from vplog.stages import Log
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
+    from collections.abc import Callable, Iterator
 
 COUNT, WIDTH, HEIGHT = 6, 64, 48
 START_NS = 1_403_715_273_262_142_976
@@ -329,6 +329,24 @@ def test_images_named_by_their_place_have_positions_as_truth(tmp_path: Path) -> 
     np.testing.assert_allclose(truth.world_from_body[:, :3, 3], places[::-1], atol=0.01)  # by panorama
     np.testing.assert_allclose(gps.latitude_deg[::-1], 37.75 + 1e-5 * np.arange(COUNT), atol=1e-6)
     assert log.warnings == [], "pictures without times are no fault"
+
+
+@pytest.mark.parametrize("last", ["@", "n", "r", "T"])
+def test_the_kind_does_not_depend_on_the_order_of_the_folder(
+    last: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Copying a folder may change the order in which a file system lists it."""
+    names = [f"@{500_000 + 3 * row}.00@4180000.00@10@S@@@p{row}@@90@@@@@@.jpg" for row in range(COUNT)]
+    write_images(tmp_path, names, images())
+    for other in ("readme.txt", "notes.md", "Thumbs.db"):
+        (tmp_path / other).write_text("none")
+    listed = Path.iterdir
+
+    def in_order(folder: Path) -> Iterator[Path]:
+        return iter(sorted(listed(folder), key=lambda file: file.name.startswith(last)))
+
+    monkeypatch.setattr(Path, "iterdir", in_order)
+    assert logs.open(tmp_path).info().kind == "utm-images"
 
 
 def write_video(path: Path, pictures: np.ndarray, codec: str, turn_deg: int = 0) -> list[Fraction]:

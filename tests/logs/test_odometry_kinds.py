@@ -155,6 +155,17 @@ def path() -> Messages:
     return topic("/path", "nav_msgs/msg/Path", fields, STAMPS[9::10])
 
 
+def test_a_path_that_passes_a_time_twice_is_read(tmp_path: Path) -> None:
+    """All its poses have one place in the file; a search for steps of the clock never ended."""
+    kind, stamps = "geometry_msgs/msg/PoseStamped", np.concatenate([STAMPS[:20], STAMPS[5:25]])
+    each = [message(kind, **one) for one in stamped("odom", [{"pose": pose(value)} for value in POSES[:40]], stamps)]
+    fields = stamped("odom", [{"poses": each}], STAMPS[30:31])
+    odometry = logs.open(
+        write_raw(tmp_path / "a.mcap", topic("/path", "nav_msgs/msg/Path", fields, STAMPS[30:31]))
+    ).odometry()
+    assert odometry is not None
+
+
 def px4() -> Messages:
     """North-east-down and forward-right-down, in microseconds."""
     ned_from_enu, flip = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1.0, -1, -1])

@@ -191,3 +191,18 @@ def test_ros1_messages_are_those_of_the_reference_reader() -> None:
         assert all(bag.read(m.place) == m.data for m in messages[:50])
         compared += 1
     assert compared >= 15
+
+
+@pytest.mark.parametrize("name", ["msgs_20x2m_same.mcap", "bz2_many.bag", "gencol_rand.db3"])
+def test_files_that_took_minutes_are_refused(name: str) -> None:
+    with pytest.raises(LogError, match=r"claims more content|generated columns") as error:
+        logs.open(data(f"damaged/{name}"))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["overflow_traceback.mcap", "ovf.mcap"])
+def test_forged_log_times_leave_the_header_stamps(name: str) -> None:
+    log = logs.open(data(f"damaged/{name}"))
+    odometry = log.odometry()
+    assert odometry is not None
+    assert any("log times jump" in warning for warning in log.warnings)

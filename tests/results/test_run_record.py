@@ -52,6 +52,15 @@ def test_no_flipped_bit_of_a_run_json_is_believed(tmp_path: Path) -> None:
     assert refused > 190
 
 
+@pytest.mark.parametrize("number", ["1" + 400 * "0", "-9223372036854775809", "1e400", "Infinity", "NaN"])
+def test_a_number_that_no_field_can_hold_is_damage(number: str, tmp_path: Path) -> None:
+    path = tmp_path / "run.json"
+    path.write_text(f'{{"finished": true, "log": "a", "solution": {{"pieces": {number}}}}}')
+    with pytest.raises(ResultError, match="damaged") as error:
+        read_run_json(path)
+    assert "\n" not in str(error.value)
+
+
 def test_a_record_without_a_checksum_is_read(tmp_path: Path) -> None:
     """An older vplog wrote it, or an editor."""
     write_run_json(tmp_path / "run.json", {"finished": True, "log": "a"})

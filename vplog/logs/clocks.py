@@ -31,6 +31,8 @@ LEAST_STEP_NS = 128_000_000
 GAP_NS = 10**9
 """ns without a message that count as a gap, where it is also GAP_PERIODS of the topic's own."""
 GAP_PERIODS = 10
+LONGEST_PAUSE_NS = 3600 * 10**9
+"""Longest time in ns between two parts of one drive: odometry is seldom kept running through a longer pause."""
 _SHORT = 10
 """Small steps count as clock steps where less than a tenth of the messages are in runs too short to show a clock."""
 _NEAR = 4

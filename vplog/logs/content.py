@@ -115,8 +115,9 @@ def read_content(container: Container, contents: Contents, chosen: Selection, no
     chosen = chosen.with_odometry(source, bool(static), source is None or found[source].kind == "twist")
     sources = [(replace(one, used=known == source), known) for one, known in sources]
     read.poses = {source: track for source, track in read.poses.items() if source == chosen.odometry}
-    for (reason, topic), runs in read.lost.items():
-        if topic in {channel.topic for channel in chosen.channels}:
+    topics = {channel.topic for channel in chosen.channels}
+    for topic, lost in read.lost.items():
+        for reason, runs in lost.items() if topic in topics else ():
             notes.account.add(reason, {topic: runs.messages}, (topic, 0), runs.spans)
     tree = FrameTree([*static, *read.transforms])
     if tree.dropped:

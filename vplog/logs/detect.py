@@ -16,10 +16,12 @@ import zstandard
 from vplog.errors import LogError, nearest_path, plural
 from vplog.logs import image_folder
 from vplog.logs.calibration_file import read_calibrations
+from vplog.logs.clocks import LONGEST_PAUSE_NS
 from vplog.logs.datasets import colmap, euroc, kitti, tum_rgbd, utm_images, video, vslam_lab
 from vplog.logs.datasets.images import read as read_images
 from vplog.logs.datasets.streams import DataSet, DataSetContainer
 from vplog.logs.formats import mcap_layout, ros1_layout, sqlite_bag
+from vplog.logs.formats.budget import Budget
 from vplog.logs.formats.compression import fetched, unpacked
 from vplog.logs.formats.container import Container, Contents, Notes
 from vplog.logs.formats.mcap_file import McapFile
@@ -58,8 +60,6 @@ _DEEPEST, _MOST_FILES = 4, 10**6
 """Levels of folders below the one given, and files in them, that are looked through for images."""
 _OVERLAP_NS = 10**9
 """ns that one file may reach into the next: recorders split between messages that are a little out of order."""
-_LONGEST_PAUSE_NS = 3600 * 10**9
-"""ns between two files of one drive; who goes on after more than an hour has not kept the odometry running."""
 _KNOWN = (
     "an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), a video, a folder of images, or the folder of a data set "
     "(KITTI, EuRoC, TUM RGB-D, VSLAM-LAB, COLMAP)"
@@ -183,9 +183,10 @@ def open_container(path: Path, notes: Notes, name: str = "") -> tuple[Container,
     """The messages of one file, unpacked first where it is compressed as a whole, and its kind. `name` is what it is
     called in notes, its own name where empty. Raises LogError."""
     kind, inside = _magic(path), path
+    budget = Budget(str(path), path.stat().st_size)
     with ExitStack() as copies:
         if kind == "zstd":
-            inside = copies.enter_context(unpacked(path))
+            inside = copies.enter_context(unpacked(path, budget))
             kind = _magic(inside)
         if kind not in _READERS:
             raise LogError(
@@ -193,7 +194,7 @@ def open_container(path: Path, notes: Notes, name: str = "") -> tuple[Container,
             )
         if kind == "ros2-db3" and isinstance(inside, RemotePath):  # SQLite reads local files only
             inside = copies.enter_context(fetched(inside))
-        container = _READERS[kind](inside, notes, name or path.name)
+        container = _READERS[kind](inside, notes, name or path.name, budget)
         weakref.finalize(container, copies.pop_all().close)  # a process may read thousands of logs
     return container, kind
 
@@ -255,7 +256,7 @@ def _in_order_of_time(parts: list[_Part]) -> list[_Part]:
                 f"{a.path} and {b.path} overlap by {overlap_ns / 1e9:.1f} s, so they are not one drive in parts. "
                 "Run each by itself."
             )
-        if -overlap_ns > _LONGEST_PAUSE_NS:
+        if -overlap_ns > LONGEST_PAUSE_NS:
             raise LogError(
                 f"{-overlap_ns / 3.6e12:.1f} hours lie between {a.path} and {b.path}, so they are two drives. "
                 "Run each by itself."

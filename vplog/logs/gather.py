@@ -149,8 +149,8 @@ class TopicCollector:
         """The last message of each topic of paths, which holds those before it."""
         self.transforms: list[PoseMessage] = []
         self.dynamic = DynamicTransforms(store=any(source in chosen.tf for source in chosen.sources))
-        self.lost: dict[tuple[str, str], LossRuns] = {}
-        """Lost messages by reason and topic."""
+        self.lost: defaultdict[str, dict[str, LossRuns]] = defaultdict(dict)
+        """Lost messages by topic, then by reason."""
         self._tf = chosen.tf
         self._waiting: defaultdict[Channel, list[tuple[bytes, int, int]]] = defaultdict(list)
         """Messages of odometry that are still to be added, their log times and their positions."""
@@ -210,12 +210,12 @@ class TopicCollector:
                 self._add(message, position)
         except BadMessageError as error:
             reason = "empty_image" if isinstance(error, _EmptyImageError) else "undecodable"
-            self.lost.setdefault((reason, channel.topic), LossRuns()).add_lost(message.log_ns)
+            self.lost[channel.topic].setdefault(reason, LossRuns()).add_lost(message.log_ns)
         else:
             self._sound(channel.topic)
 
     def _sound(self, topic: str) -> None:
-        for runs in (runs for (_, lost), runs in self.lost.items() if lost == topic):
+        for runs in self.lost.get(topic, {}).values():
             runs.add_sound()
 
     def calibrations(self, channel: Channel | None, part: str, notes: Notes) -> list[CalibrationMessage]:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import re
 import statistics
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import datetime
 from functools import partial
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from vplog.data import Ints
 from vplog.errors import LogError
+from vplog.logs.clocks import LONGEST_PAUSE_NS
 from vplog.logs.topic_selection import EVERY_IMAGE
 from vplog.storage.image_file import PNG, image_size
 
@@ -76,31 +79,68 @@ def stamps_of(names: list[str]) -> list[int] | None:
     """ns from file stems that are times, or hold one beside words that all have (`frame_1403715273262142976`); None
     where they count the images.
 
-    Times are decimal seconds, or whole s, ms, us or ns, that all lie between 1990 and 2100, or a date and a time of day
-    to the ms (`PXL_20230512_143015123`). Others are decimal seconds, us or ns since some start, as of a machine's boot,
-    where all differ and their median step is the period of a camera: counters go in steps of a few, with leading zeros
-    or without, also behind the number of a camera and a dot (`cam0.17`).
+    Times are a date and a time of day to the ms (`PXL_20230512_143015123`), decimal seconds, or whole numbers, whose
+    unit `_unit_of` chooses. Numbers in small steps count the images, with leading zeros or without, also behind the
+    number of a camera and a dot (`cam0.17`).
     """
+    if not names:
+        return None
     dates = [_DATE.search(name) for name in names]
     with suppress(ValueError):  # no such day
         found = [datetime.strptime(f"{one[1]}{one[2]}Z", "%Y%m%d%H%M%S%f%z") for one in dates if one]
         if 2 * len({*found}) > len(found):  # else of a burst, or of the clip that they are the frames of
             return [round(at.timestamp() * 1e3) * 10**6 for at in found] if len(found) == len(names) else None
-    names, units, (least_ns, most_ns) = _changing(names), (10**9, 10**6, 10**3, 1), _PERIODS_NS
+    names = _changing(names)
     if all(re.fullmatch(r"[0-9]{1,10}\.[0-9]{1,9}", name) for name in names):
-        parts, units, (least_ns, most_ns) = [name.split(".") for name in names], (1,), (_LEAST_DECIMAL_NS, 2**63)
+        parts = [name.split(".") for name in names]
         if len({whole for whole, _ in parts}) == 1 and int(parts[0][0]) < _SINCE_1970_S[0]:
             return None  # a camera's number before a counter, rather than a drive of less than a second
-        names = [whole + fraction.ljust(9, "0") for whole, fraction in parts]
-    if not (names and all(re.fullmatch(r"[0-9]{1,30}", name) for name in names)):
+        values = [int(whole + fraction.ljust(9, "0")) for whole, fraction in parts]
+        unit_ns = int(_is_since_1970(values, 1) or _median_step(values) >= _LEAST_DECIMAL_NS)
+    elif all(re.fullmatch(r"[0-9]{1,30}", name) for name in names):
+        values = [int(name) for name in names]
+        unit_ns = _unit_of(values)
+    else:
         return None
-    values = sorted({int(name) for name in names})
-    low_ns, high_ns = (bound * 10**9 for bound in _SINCE_1970_S)
-    unit = next((ns for ns in units if low_ns <= values[0] * ns and values[-1] * ns < high_ns), 0)
-    if not unit and 1 < len(values) == len(names):
-        step = statistics.median(b - a for a, b in pairwise(values))
-        unit = next((ns for ns in units[-2:] if least_ns <= step * ns < most_ns), 0)
-    return [int(name) * unit for name in names] if unit and values[-1] * unit < 2**63 else None
+    return [value * unit_ns for value in values] if unit_ns and max(values) * unit_ns < 2**63 else None
+
+
+def _unit_of(values: list[int]) -> int:
+    """Return the ns in the unit of whole numbers that are times, or 0 if they count the images.
+
+    Times since 1970 have the unit that puts all of them between 1990 and 2100, if images follow each other within
+    LONGEST_PAUSE_NS. Times of a simulation in ns may lie between these years as ms, but hours apart. Other times, since
+    the start of a computer or of a simulation, have the unit that gives a frame rate of a camera. Only us and ns are
+    told from counters by this.
+    """
+    step = _median_step(values)
+    dated = next((unit for unit in (10**9, 10**6, 10**3, 1) if _is_since_1970(values, unit)), 0)
+    if dated and step * dated < LONGEST_PAUSE_NS:
+        return dated
+    return next((unit for unit in (10**3, 1) if _PERIODS_NS[0] <= step * unit < _PERIODS_NS[1]), dated)
+
+
+def _is_since_1970(values: list[int], unit_ns: int) -> bool:
+    first_ns, last_ns = (bound * 10**9 for bound in _SINCE_1970_S)
+    return first_ns <= min(values) * unit_ns and max(values) * unit_ns < last_ns
+
+
+def _median_step(values: list[int]) -> float:
+    """Return the median difference between numbers in order; 0 for a single one, or if two are the same."""
+    steps = [b - a for a, b in pairwise(sorted(values))]
+    return statistics.median(steps) if steps and min(steps) else 0
+
+
+def frame_rate_remarks(folder: Path, stamp_ns: Sequence[int]) -> list[str]:
+    """Return a remark on times in names that are further apart than the images of a camera; none without."""
+    period_s = _median_step([*stamp_ns]) / 1e9
+    if period_s * 1e9 < _PERIODS_NS[1]:
+        return []
+    return [
+        f"The names of the images in {folder.name} are read as times, which are {period_s:.4g} s apart. No unit gives "
+        "a frame rate of a camera, so speeds and gaps are wrong if this is not how the images were taken. If the names "
+        "are not times, number the images: 0001, 0002, ..."
+    ]
 
 
 def _changing(names: list[str]) -> list[str]:
@@ -146,7 +186,8 @@ def by_folder(root: Path, files: list[Path]) -> Group:
     """Groups by the folder below `root`, where these are fewer than the images of each and run side by side. Empty
     where they follow each other, or hold a few views of a place each."""
     groups = grouped(files, lambda file: file.relative_to(root).parent.as_posix())
-    large = [group for group in groups.values() if len(group) >= max(len(groups), _LEAST)]  # others may be strays
+    numbers = _numbers_of_large(groups)
+    large = [*numbers.values()]
     pairs = [*pairwise(large), *((large[0], other) for other in large[2:])]
     return groups if 2 * len(large) > len(groups) and any(_are_parallel(a, b) for a, b in pairs) else {}
 
@@ -155,8 +196,9 @@ def _by_name(files: list[Path]) -> Group:
     """Groups whose names differ in more than numbers and whose numbers run side by side: `left_*.png`, `right_*.png`.
     Empty where there is one, or one follows the other."""
     groups = grouped(files, lambda file: _pattern(file.name))
-    groups = {name: group for name, group in groups.items() if len(group) >= _LEAST}
-    parallel = {a for a in groups for b in groups if a != b and _are_parallel(groups[a], groups[b])}
+    numbers = _numbers_of_large({name: group for name, group in groups.items() if len(group) >= _LEAST})
+    pairs = ((a, b) for a, b in combinations(numbers, 2) if _are_parallel(numbers[a], numbers[b]))
+    parallel = {name for pair in pairs for name in pair}
     found = {name: group for name, group in groups.items() if name in parallel}
     return found if sum(map(len, found.values())) >= _IN_GROUPS * len(files) else {}
 
@@ -166,11 +208,32 @@ def _pattern(name: str) -> str:
     return _NUMBER.sub(lambda found: found[1] or "*", name)
 
 
-def _are_parallel(a: list[Path], b: list[Path]) -> bool:
-    x, y = ([tuple(int(n) for _, n in _NUMBER.findall(file.stem) if n) for file in group] for group in (a, b))
-    if _pattern(a[0].stem) == _pattern(b[0].stem):  # one camera's, in two formats
+class _Numbers(NamedTuple):
+    """The numbers in the names of a group of images."""
+
+    pattern: str
+    """Of the names, without their endings."""
+    values: list[tuple[int, ...]]
+    """In order."""
+
+
+def _numbers_of_large(groups: Group) -> dict[str, _Numbers]:
+    """Return the numbers of the groups that have at least as many images as there are groups, because a drive has more
+    images than cameras. All of these can be compared with each other in about the time that their names take."""
+    large = {name: group for name, group in groups.items() if len(group) >= max(len(groups), _LEAST)}
+    return {
+        name: _Numbers(
+            _pattern(group[0].stem), sorted(tuple(int(n) for _, n in _NUMBER.findall(file.stem) if n) for file in group)
+        )
+        for name, group in large.items()
+    }
+
+
+def _are_parallel(a: _Numbers, b: _Numbers) -> bool:
+    x, y = a.values, b.values
+    if a.pattern == b.pattern:  # one camera's, in two formats
         return len({*x} & {*y}) >= _SHARE * min(len(x), len(y))
-    within = [sum(min(other) <= one <= max(other) for one in own) / len(own) for own, other in ((x, y), (y, x))]
+    within = [(bisect_right(own, other[-1]) - bisect_left(own, other[0])) / len(own) for own, other in ((x, y), (y, x))]
     return max(within) >= _SHARE
 
 

@@ -37,7 +37,15 @@ from vplog.logs.rectification import (
 from vplog.logs.scans import ScanReader
 from vplog.logs.stamps import rows_of
 from vplog.logs.topic_candidates import read_candidates
-from vplog.logs.topic_selection import Candidate, Selection, TopicChoice, further_cameras, select, wheel_options
+from vplog.logs.topic_selection import (
+    MOST_TOPICS,
+    Candidate,
+    Selection,
+    TopicChoice,
+    further_cameras,
+    select,
+    wheel_options,
+)
 
 _SAME_VIEW_RAD, _SAME_VIEW_M = np.radians(5.0), 1.0
 """Turn and distance of two cameras below which they see the same: as far as those of a stereo head."""
@@ -56,6 +64,12 @@ class RecordedLog:
         self._contents: Contents = container.contents()
         self._container = messages_unpacked(container, self._contents, notes)
         self._candidates = read_candidates(self._container, self._contents)
+        if (count := len(self._candidates)) > MOST_TOPICS:
+            notes.add(
+                f"{path.name} has {count} topics that can be used; the {MOST_TOPICS} with the most messages are "
+                "considered. Choose others by their names, for example with --image-topic."
+            )
+        self._by_channel = {candidate.channel: candidate for candidate in self._candidates}
         self._sidecar = SidecarFiles(choice, notes)
         self._choice = choice = self._sidecar.choice
         self._selection = select(self._candidates, choice, path.name)
@@ -105,7 +119,7 @@ class RecordedLog:
         )
 
     def _candidate(self, channel: Channel | None) -> Candidate | None:
-        return next((candidate for candidate in self._candidates if candidate.channel == channel), None)
+        return None if channel is None else self._by_channel.get(channel)
 
     def stamps(self) -> Ints:
         self._image_channel()

@@ -7,15 +7,17 @@ into a gap the motion decides, which leads on from one message to the next in th
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 
 from vplog.data import Floats, Ints
-from vplog.logs.clocks import GAP_NS, GAP_PERIODS, STEP_PERIODS
+from vplog.logs.clocks import GAP_NS, GAP_PERIODS, LONGEST_PAUSE_NS, STEP_PERIODS
 from vplog.logs.formats.container import Notes
-from vplog.logs.stamps import Stamps
+from vplog.logs.stamps import LAST_NS, Stamps
 
 _ALTERNATIONS = 3
 """Turns from one side of a step to the other in the order of time that mere neighbours make: A B A B."""
@@ -27,8 +29,6 @@ _AROUND = 10
 """Messages on either side of a step by which its speed is known."""
 _LONGEST_GAP_NS = 10 * 10**9
 """ns; a way that takes longer at that speed is a jump of the poses."""
-_LONGEST_PAUSE_NS = 3600 * 10**9
-"""ns; between parts of one drive in another order lies no more."""
 _FURTHEST_STEP = 3
 """Times nine tenths of the steps from one message to the next: a drive that goes on does not step further."""
 
@@ -56,18 +56,20 @@ class _Drop:
 def correct_clock_steps(topics: Iterable[Stamps], notes: Notes) -> None:
     """Shift all log times behind each step back of the recorder's clock on by its size."""
     topics = [one for one in topics if len(one.log_ns)]
-    drops = sorted((drop for one in topics for drop in _drops(one)), key=lambda drop: (drop.behind, drop.before))
+    drops = sorted((drop for one in topics for drop in _drops(one)), key=lambda drop: drop.before)
+    behind = [*accumulate((drop.behind for drop in reversed(drops)), min)][::-1]
     steps: list[tuple[int, int]] = []
-    while drops:  # all topics go back at the same place: each group has its first message behind
-        position = drops[0].behind
-        group = [drop for drop in drops if drop.before < position]
-        drops = [drop for drop in drops if drop.before >= position]
+    start = 0
+    while start < len(drops):  # all topics go back at the same place: each group has its first message behind
+        position = behind[start]
+        stop = max(bisect_left(drops, position, key=lambda drop: drop.before), start + 1)  # a path has one position
+        group, start = drops[start:stop], stop
         if sum(drop.overlap for drop in group) >= _OVERLAP or any(drop.continuous for drop in group):
-            fastest = min(group, key=lambda drop: (drop.period_ns, drop.elapsed_ns))
+            fastest = min(group, key=lambda drop: (drop.period_ns, drop.elapsed_ns, drop.behind))
             sizes = (drop.back_ns + drop.moved_ns for drop in group)
             steps.append((position, max(fastest.back_ns + fastest.elapsed_ns, *sizes)))
-    if not 0 < len(steps) <= _MOST_STEPS:
-        return
+    if not 0 < len(steps) <= _MOST_STEPS or sum(size_ns for _, size_ns in steps) > LAST_NS:
+        return  # a forged time steps further than any clock
     positions, sizes = np.transpose(np.array(steps, np.int64))
     total_ns = np.append(0, np.cumsum(sizes))
     for one in topics:
@@ -106,7 +108,7 @@ def _drops(one: Stamps) -> list[_Drop]:
                 -int(step[row - 1]), elapsed if elapsed > 0 else period,
                 0 if elapsed > 0 or one.xyz_m is None else _time_by_motion(one.xyz_m, row, period),
                 max(_alternations(log_ns[before], log_ns[behind]) - _ALTERNATIONS, 0),
-                last_ns < log_ns[:row].min() - _LONGEST_PAUSE_NS or _is_continuous(log_ns, one.xyz_m, row),
+                last_ns < log_ns[:row].min() - LONGEST_PAUSE_NS or _is_continuous(log_ns, one.xyz_m, row),
             )
         )  # fmt: skip
     return found

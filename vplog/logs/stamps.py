@@ -26,8 +26,9 @@ from vplog.logs.formats.container import Notes
 from vplog.logs.formats.loss_account import runs_of
 
 NONE: Ints = np.zeros(0, np.int64)
-_LAST_NS = 2**63 - 1
-"""Log times are unsigned; what is beyond this, year 2262, is damage."""
+LAST_NS = 2**63 - 1
+"""Last time that 64 bits hold, in the year 2262. A log time after it or before 1970 is damage, and is set to the
+nearest time in between."""
 _SECOND_NS = 10**9
 _COARSE_NS = 3 * 10**8
 """ns by which the delay of stamps in whole seconds varies at least where they are not taken on the second."""
@@ -68,13 +69,13 @@ class Stamps:
     def add(self, header_ns: int, log_ns: int, position: int | None = None) -> None:
         self._positions.append(len(self.log_ns) if position is None else position)
         self.header_ns.append(header_ns)
-        self.log_ns.append(min(log_ns, _LAST_NS))
+        self.log_ns.append(min(max(log_ns, 0), LAST_NS))
 
     def extend(self, header_ns: list[int], log_ns: list[int], positions: list[int] | None = None) -> None:
         """Add messages by their stamps, log times and positions in the file; None is one behind the other."""
         self._positions.extend(positions or range(len(self.log_ns), len(self.log_ns) + len(log_ns)))
         self.header_ns.extend(header_ns)
-        self.log_ns.extend([min(time_ns, _LAST_NS) for time_ns in log_ns])
+        self.log_ns.extend([min(max(time_ns, 0), LAST_NS) for time_ns in log_ns])
 
     def offset_ns(self) -> int | None:
         """Log time less header stamp, the median; None where the header stamps follow no clock."""
@@ -88,7 +89,7 @@ class Stamps:
     def shift_log_times(self, by_ns: Ints) -> None:
         """Add (M,) ns to the log times."""
         log_ns = np.array(self.log_ns, np.int64)
-        self.log_ns, self._found = array("q", (np.minimum(log_ns, _LAST_NS - by_ns) + by_ns).tolist()), None
+        self.log_ns, self._found = array("q", (np.minimum(log_ns, LAST_NS - by_ns) + by_ns).tolist()), None
 
     def clocks(self) -> dict[int, int]:
         """Messages by the offset of the clock that they came on; several where it was set."""
@@ -217,7 +218,7 @@ def _on_common(stamp_ns: Ints, offset_ns: int, common: Clock | None, topic: str,
     first_ns, last_ns = int(stamp_ns.min()), int(stamp_ns.max())
     apart = first_ns > common.last_ns or last_ns < common.first_ns
     apart |= offset_ns < -LATE_NS and abs(common.offset_ns) <= LATE_NS  # GPS time: nothing is recorded before its time
-    if not apart or first_ns + shift < 0 or last_ns + shift > _LAST_NS:
+    if not apart or first_ns + shift < 0 or last_ns + shift > LAST_NS:
         notes.add(
             f"{topic}: by the log times, the header stamps are {abs(shift) / 1e9:.1f} s "
             f"{'earlier' if shift > 0 else 'later'} than those of other topics. Were they recorded late, or is a "

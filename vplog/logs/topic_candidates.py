@@ -43,7 +43,8 @@ def read_candidates(container: Container, contents: Contents) -> list[Candidate]
         for channel, kind in kinds.items()
         if kind
     ]
-    return [replace(c, role="image") if _is_thermal(c, firsts.get(c.channel), found) else c for c in found]
+    frames = {c.frame for c in found if c.role == "image"}
+    return [replace(c, role="image") if _is_thermal(c, firsts.get(c.channel), frames) else c for c in found]
 
 
 def _candidate(channel: Channel, count: int, kind: str, first: _First | None) -> Candidate:
@@ -67,12 +68,12 @@ def _candidate(channel: Channel, count: int, kind: str, first: _First | None) ->
     return Candidate(channel, count, role, frame, calibrated, codec, encoding, size or (0, 0), supported)
 
 
-def _is_thermal(candidate: Candidate, first: object, candidates: list[Candidate]) -> bool:
-    """Whether images of 16UC1 are a thermal camera's, not depth: by the words of topic and frame; else where no camera
-    has their frame, to which depth would be registered, and every px has a value."""
+def _is_thermal(candidate: Candidate, first: object, frames: set[str]) -> bool:
+    """Whether images of 16UC1 are a thermal camera's, not depth: by the words of topic and frame; else if no camera
+    has their frame, to which depth would be registered, and every px has a value. `frames` are those of the cameras."""
     if candidate.role != "depth" or not isinstance(first, ImageMessage) or not may_be_thermal(first):
         return False
     words = f"{candidate.channel.topic} {candidate.frame}".lower()
     if "depth" in words or _THERMAL.search(words):
         return "depth" not in words
-    return not any(c.role == "image" and c.frame == candidate.frame for c in candidates)
+    return candidate.frame not in frames

@@ -219,13 +219,19 @@ _BACKWARD = re.compile(r"(?<![a-z])(back|rear)(?![a-z])", re.IGNORECASE)
 """Words in the topics of cameras that look back."""
 
 
+MOST_TOPICS = 1000
+"""Maximum number of topics that are compared with each other, those with the most messages. A swarm of a hundred robots
+has some 500 that can be used."""
+
+
 def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Selection:
     """The topics to use by the rules above. Raises LogError where a topic named in `choice` cannot play its part."""
     _check_files(choice)
     _check_mask_topics(candidates, choice)
     candidates = sorted(candidates, key=lambda c: (c.role == "imu" and not c.supported, -c.count, c.channel))
-    usable, pick = [c for c in candidates if c.count], partial(_pick, candidates, choice, log)
-    image = pick("image", "depth", lambda c: _image_order(c, usable))
+    usable, pick = [c for c in candidates if c.count][:MOST_TOPICS], partial(_pick, candidates, choice, log)
+    known = candidates if choice.image else usable
+    image = _pick(known, choice, log, "image", "depth", lambda c: _image_order(c, usable))
     for topic in choice.cameras or ():
         _pick(candidates, choice.of_camera(topic), log, "image", "depth")  # raises where it is not there
     found = {"image": image} | ({} if image is None else _of_image(image, usable, choice, log, pick))
@@ -305,7 +311,7 @@ def further_cameras(
 ) -> list[tuple[Candidate, Candidate | None]]:
     """Calibrated cameras beside the one in use, each by its best topic: with another frame_id than any before it; and,
     where its name is that of the right one of a pair, the left one. Other cameras, by their calibrations, are noted."""
-    usable = sorted((c for c in candidates if c.count), key=lambda c: (-c.count, c.channel))
+    usable = sorted((c for c in candidates if c.count), key=lambda c: (-c.count, c.channel))[:MOST_TOPICS]
     requested = used.right if choice.right else None  # any other is a pair by its name, and may look elsewhere
     first = [c for c in usable if c.channel in (used.image, requested)]
     taken, infos = {c.frame for c in first}, {_calibration(c, usable) for c in first}

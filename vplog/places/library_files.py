@@ -23,7 +23,7 @@ from vplog.execution.execution import Execution
 from vplog.settings import Settings
 from vplog.storage.folders import check_regular
 from vplog.storage.image_file import BadImageError, decode_image, image_size
-from vplog.storage.json_records import has_checksum, with_checksum
+from vplog.storage.json_records import has_checksum, parse_json, with_checksum
 from vplog.storage.parquet_limits import check_columns, check_file, check_version, open_table, read_table, write_table
 from vplog.storage.scratch import put_in_place, sync_all
 from vplog.version import __version__
@@ -185,7 +185,7 @@ def read_library_record(folder: Path) -> dict[str, Any]:
     check_regular(folder, "library.json")
     try:
         check_file(folder / "library.json")
-        record = json.loads((folder / "library.json").read_text(encoding="utf-8"))
+        record = parse_json((folder / "library.json").read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise LibraryError(
             f"{folder} is not a library: it has no library.json.{nearest_path(folder)} "

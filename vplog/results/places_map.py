@@ -23,7 +23,7 @@ from vplog.data import Floats, Int32s, Ints
 from vplog.errors import ResultError
 from vplog.geometry import se3
 from vplog.results import geo, run_record, tables
-from vplog.storage.json_records import canonical_json
+from vplog.storage.json_records import canonical_json, parse_json
 from vplog.storage.parquet_limits import check_size, filled, open_table, read_schema, table_writer
 from vplog.storage.scratch import replacing
 
@@ -178,7 +178,7 @@ def read_places_header(path: Path) -> PlacesHeader:
     """The header of a map of places. Raises ResultError where it is none."""
     with tables.reading(path, _AGAIN, _AGAIN):
         header = {key.decode(): value.decode() for key, value in (read_schema(path).metadata or {}).items()}
-        settings, drives = (json.loads(header.get(f"vplog.{name}", "null")) for name in ("settings", "drives"))
+        settings, drives = (parse_json(header.get(f"vplog.{name}", "null")) for name in ("settings", "drives"))
         canonical_json([settings, drives])  # not nested deeper than can be written again
     sound = isinstance(settings, dict) and isinstance(drives, dict)
     sound = sound and all(isinstance(known, dict) for known in drives.values())

@@ -11,7 +11,7 @@ from typing import Any
 from vplog.errors import ResultError, nearest_path
 from vplog.results.staging import recover
 from vplog.storage.folders import check_regular
-from vplog.storage.json_records import CHECKSUM, has_checksum, with_checksum
+from vplog.storage.json_records import CHECKSUM, has_checksum, parse_json, with_checksum
 from vplog.storage.parquet_limits import check_file, check_version
 from vplog.storage.scratch import replacing
 
@@ -73,7 +73,7 @@ def _run_meant(folder: Path) -> str:
 
 def _sound_json(text: str) -> Any:
     """The value of a JSON text, if it can be written again. Raises ValueError or RecursionError."""
-    tree = json.loads(text)
+    tree = parse_json(text)
     if "\\u" in text:  # half a character that takes two, which no file or terminal can hold
         json.dumps(tree, ensure_ascii=False).encode()
     level, depth = [tree] if text.count("[") + text.count("{") > _MOST_DEPTH else [], 0

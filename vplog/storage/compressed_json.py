@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vplog.errors import ResultError
+from vplog.storage.json_records import parse_json
 from vplog.storage.parquet_limits import check_file
 from vplog.storage.scratch import replacing
 
@@ -33,6 +34,6 @@ def read_compressed(path: Path) -> Any:
         text = unpacked.decompress(packed, _MOST_RATIO * len(packed))
         if not unpacked.eof:  # its checksum is behind it
             raise ValueError
-        return json.loads(text)
+        return parse_json(text)
     except (OSError, ValueError, RecursionError, zlib.error):
         raise ResultError(f"{path} is missing or damaged.") from None

@@ -34,6 +34,26 @@ def canonical_json(tree: Any) -> str:
     return json.dumps(plain(tree), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
+def parse_json(text: str | bytes) -> Any:
+    """Return the value of a JSON text. Raises ValueError if the text is damaged or holds a number that is not finite or
+    does not fit 64 bits, and RecursionError if its values are nested too deeply."""
+    return json.loads(text, parse_int=_integer, parse_float=_finite, parse_constant=_finite)
+
+
+def _integer(text: str) -> int:
+    number = int(text)
+    if not -(2**63) <= number < 2**64:
+        raise ValueError(f"an integer of {len(text)} characters does not fit 64 bits")
+    return number
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text[:20]} is not finite")
+    return number
+
+
 def plain(value: Any) -> Any:
     """The value with numpy scalars, arrays and paths as JSON has them."""
     if isinstance(value, dict):

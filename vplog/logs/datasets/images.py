@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from vplog.logs.datasets.streams import DataSet, camera_streams
-from vplog.logs.image_folder import PERIOD_NS, natural_order, select_camera, stamps_of
+from vplog.logs.image_folder import PERIOD_NS, frame_rate_remarks, natural_order, select_camera, stamps_of
 from vplog.logs.topic_selection import EVERY_IMAGE, TopicChoice
 
 
@@ -28,6 +28,8 @@ def read(path: Path, files: list[Path], damaged: Collection[Path], choice: Topic
         times = [number * PERIOD_NS for number in range(len(files))]
         if choice.odometry_file is not None or choice.odometry == "visual":  # who compares pictures uses no times
             remarks = [f"The names in {path.name} are not times; its images are assumed to be 0.1 s apart."]
+    else:
+        remarks = frame_rate_remarks(path, times)
     names = {
         time_ns: file.relative_to(path).as_posix() for time_ns, file in reversed([*zip(times, files, strict=True)])
     }

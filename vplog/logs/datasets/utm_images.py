@@ -15,8 +15,9 @@ from vplog.logs.image_folder import image_files, named_stamps, natural_order
 
 
 def roots(path: Path) -> list[Path]:
-    first = next((file.name for file in path.iterdir() if file.suffix), "") if path.is_dir() else ""
-    return [path] if first.startswith("@") and utm_name(first) else []
+    """Return the folder itself if the name of any file in it begins with a position."""
+    names = [file.name for file in path.iterdir()] if path.is_dir() else []
+    return [path] if any(name.startswith("@") and utm_name(name) for name in names) else []
 
 
 def read(path: Path) -> DataSet:

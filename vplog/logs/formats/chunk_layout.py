@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import accumulate
 from typing import BinaryIO
 
 from vplog.errors import plural
@@ -73,6 +75,11 @@ class Layout:
     summary_definitions: list[tuple[int, bytes]] = field(default_factory=list)
     """Opcode and data of schemas and channels of a damaged summary, for those that no other place defines."""
 
+    def is_in_gap(self, position: int) -> bool:
+        """Return whether a byte lies in a damaged place, of which `gaps` are in order."""
+        number = bisect_right(self.gaps, position, key=lambda gap: gap[0]) - 1
+        return number >= 0 and position < self.gaps[number][1]
+
     def in_order(self) -> None:
         """Sort the chunks, and take back the counts of doubtful ones."""
         self.chunks.sort(key=lambda chunk: chunk.start)
@@ -109,19 +116,20 @@ class ResyncSearch:
     ) -> int | None:
         """The first offset from `start` on, below `stop`, where the pattern, of at most 64 bytes, matches and
         `accept(offset)` holds."""
-        position, stop = start, self._length if stop is None else stop
+        position, stop, size = start, self._length if stop is None else stop, _WINDOW
         while position < stop and self._left > 0:
             self._file.seek(position)
-            block = self._file.read(_BLOCK + 64)
+            size = min(2 * size, _BLOCK, stop - position)  # a match is often near, and searched for many times
+            block = self._file.read(size + 64)
             for match in pattern.finditer(block):
-                if match.start() >= min(_BLOCK, stop - position):
+                if match.start() >= size:
                     break
                 self._left -= 1
                 if self._left <= 0:
                     return None
                 if accept(position + match.start()):
                     return position + match.start()
-            position += _BLOCK
+            position += size
         return None
 
 
@@ -179,15 +187,16 @@ class ChunkLosses:
         recorded = topics_of(layout.recorded, self.channels)
         total = Counter(found)
         layout.missing = [chunk for chunk in layout.missing if not self._is_read(chunk)]
+        times = _TimesBetween(layout.chunks, span)
         for chunk in layout.missing:
             counts = topics_of(chunk.counts, self.channels)
-            when = (chunk.first_ns, chunk.last_ns) if chunk.last_ns else self.between(chunk.start, span)
+            when = (chunk.first_ns, chunk.last_ns) if chunk.last_ns else times.at(chunk.start)
             detail = f"{name} is damaged near byte {chunk.start}."
             account.add("damaged_bytes", counts or None, (name, chunk.start), [when], detail)
             total.update(counts)
         for start, stop in layout.gaps:
             detail = f"{name} is damaged near byte {start}; reading resumes at byte {stop}."
-            account.add("damaged_bytes", None, (name, -start), [self.between(start, span)], detail)
+            account.add("damaged_bytes", None, (name, -start), [times.at(start)], detail)
         if layout.unknown_at is not None and (not recorded or total.total() < sum(recorded.values())):
             detail = f"{name} has a record of unknown content at byte {layout.unknown_at}."
             account.add("damaged_bytes", None, (name, layout.unknown_at), [span], detail)
@@ -201,7 +210,9 @@ class ChunkLosses:
 
     def _is_read(self, missing: Chunk) -> bool:
         """Whether the index behind damaged bytes is that of the chunk before them, by its messages and their times."""
-        before = next((chunk for chunk in reversed(self.layout.chunks) if chunk.stop <= missing.start), None)
+        chunks = self.layout.chunks
+        number = bisect_right(chunks, missing.start, key=lambda chunk: chunk.stop)
+        before = chunks[number - 1] if number else None
         return (
             before is not None
             and missing.start < missing.stop
@@ -209,13 +220,6 @@ class ChunkLosses:
             and before.first_ns <= missing.first_ns <= missing.last_ns <= before.last_ns
             and Counter(missing.counts) <= Counter(before.counts)
         )
-
-    def between(self, position: int, span: Span) -> Span:
-        """The time between the chunk before a damaged place and the one behind it; `span` is that of the file."""
-        chunks = [chunk for chunk in self.layout.chunks if chunk.last_ns]
-        before = max((chunk.last_ns for chunk in chunks if chunk.stop <= position), default=span[0])
-        behind = min((chunk.first_ns for chunk in chunks if chunk.start > position), default=span[1])
-        return before, behind
 
     def _add_end(self, messages: int, spans: list[Span]) -> None:
         """Where the file is cut, or goes on with another recording, behind so many messages."""
@@ -228,3 +232,20 @@ class ChunkLosses:
             account.add_appended(name, layout.appended_at, self.length)
         if layout.index_cut_at is not None:
             self.notes.add(f"{name} is cut or damaged at byte {layout.index_cut_at}, after its last message.")
+
+
+class _TimesBetween:
+    """Log times of the chunks around damaged places."""
+
+    def __init__(self, chunks: list[Chunk], span: Span) -> None:
+        """`chunks` in the order of the file; `span` is that of the file."""
+        chunks = [chunk for chunk in chunks if chunk.last_ns]
+        self._starts, self._stops = [chunk.start for chunk in chunks], [chunk.stop for chunk in chunks]
+        self._last_ns = [span[0], *accumulate((chunk.last_ns for chunk in chunks), max)]
+        self._first_ns = [*accumulate((chunk.first_ns for chunk in reversed(chunks)), min)][::-1]
+        self._first_ns.append(span[1])
+
+    def at(self, position: int) -> Span:
+        """Return the last time in the chunks before a byte, and the first time in those behind it."""
+        before, behind = bisect_right(self._stops, position), bisect_right(self._starts, position)
+        return self._last_ns[before], self._first_ns[behind]

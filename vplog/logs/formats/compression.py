@@ -16,18 +16,15 @@ try:
 except ImportError:  # no wheel for this processor
     from zlib import crc32
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from vplog.errors import LogError
+from vplog.logs.formats.budget import Budget, max_unpacked
 from vplog.logs.formats.container import RawData
 from vplog.storage.remote_path import RemotePath
 from vplog.storage.scratch import scratch
 
-MAX_RATIO = 200
-"""Output bytes a chunk may claim per input byte, above the free allowance; images and numbers pack 1 to 20 fold."""
-FREE_BYTES = 64 * 2**20
-"""A chunk may unpack to this much whatever its ratio (64 MiB: one large raw image of a single grey)."""
 __all__ = ["BadChunkError", "crc32", "unpack", "unpack_zstd_message"]
 KINDS = ("", "none", "lz4", "zstd", "bz2")
 _BLOCK = 2**20
@@ -47,16 +44,21 @@ class BadChunkError(Exception):
         self.data = data
 
 
-def unpack(kind: str, data: bytes, size: int, partial: bool = False) -> bytes:
-    """The `size` bytes that `data` holds under `kind` (one of KINDS); fewer where `partial` and the data are cut.
-    Raises BadChunkError where the kind is unknown, the size beyond what the data justify, or the data are damaged."""
+def unpack(
+    kind: str, data: bytes, size: int, partial: bool = False, charge: Callable[[int], None] = lambda _: None
+) -> bytes:
+    """Return the `size` bytes that `data` holds under `kind` (one of KINDS), or fewer if `partial` and the data are
+    cut. `charge` gets the number of bytes before they are unpacked, and may raise. Raises BadChunkError if the kind is
+    unknown, the size is more than the data justify, or the data are damaged."""
     if kind not in KINDS:
         raise BadChunkError(f"unknown compression {kind[:20]!r}")
     if kind in ("", "none"):
+        charge(len(data))
         result = data
-    elif size < 0 or size > max(FREE_BYTES, MAX_RATIO * len(data)):
+    elif not 0 <= size <= max_unpacked(len(data)):
         raise BadChunkError(f"{len(data)} bytes claim to unpack to {size}")
     else:
+        charge(size)
         try:
             result = _DECODERS[kind](data, size + 1)  # one more, so that one that holds more than that shows
         except (RuntimeError, OSError, ValueError, EOFError, zstandard.ZstdError) as error:
@@ -92,15 +94,15 @@ _DECODERS = {
 }
 
 
-def unpack_zstd_message(data: RawData) -> bytes:
-    """One zstd frame with its own length, bounded like a chunk. Raises BadChunkError."""
+def unpack_zstd_message(data: RawData, charge: Callable[[int], None] = lambda _: None) -> bytes:
+    """Unpack one zstd frame that holds its own length, bounded and charged as by `unpack`. Raises BadChunkError."""
     try:
         size = zstandard.frame_content_size(data)
     except zstandard.ZstdError as error:
         raise BadChunkError(str(error)) from None
     if size < 0:
         raise BadChunkError("a message's zstd frame does not say its length")
-    return unpack("zstd", bytes(data), size)
+    return unpack("zstd", bytes(data), size, charge=charge)
 
 
 @contextmanager
@@ -117,20 +119,20 @@ def fetched(path: RemotePath) -> Iterator[Path]:
 
 
 @contextmanager
-def unpacked(path: Path) -> Iterator[Path]:
-    """A file with what a zstd file holds (rosbag2's compression mode FILE), for the time of the block. A cut one is
-    unpacked as far as it goes. Raises LogError where it is no zstd data, would fill the disk, or claims more than its
-    bytes justify."""
+def unpacked(path: Path, budget: Budget) -> Iterator[Path]:
+    """Yield a file with the content of a zstd file (rosbag2's compression mode FILE) for the time of the block. A cut
+    file is unpacked as far as it goes. Raises LogError if it is no zstd data, would fill the disk, or unpacks to more
+    than its budget."""
     with scratch("log") as folder:
         target = folder / path.name.removesuffix(".zstd").removesuffix(".zst")
-        most, room = max(FREE_BYTES, MAX_RATIO * path.stat().st_size), shutil.disk_usage(folder).free - _SPARE
+        room = shutil.disk_usage(folder).free - _SPARE
         with path.open("rb") as file, target.open("wb") as out:
             stream = zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True)
             try:
                 while block := stream.read(_BLOCK):
                     out.write(block)
-                    if out.tell() > most:
-                        raise LogError(f"{path} unpacks to more than {MAX_RATIO} times its size, so it is no log.")
+                    if out.tell() > budget.max_bytes:
+                        raise budget.error()
                     if out.tell() > room:
                         raise LogError(
                             f"{path} unpacks to more than the {room / 1e9:.1f} GB that are free in {folder.parent}. "

@@ -74,11 +74,10 @@ class Notes:
     """Remarks on a log, each once, in the order they were found, and the account of what is lost."""
 
     account: LossAccount = field(default_factory=LossAccount)
-    _remarks: list[str] = field(default_factory=list)
+    _remarks: dict[str, None] = field(default_factory=dict)
 
     def add(self, line: str) -> None:
-        if line not in self._remarks:
-            self._remarks.append(line)
+        self._remarks.setdefault(line)
 
     def extend(self, other: Notes) -> None:
         self.account.extend(other.account)

@@ -179,25 +179,15 @@ class LossAccount:
         recorded: Counter[str] = Counter()
         for counts in self._recorded.values():
             recorded.update(counts)
-        order, found, result = list(REASONS), self._copy(), []
+        order, found, result, log = list(REASONS), self._copy(), [], self._span
         for reason, topic in sorted(found, key=lambda key: (order.index(key[0]), key)):
             places = found[reason, topic]
             lost = [places[key] for key in sorted(places)]
             if lost:
                 messages = None if None in (counts := [one.messages for one in lost]) else sum(n or 0 for n in counts)
-                spans = tuple(merged([span for one in lost for span in self._in_log(reason, one.spans)]))
+                spans = tuple(merged([span for one in lost for span in _in_log(reason, one.spans, log)]))
                 result.append(TopicLoss(reason, topic, messages, recorded.get(topic), spans, lost[0].detail))
         return result
-
-    def _in_log(self, reason: str, spans: list[Span]) -> list[Span]:
-        """The spans without what is far from the log: stamps that damage has changed."""
-        if reason not in _OPEN:
-            return spans
-        spans = [(a or b, b) for a, b in spans if b]  # 0 is no time
-        start, end = self._span
-        least, most = start - _FARTHEST_NS, end + _FARTHEST_NS
-        ends = [(max(a, min(start, b)) if a < least else a, min(b, max(end, a)) if b > most else b) for a, b in spans]
-        return [(a, b) for a, b in ends if a <= most and b >= least]
 
     @property
     def _span(self) -> Span:
@@ -235,6 +225,17 @@ class LossAccount:
         first, last = (f"{(ns - (self.start_ns or 0)) / 1e9:.3f}" for ns in (spans[0][0], spans[-1][1]))
         where = f" in {len(spans)} places" if len(spans) > 1 else ""
         return f"at t={first} s" if first == last else f"from t={first} to {last} s{where}"
+
+
+def _in_log(reason: str, spans: list[Span], log: Span) -> list[Span]:
+    """Return the spans without what is far from those of the log, because damage has changed these stamps."""
+    if reason not in _OPEN:
+        return spans
+    spans = [(a or b, b) for a, b in spans if b]  # 0 is no time
+    start, end = log
+    least, most = start - _FARTHEST_NS, end + _FARTHEST_NS
+    ends = [(max(a, min(start, b)) if a < least else a, min(b, max(end, a)) if b > most else b) for a, b in spans]
+    return [(a, b) for a, b in ends if a <= most and b >= least]
 
 
 def _count(loss: TopicLoss) -> str:

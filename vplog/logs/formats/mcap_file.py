@@ -14,6 +14,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
+from vplog.logs.formats.budget import Budget
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
 from vplog.logs.formats.chunk_layout import Chunk, ChunkLosses
 from vplog.logs.formats.compression import BadChunkError, crc32, unpack
@@ -36,9 +37,10 @@ _WINDOW = 4096
 class McapFile:
     """A Container over one MCAP file."""
 
-    def __init__(self, path: Path, notes: Notes, name: str = "") -> None:
-        """`name` is what the file is called in remarks."""
+    def __init__(self, path: Path, notes: Notes, name: str = "", budget: Budget | None = None) -> None:
+        """`name` is what the file is called in remarks. `budget` limits its content, by default by its size."""
         self._name, self._notes, length = name or path.name, notes, path.stat().st_size
+        self._budget = budget or Budget(str(path), length)
         self._file = path.open("rb")
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {0: ""}
@@ -66,7 +68,9 @@ class McapFile:
         if layout.summary_definitions or by_id.keys() - self._channels.keys():
             self._define_all()
             by_id, times = self._counted(unpack_all=False)
-        listed = sum((Counter(chunk.counts) for chunk in layout.missing), +by_id)
+        listed = +by_id
+        for chunk in layout.missing:
+            listed.update(chunk.counts)
         if layout.recorded and layout.recorded != dict(listed) and layout.chunks:
             by_id, times = self._counted(unpack_all=True)
         for number in self._unread:  # more channels may be defined by now
@@ -84,7 +88,7 @@ class McapFile:
                 times += (chunk.first_ns, chunk.last_ns)
             else:
                 data = self._data(number)
-                reader = ChunkReader(number, len(data), self._channels, self._define, None, cut=chunk.cut)
+                reader = self._reader(number, len(data))
                 times += sampled([message.log_ns for message in reader.read(data)])
                 damaged = self._account_for_chunk(chunk, reader) or not data
                 counts.update(reader.counts | Counter(chunk.counts) if damaged else reader.counts)
@@ -101,7 +105,7 @@ class McapFile:
             if not self._losses.may_hold(chunk, wanted):  # by a definition that came meanwhile
                 continue
             end = chunk.stop - chunk.start if data is None else len(data)
-            reader = ChunkReader(number, end, self._channels, self._define, wanted, header_only, chunk.cut)
+            reader = self._reader(number, end, wanted, header_only)
             if data is None:
                 yield from reader.read_in_place(lambda start, length, at=chunk.start: self._at(at + start, length))
             else:
@@ -143,10 +147,22 @@ class McapFile:
         """Take the schemas and channels of all chunks, and those of a damaged summary where no chunk has them."""
         for number in range(len(self._layout.chunks)):
             data = self._data(number)
-            ChunkReader(number, len(data), self._channels, self._define, None).read(data)
+            self._reader(number, len(data)).read(data)
         for opcode, data in self._layout.summary_definitions:
             self._define(opcode, data, doubtful=True)
         self._layout.summary_definitions.clear()
+
+    def _reader(
+        self,
+        number: int,
+        end: int,
+        wanted: Collection[Channel] | None = None,
+        header_only: Collection[Channel] = (),
+        doubtful: bool = False,
+    ) -> ChunkReader:
+        """Return a reader of chunk `number`. The definitions of a damaged chunk are `doubtful`."""
+        define, cut = partial(self._define, doubtful=doubtful), self._layout.chunks[number].cut and not doubtful
+        return ChunkReader(number, end, self._channels, define, wanted, header_only, cut, self._budget)
 
     def _account_for_chunk(self, chunk: Chunk, reader: ChunkReader) -> bool:
         """Account for what a chunk lacks; whether it is damaged."""
@@ -166,7 +182,8 @@ class McapFile:
         data = self._at(chunk.start, chunk.stop - chunk.start)
         if chunk.compression is None:
             return data
-        data = unpack(chunk.compression, data, chunk.size, partial=chunk.cut)
+        charge = partial(self._budget.charge_bytes, number)
+        data = unpack(chunk.compression, data, chunk.size, chunk.cut, charge)
         if chunk.crc and not chunk.cut and not self._sound[number]:
             if crc32(data) != chunk.crc:
                 raise BadChunkError("its checksum does not match", data)
@@ -175,8 +192,7 @@ class McapFile:
 
     def _add_damaged_chunk(self, number: int, error: BadChunkError) -> None:
         """Account for a damaged chunk, and take its schemas and channels, which other chunks need."""
-        define = partial(self._define, doubtful=True)
-        ChunkReader(number, len(error.data), self._channels, define, None).read(error.data)
+        self._reader(number, len(error.data), doubtful=True).read(error.data)
         self._unread[number] = f", left out: {error}"
         self._add_unread(number)
 
@@ -210,16 +226,19 @@ class ChunkReader:
         wanted: Collection[Channel] | None,
         header_only: Collection[Channel] = (),
         cut: bool = False,
+        budget: Budget | None = None,
     ) -> None:
         """`end` is its length, `cut` whether the file ends in it. Messages on `wanted` channels are given (None: on
         all); those on `header_only` ones need not be whole. `define` takes a schema or channel record and may add to
-        `channels`."""
+        `channels`. `budget` is that of the file; by default, that of a file of this length."""
         self.position = 0
         self.last_ns: int | None = None
         """Log time of the last message, on whatever channel."""
         self.number, self.end, self._channels, self._define = number, end, channels, define
         self._wanted, self._header_only, self._cut = wanted, header_only, cut
-        self._used = {i: channel for i, channel in channels.items() if wanted is None or channel in wanted}
+        self._budget = budget or Budget(f"Chunk {number}", end)
+        self._used: dict[int, Channel | None] = {}
+        """Channels of the messages found so far, None for those that are not wanted."""
         self._ids: list[int] = []
         self._messages: list[Message] = []
 
@@ -250,29 +269,39 @@ class ChunkReader:
 
     def _without_damaged(self) -> list[Message]:
         """The messages found, without the one before damage: its length may be what is damaged."""
-        if self.position < self.end and not self._cut and self._ids and self._ids.pop() in self._used:
+        self._budget.charge_messages(self.number, len(self._ids))
+        if self.position < self.end and not self._cut and self._ids and self._channel(self._ids.pop()):
             self._messages.pop()
         return self._messages
+
+    def _channel(self, number: int) -> Channel | None:
+        """Return the channel of this number, or None if it is not wanted or not defined."""
+        if number not in self._used:
+            channel = self._channels.get(number)
+            self._used[number] = channel if self._wanted is None or channel in self._wanted else None
+        return self._used[number]
 
     def _parse(self, data: bytes) -> None:
         """On through `data`, which lie at `position` in the chunk, up to the first record that more is needed of."""
         base, at, size, left = self.position, 0, len(data), self.end - self.position
-        used = self._used
+        max_messages = self._budget.max_messages
         while at + _MESSAGE.size <= size:
             opcode, length, channel_id, _, log_ns, _ = _MESSAGE.unpack_from(data, at)
             start, stop = at + _MESSAGE.size, at + RECORD.size + length
             if stop < start if opcode == _IS_MESSAGE else opcode in _OUTSIDE:
                 break
             if stop > size and (
-                opcode != _IS_MESSAGE or stop > left or self._is_needed(used.get(channel_id), size - start, length)
+                opcode != _IS_MESSAGE or stop > left or self._is_needed(channel_id, size - start, length)
             ):
                 break
             if opcode == _IS_MESSAGE:
                 self._ids.append(channel_id)
+                if len(self._ids) > max_messages:
+                    raise self._budget.error()
                 self.last_ns = log_ns
-                if channel_id in used:
+                if (channel := self._channel(channel_id)) is not None:
                     place = self.number, base + start, base + stop
-                    self._messages.append(Message(used[channel_id], log_ns, part_of(data, start, stop), place))
+                    self._messages.append(Message(channel, log_ns, part_of(data, start, stop), place))
             elif opcode in _DEFINES:
                 self._take_definition(opcode, data[at + RECORD.size : stop])
             at = stop
@@ -287,16 +316,11 @@ class ChunkReader:
         self.position = base + at
 
     def _take_definition(self, opcode: int, data: bytes) -> None:
-        """Take a definition; it may be of a wanted channel, and a log may have ten thousands of them."""
         self._define(opcode, data)
-        number = int.from_bytes(data[:2], "little")  # of a schema or channel record, its first field
-        channel = self._channels.get(number)
-        if opcode != _IS_SCHEMA and channel is not None:
-            if self._wanted is None or channel in self._wanted:
-                self._used[number] = channel
-            else:
-                self._used.pop(number, None)
+        if opcode != _IS_SCHEMA:
+            self._used.pop(int.from_bytes(data[:2], "little"), None)  # the number of the channel, which may be new
 
-    def _is_needed(self, channel: Channel | None, there: int, length: int) -> bool:
+    def _is_needed(self, channel_id: int, there: int, length: int) -> bool:
         """Whether more of a message is needed than the bytes that are there."""
+        channel = self._channel(channel_id)
         return channel is not None and (channel not in self._header_only or there < HEADER_BYTES or length < _WINDOW)

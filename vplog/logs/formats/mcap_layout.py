@@ -92,9 +92,11 @@ class _LayoutReader:
         self.layout = Layout()
         self._indexed: dict[int, tuple[Chunk, dict[int, int]]] = {}
         """By offset: chunks as the summary's index lists them, and where the message index of each channel lies."""
+        self._ahead: list[int] | None = None
+        """Offsets of the index that may be chunks to go on with behind damage, the next one last."""
         self._unfit: list[tuple[int, int]] = []
         """Offset and opcode of records of other lengths than their fields, which may have been messages."""
-        self._chunked = False
+        self._chunked = self._looked_for_chunks = False
         self._indexing: Chunk | None = None
         """The chunk whose message indexes come by."""
         self._search = ResyncSearch(file, length)
@@ -150,7 +152,7 @@ class _LayoutReader:
             elif (there := self._bounds(offset))[0] == Opcode.CHUNK and there[1] <= self._length:  # jumped over
                 self._add_chunk(offset + RECORD.size, there[1], cut=False)
                 self.layout.chunks[-1].counts = self._counts(indexes)
-            elif any(start <= offset < stop for start, stop in self.layout.gaps):
+            elif self.layout.is_in_gap(offset):
                 listed.counts = self._counts(indexes)
                 self.layout.missing.append(listed)
             else:  # bytes are gone or new before it, or the index is damaged
@@ -296,14 +298,13 @@ class _LayoutReader:
         if self._summary_start is not None and not self._indexed:
             self._read_summary(self._summary_start)
         chunks, found = self.layout.chunks, None
-        self._chunked |= not chunks and self._search.first(_CHUNKS, position + 1, self._is_record) is not None
+        self._look_for_chunks(position)
         if not self._chunked and chunks and chunks[-1].stop > before and not self._is_message_head(position):
             chunks[-1].stop, position = before, before
             if chunks[-1].start == before:
                 chunks.pop()
         if self._indexed:
-            behind = (offset for offset in sorted(self._indexed) if offset > position)
-            found = next((offset for offset in behind if self._bounds(offset)[0] == Opcode.CHUNK), None)
+            found = self._next_listed_chunk(position)
         elif self._chunked:
             found = self._search.first(_OUTSIDE_CHUNKS, position + 1, self._is_record)
         else:
@@ -326,6 +327,20 @@ class _LayoutReader:
         if found - position >= (_LEAST_CHUNK if self._chunked else RECORD.size + _MESSAGE_HEAD.size):
             self.layout.gaps.append((position, found))  # else no message has room in it
         return found
+
+    def _look_for_chunks(self, position: int) -> None:
+        """Find out whether chunks follow damage before the first message; a second search would find the same."""
+        if not self.layout.chunks and not self._looked_for_chunks:
+            self._looked_for_chunks = True
+            self._chunked |= self._search.first(_CHUNKS, position + 1, self._is_record) is not None
+
+    def _next_listed_chunk(self, position: int) -> int | None:
+        """Return the next chunk of the index behind `position`, which increases from call to call; None without one."""
+        if self._ahead is None:
+            self._ahead = sorted(self._indexed, reverse=True)
+        while self._ahead and (self._ahead[-1] <= position or self._bounds(self._ahead[-1])[0] != Opcode.CHUNK):
+            self._ahead.pop()
+        return self._ahead[-1] if self._ahead else None
 
     def check_summary(self) -> None:
         """Find the summary at the end of the file, and read it where its checksum is right."""

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator
+from functools import partial
 from pathlib import Path
 
+from vplog.logs.formats.budget import Budget
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
 from vplog.logs.formats.chunk_layout import ChunkLosses
 from vplog.logs.formats.compression import BadChunkError, unpack
@@ -21,9 +23,10 @@ _FIELDS = {MESSAGE: {b"conn", b"time"}, CONNECTION: {b"conn", b"topic"}}
 class Ros1Bag:
     """A Container over one bag file."""
 
-    def __init__(self, path: Path, notes: Notes, name: str = "") -> None:
-        """`name` is what the file is called in remarks."""
+    def __init__(self, path: Path, notes: Notes, name: str = "", budget: Budget | None = None) -> None:
+        """`name` is what the file is called in remarks. `budget` limits its content, by default by its size."""
         self._name, length = name or path.name, path.stat().st_size
+        self._budget = budget or Budget(str(path), length)
         self._file = path.open("rb")
         self._channels: dict[int, Channel] = {}
         self._doubtful: dict[int, Channel] = {}
@@ -106,7 +109,10 @@ class Ros1Bag:
                 self._connect(header, data[start:stop])
             else:
                 found.append((number(header, b"conn"), time_ns(header[b"time"]), start, stop))
+                if len(found) > self._budget.max_messages:
+                    raise self._budget.error()
             position = stop
+        self._budget.charge_messages(row, len(found))
         damaged = position < len(data) and not chunk.cut
         if damaged and found:
             found.pop()  # its length may be what is damaged
@@ -123,7 +129,8 @@ class Ros1Bag:
         """The records of one chunk. Raises BadChunkError where it is damaged."""
         chunk = self._layout.chunks[row]
         data = self._at(chunk.start, chunk.stop - chunk.start)
-        return unpack(chunk.compression or "", data, chunk.size, chunk.cut)
+        charge = partial(self._budget.charge_bytes, row)
+        return unpack(chunk.compression or "", data, chunk.size, chunk.cut, charge)
 
     def _add_damaged_chunk(self, row: int, error: BadChunkError) -> None:
         chunk = self._layout.chunks[row]

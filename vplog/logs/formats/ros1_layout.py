@@ -158,13 +158,16 @@ class _LayoutReader:
                 header, start, stop = self._head(offset)
                 self._record(_CHUNK, header or {}, offset, start, stop)
                 layout.chunks[-1].counts = info.counts
-            elif any(start <= offset < stop for start, stop in layout.gaps):  # else the index is damaged
+            elif layout.is_in_gap(offset):  # else the index is damaged
                 info.doubtful |= bool(others)  # then it may be one of these
                 layout.missing.append(info)
             else:
                 listed = False
         if self._index_sound and len(self._infos) == self._chunk_count:
-            layout.recorded = dict(sum((Counter(info.counts) for info in self._infos.values()), Counter()))
+            recorded = Counter[int]()
+            for info in self._infos.values():
+                recorded.update(info.counts)
+            layout.recorded = dict(recorded)
         if not self._infos or not listed:
             layout.missing += skipped
         layout.gaps = []  # each has its chunk among the missing ones

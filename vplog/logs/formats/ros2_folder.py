@@ -13,6 +13,8 @@ from typing import Any
 import yaml
 import zstandard
 
+from vplog.errors import LogError
+from vplog.logs.formats.budget import max_unpacked
 from vplog.logs.formats.compression import BadChunkError, unpack_zstd_message
 from vplog.logs.formats.container import Channel, Container, Contents, Message, Notes, Place, RawData, by_topic
 from vplog.logs.formats.loss_account import LossRuns
@@ -103,11 +105,22 @@ class ZstdMessages:
 
     def messages(self, channels: Collection[Channel], header_only: Collection[Channel] = ()) -> Iterator[Message]:
         lost: defaultdict[str, LossRuns] = defaultdict(LossRuns)
-        reason = ""
+        reason, on_disk, unpacked = "", 0, 0
+
+        def charge(size: int) -> None:
+            nonlocal unpacked
+            unpacked += size
+            if unpacked > max_unpacked(on_disk):
+                raise LogError(
+                    f"{on_disk} bytes of messages with zstd compression unpack to more than {max_unpacked(on_disk)} "
+                    "bytes, so the log is damaged or made to exhaust the computer. Copy or record it again."
+                )
+
         for message in self._packed.messages(channels):
             topic = message.channel.topic
+            on_disk += len(message.data)
             try:
-                yield message._replace(data=unpack_zstd_message(message.data))
+                yield message._replace(data=unpack_zstd_message(message.data, charge))
             except BadChunkError as error:
                 reason = reason or f"The first does not unpack: {error}."
                 lost[topic].add_lost(message.log_ns)

@@ -7,9 +7,11 @@ import sqlite3
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterator
+from functools import partial
 from pathlib import Path
 
 from vplog.errors import LogError, plural
+from vplog.logs.formats.budget import Budget
 from vplog.logs.formats.chunk_layout import ResyncSearch
 from vplog.logs.formats.container import Channel, Contents, Message, Notes, Place, by_topic
 from vplog.logs.formats.loss_account import confirmed_span, main_span
@@ -31,15 +33,25 @@ FROM (SELECT *, lag(row) OVER () AS before
       FROM (SELECT rowid AS row, topic_id, timestamp FROM messages NOT INDEXED LIMIT ?))
 GROUP BY topic_id"""
 """By topic: rows, times, and how many lie behind one of no lower number, as pages in each other's place have them."""
+_TABLES = """
+SELECT name FROM sqlite_master WHERE type = 'table' AND sql LIKE 'CREATE TABLE %'
+AND NOT EXISTS (SELECT * FROM pragma_table_xinfo(sqlite_master.name) WHERE hidden)"""
+"""Names of tables whose rows are in the file. Views, virtual tables and generated columns are computed."""
+_STEPS = 2**16
+"""Instructions of SQLite between two looks at their number: about a millisecond."""
 _ROWS = "SELECT rowid, topic_id, timestamp, data FROM messages"
 
 
 class SqliteBag:
     """A Container over one .db3 file."""
 
-    def __init__(self, path: Path, notes: Notes, name: str = "") -> None:
-        """`name` is what the file is called in remarks."""
+    def __init__(self, path: Path, notes: Notes, name: str = "", budget: Budget | None = None) -> None:
+        """`name` is what the file is called in remarks. `budget` limits the work of its queries, by default by its
+        size."""
         self._path, self._name, self._notes = path, name or path.name, notes
+        self._budget = budget or Budget(str(path), path.stat().st_size)
+        self._steps = 0
+        """Instructions of SQLite so far."""
         self._damage = ""
         """The first damage that was met, in a sentence."""
         self._by_id: Counter[int] = Counter()
@@ -80,7 +92,7 @@ class SqliteBag:
         """Topic number, messages, first and last time, of each topic or, in a damaged file, of each row."""
         try:
             most = self._path.stat().st_size // _LEAST_ROW
-            found = [] if self._damage else self._db.execute(_COUNTS, [most]).fetchall()
+            found = [] if self._damage else [*self._execute(_COUNTS, most)]
             count = sum(row[1] for row in found)
             if any(row[4] for row in found) or count == most:
                 self._add_damage("its row numbers do not increase")
@@ -131,7 +143,7 @@ class SqliteBag:
         try:
             if not self._damage:
                 query = f"{_ROWS} WHERE topic_id IN ({','.join('?' * len(topics))}) ORDER BY rowid"
-                for row in self._db.execute(query, topics):
+                for row in self._execute(query, *topics):
                     last = row[0]
                     if _is_whole(row):
                         yield row
@@ -147,7 +159,7 @@ class SqliteBag:
         left, last = _MOST_TRIED, self._last_row()
         while left > 0:
             try:
-                for row in self._db.execute(f"{_ROWS} NOT INDEXED WHERE rowid > ?", [number]):
+                for row in self._execute(f"{_ROWS} NOT INDEXED WHERE rowid > ?", number):
                     left -= row[0] in yielded
                     if left <= 0:
                         return
@@ -181,9 +193,22 @@ class SqliteBag:
     def _first(self, query: str, *values: int) -> tuple | None:
         """The first row of a query; None where there is none, or damage keeps it from being read."""
         try:
-            return self._db.execute(query, values).fetchone()
+            return next(self._execute(query, *values), None)
         except _DAMAGE:
             return None
+
+    def _execute(self, query: str, *values: int) -> Iterator[tuple]:
+        """Yield the rows of a query. Raises LogError if the file's queries have taken more steps than its budget."""
+        try:
+            yield from self._db.execute(query, values)
+        except sqlite3.OperationalError:
+            if self._is_over_budget():
+                raise self._budget.error() from None
+            raise
+
+    def _is_over_budget(self, steps: int = 0) -> bool:
+        self._steps += steps
+        return self._steps > self._budget.max_bytes
 
     def _connect(self, mode: str) -> sqlite3.Connection:
         db = sqlite3.connect(f"{self._path.resolve().as_uri()}?{mode}", uri=True)
@@ -191,6 +216,7 @@ class SqliteBag:
         db.execute("PRAGMA trusted_schema = OFF")  # a stranger's file runs nothing
         longest = min(max(self._path.stat().st_size, 2**16), _LONGEST)  # no value exceeds its file
         db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, longest)
+        db.set_progress_handler(partial(self._is_over_budget, _STEPS), _STEPS)
         try:
             db.execute("SELECT count(*) FROM sqlite_master").fetchone()
         except sqlite3.DatabaseError:
@@ -199,10 +225,10 @@ class SqliteBag:
         return db
 
     def _read_topics(self) -> dict[int, Channel]:
-        tables = {name for (name,) in self._rows("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        if not {"topics", "messages"} <= tables:
+        if not {("topics",), ("messages",)} <= {*self._rows(_TABLES)}:
             raise LogError(
-                f"{self._path} is an SQLite file, but not a ROS 2 bag: it has no tables topics and messages."
+                f"{self._path} is an SQLite file, but not a ROS 2 bag: it has no tables topics and messages, or they "
+                "are views or have generated columns. Give a file that `ros2 bag record` wrote."
             )
         # All columns, as SQLite holds the lengths of a row's against its own only where it reads the last.
         rows = [row[:4] for row in self._rows("SELECT id, name, type, serialization_format, * FROM topics")]
@@ -214,7 +240,7 @@ class SqliteBag:
     def _rows(self, query: str) -> Iterator[tuple]:
         """Rows as far as the file is sound."""
         try:
-            yield from self._db.execute(query)
+            yield from self._execute(query)
         except _DAMAGE as error:
             self._add_damage(str(error))
 

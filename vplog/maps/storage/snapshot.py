@@ -34,7 +34,7 @@ from vplog.maps.storage import objects
 from vplog.maps.storage.damage import UnreachableError
 from vplog.maps.storage.layout import FORMAT, Below
 from vplog.storage.folders import is_below
-from vplog.storage.json_records import has_checksum, with_checksum
+from vplog.storage.json_records import has_checksum, parse_json, with_checksum
 from vplog.storage.parquet_limits import check_version
 from vplog.storage.remote_path import RemotePath, reason
 from vplog.version import __version__
@@ -338,7 +338,7 @@ def store_errors(remote: RemotePath) -> Iterator[None]:
 
 def _json(data: bytes, place: RemotePath) -> dict[str, Any]:
     try:
-        record = json.loads(data)
+        record = parse_json(data)
         sound = isinstance(record, dict) and has_checksum(record)
     except (ValueError, RecursionError):
         sound, record = False, {}
