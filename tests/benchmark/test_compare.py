@@ -696,6 +696,19 @@ def test_answers_of_a_file_stand_beside_the_methods(traversals: tuple[Path, Path
     assert f"answers:{names}" in said.out
 
 
+def test_answers_that_were_not_given_are_not_counted(traversals: tuple[Path, Path], tmp_path: Path) -> None:
+    """One answer a query, every fourth of them right: looking at five finds no more, and the rest has no rank."""
+    file = tmp_path / "answers.csv"
+    file.write_text("query,match\n" + "".join(f"{row},{row if row % 4 == 0 else 1}\n" for row in range(FRAMES)))
+    done = compare.compare(*traversals, [f"answers:{file}"], TruthChoice("index"), SMALL)
+    (found,) = done.record["methods"].values()
+    right = FRAMES // 4 + 1  # and query 1
+    assert [found[name] for name in ("r_at_1", "r_at_5", "r_at_10")] == pytest.approx([right / FRAMES] * 3)
+    assert found["anr"] == pytest.approx(100 * (FRAMES - right) / FRAMES * (FRAMES - 1) / FRAMES)
+    rank = done.answers["rank"].to_pylist()
+    assert [one for one in rank if one is not None] == [1] * right
+
+
 def test_a_number_is_a_frame_also_where_images_are_named_by_numbers(
     traversals: tuple[Path, Path], tmp_path: Path
 ) -> None:

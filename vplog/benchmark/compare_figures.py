@@ -79,8 +79,8 @@ class Figures:
             grid = figure.subplots(len(shown), len(titles), squeeze=False, subplot_kw=bare)
             for axes, query in zip(grid, shown.tolist(), strict=True):
                 given, right = int(ranks.top_row[query]), int(ranks.true_row[query])
-                rank = 1 + int(ranks.better[query])
-                found = "nowhere in the map" if right < 0 else f"right, rank {rank}: {self.map.name_of(right)}"
+                rank = f"rank {1 + int(ranks.better[query])}" if ranks.true_given[query] else "not given"
+                found = "nowhere in the map" if right < 0 else f"right, {rank}: {self.map.name_of(right)}"
                 texts = (
                     f"query {self.query.name_of(query)}",
                     f"given, {ranks.top_score[query]:.3g}: {self.map.name_of(given)}", found,
