@@ -23,6 +23,7 @@ from vplog.benchmark.method_scores import MethodInputs, evaluate_method, stored_
 from vplog.benchmark.recogniser_specs import read_method, read_methods, split_methods
 from vplog.benchmark.sequence_fit import sequence_warning
 from vplog.benchmark.traversals import candidate_stops, extract_traversal, references_of
+from vplog.cli.printing import print_comparison
 from vplog.errors import LogError, SettingsError
 from vplog.evaluate.open_set import score_open_set
 from vplog.evaluate.pairs import index_pairs, listed_pairs
@@ -665,6 +666,25 @@ def test_truth_of_another_drive(verb: Verb, traversals: tuple[Path, Path], drive
 )
 def test_wrong_usage(verb: Verb, wrong: tuple[str, str]) -> None:
     assert verb("compare", "a", "b", "--truth", "index", "--methods", "bobb", *wrong).code == 2
+
+
+def test_the_time_of_shared_features_is_not_a_methods_own(
+    traversals: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The table has both times side by side; answers from a file have neither."""
+    file = tmp_path / "answers.csv"
+    file.write_text("query,match\n0,0\n")
+    methods = ["gist", f"answers:{file}"]
+    record = compare.compare(*traversals, methods, TruthChoice("index"), SMALL).record
+    gist = record["methods"]["gist"]
+    assert gist["mining_ms"] > 0
+    assert gist["feature_ms"] > 0
+    gist |= {"mining_ms": 0.2, "feature_ms": 46.0, "query_ms": 0.03, "encode_ms": 46.2}
+    print_comparison(record)
+    lines = capsys.readouterr().out.splitlines()
+    rows = {line.split()[0]: line.split()[1:] for line in lines if line.startswith(("gist", "answers:"))}
+    assert rows["gist"][-3:] == ["0.20", "46.00", "0.03"]
+    assert len(rows["gist"]) == len(rows[methods[1]]) + 4
 
 
 # Answers from a file
