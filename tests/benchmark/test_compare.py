@@ -36,7 +36,7 @@ from vplog.pipeline import Pipeline, load_pipeline
 from vplog.places import KINDS
 from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
-from vplog.places.library_files import name_extractor
+from vplog.places.library_files import load_references, name_extractor
 from vplog.places.sequence import SequenceSettings
 from vplog.places.vectors import VectorsSettings
 from vplog.results.run_record import read_run_json
@@ -685,6 +685,36 @@ def test_the_time_of_shared_features_is_not_a_methods_own(
     rows = {line.split()[0]: line.split()[1:] for line in lines if line.startswith(("gist", "answers:"))}
     assert rows["gist"][-3:] == ["0.20", "46.00", "0.03"]
     assert len(rows["gist"]) == len(rows[methods[1]]) + 4
+
+
+@pytest.mark.usefixtures("compiled")
+def test_images_of_several_sizes_are_all_used(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
+    """By `compare` and `library`, chosen or not, each at its own size: every second image is cropped."""
+    folders = tmp_path / "day", tmp_path / "dusk"
+    for traversal, folder in zip(traversals, folders, strict=True):
+        folder.mkdir()
+        for file in traversal.iterdir():
+            image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+            assert image is not None
+            assert cv2.imwrite(str(folder / file.name), image[:, : -16 * (int(file.stem) % 3) or None])
+    for choice in ((), ("--image-topic", "*")):
+        given = ("compare", *folders, "--truth", "index", "--methods", "thumbnail,bovf:words=300", *choice, *QUICK[:4])
+        record = verb(*given, "--json").json
+        assert record["queries"] == record["map_frames"] == record["positives"] == FRAMES
+        assert record["library"]["size"] == FRAMES
+        assert not record["warnings"]
+        assert record["methods"]["thumbnail"]["r_at_1"] > 0.9
+    assert verb("library", folders[1], "-o", tmp_path / "library", *QUICK).code == 0
+    sizes = {one.features.width for one in load_references(tmp_path / "library")}
+    assert len(sizes) > 1
+
+
+def test_the_mixed_sizes_of_the_shared_data(shared_data: Path) -> None:
+    """All 40 queries count, and most are found."""
+    folder = shared_data / "mixed_sizes"
+    done = compare.compare(folder / "query", folder / "map", ["thumbnail"], TruthChoice("index"), Pipeline())
+    assert done.record["queries"] == done.record["positives"] == done.record["map_frames"] == 40
+    assert done.record["methods"]["thumbnail"]["r_at_1"] > 0.5
 
 
 # Answers from a file
