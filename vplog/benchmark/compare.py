@@ -24,7 +24,13 @@ from vplog.benchmark.method_scores import MethodInputs, evaluate_method
 from vplog.benchmark.published_answers import AnswersSettings
 from vplog.benchmark.recogniser_specs import read_methods
 from vplog.benchmark.sequence_fit import sequence_warning
-from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal, references_of
+from vplog.benchmark.traversals import (
+    Traversal,
+    candidate_stops,
+    extract_traversal,
+    references_of,
+    without_features,
+)
 from vplog.data import Float32s, Ints, Reference
 from vplog.errors import SettingsError, TruthError
 from vplog.evaluate.pairs import Pairs
@@ -39,6 +45,7 @@ from vplog.places.network_vector import OnnxSettings
 from vplog.places.reference_choice import FRAMES_A_REFERENCE, PAPER_SIZE, LibrarySettings, choose
 from vplog.places.self_recognition import MOST, NO_IMAGE, add_until_enough
 from vplog.places.sequence import SequenceSettings
+from vplog.places.vectors import VectorsSettings
 from vplog.results import run_record
 from vplog.results.staging import check_contents, staged
 from vplog.run.reference_library import check_extractor
@@ -111,9 +118,12 @@ def compare(
         warnings += check_truth(drives.known, drives.query_log, drives.map_log, options.min_gap)  # before the long part
         without = {*KINDS.values(), AnswersSettings} - {OnnxSettings}  # those of vplog that learn from features alone
         images = any(type(one) not in without for one in recognisers.values())
-        map_traversal, query_traversal, references, notes = drives.extract_all(images)
-        warnings += notes + _fewer_features(options.library, references, recognisers)
-        check_descriptors(references, map_traversal.store[0])
+        if all(isinstance(one, AnswersSettings | VectorsSettings) for one in recognisers.values()):
+            map_traversal, query_traversal, references = drives.without_features()
+        else:
+            map_traversal, query_traversal, references, notes = drives.extract_all(images)
+            warnings += notes + _fewer_features(options.library, references, recognisers)
+            check_descriptors(references, map_traversal.store[0])
         stops = candidate_stops(query_traversal.frames, map_traversal.frames, options.min_gap)
         pairs = drives.known.pairs(query_traversal.frames, map_traversal.frames).below(stops)
         if sequences is not None:
@@ -169,6 +179,14 @@ class _Drives:
         made = FeatureFolder.of(*self.cached, path, self.options.topics, log, self.pipeline.features)
         return extract_traversal(log, self.pipeline.features, made, frames, self.execution)
 
+    def without_features(self) -> tuple[Traversal, Traversal, list[Reference]]:
+        """Return the traversals of the map and the query, and the references of a saved library, for methods that need
+        no pixels: no image is decoded."""
+        map_traversal = query_traversal = without_features(self.map_log, self.known.map_frames)
+        if self.query_log is not self.map_log:
+            query_traversal = without_features(self.query_log, self.known.query_frames)
+        return map_traversal, query_traversal, self.source if isinstance(self.source, list) else []
+
     def extract_all(self, images: bool) -> tuple[Traversal, Traversal, list[Reference], list[str]]:
         """Traversals of the map and the query (one object for a drive against itself), the references, with their
         images where these count, and warnings."""
@@ -186,7 +204,7 @@ class _Drives:
         wanted = LibrarySettings(choose="random", size=size, seed=options.library_seed)
         if source is None or self.library is None:
             rows = self._reference_rows(map_traversal, wanted)
-            references = references_of(map_traversal, map_traversal.frames[rows], images)
+            references = references_of(map_traversal, map_traversal.frames[map_traversal.decoded[rows]], images)
         else:
             chosen = choose(source.stamps(), wanted)
             traversal = self.traversal_of(self.library, source, chosen)
@@ -199,13 +217,13 @@ class _Drives:
         return map_traversal, query_traversal, references, warnings
 
     def _reference_rows(self, traversal: Traversal, wanted: LibrarySettings) -> Ints:
-        """Rows of the map's frames that become references; of a drive in its own past as many as `vplog run` takes,
-        unless their number is given."""
+        """Choose the references among the map's decoded frames, by their number in `traversal.store`; of a drive in its
+        own past as many as `vplog run` takes, unless their number is given."""
+        stamp_ns, most = traversal.stamp_ns[traversal.decoded], len(traversal) // FRAMES_A_REFERENCE
 
         def reference(row: int) -> Reference:
-            return Reference(NO_IMAGE, traversal.store[row], traversal.name, int(traversal.stamp_ns[row]))
+            return Reference(NO_IMAGE, traversal.store[row], traversal.name, int(stamp_ns[row]))
 
-        stamp_ns, most = traversal.stamp_ns, len(traversal) // FRAMES_A_REFERENCE
         rows = choose(stamp_ns, wanted)
         if self.options.library_size is None:
             rows = add_until_enough(rows, stamp_ns, wanted, most, reference, self.execution)
@@ -229,6 +247,10 @@ class _Drives:
             "protocol": protocol(self.known, pairs, options.min_gap),
             "queries": len(inputs.query_traversal),
             "map_frames": len(inputs.map_traversal),
+            "undecodable": {
+                "queries": len(inputs.query_traversal.store.lost),
+                "map_frames": len(inputs.map_traversal.store.lost),
+            },
             "positives": int(pairs.positive.sum()),
             "features": self.pipeline.features.model_dump(mode="json"),
             "methods": {},

@@ -551,6 +551,12 @@ def print_comparison(found: dict[str, Any]) -> None:
         "r_at_1": "R@1", "r_at_5": "R@5", "r_at_10": "R@10", "anr": "ANR\n%", "ap": "AP", "recall_at_p100": "R@\nP100",
         "f1": "F1",
     }  # fmt: skip
+    if any((lost := found["undecodable"]).values()):
+        print_line(
+            "undecodable",
+            f"{lost['queries']} of the queries and {lost['map_frames']} of the frames; methods that need pixels do not "
+            "recognise them, and they count all the same",
+        )
     times = {"mining_ms": "encode\nown ms", "feature_ms": "encode\nshared ms", "query_ms": "query\nms"}
     if not found["positives"]:
         shares = {}
