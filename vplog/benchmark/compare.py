@@ -24,13 +24,7 @@ from vplog.benchmark.method_scores import MethodInputs, evaluate_method
 from vplog.benchmark.published_answers import AnswersSettings
 from vplog.benchmark.recogniser_specs import read_methods
 from vplog.benchmark.sequence_fit import sequence_warning
-from vplog.benchmark.traversals import (
-    Traversal,
-    candidate_stops,
-    extract_traversal,
-    references_of,
-    without_features,
-)
+from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal, references_of, without_features
 from vplog.data import Float32s, Ints, Reference
 from vplog.errors import SettingsError, TruthError
 from vplog.evaluate.pairs import Pairs
@@ -118,11 +112,10 @@ def compare(
         warnings += check_truth(drives.known, drives.query_log, drives.map_log, options.min_gap)  # before the long part
         without = {*KINDS.values(), AnswersSettings} - {OnnxSettings}  # those of vplog that learn from features alone
         images = any(type(one) not in without for one in recognisers.values())
-        if all(isinstance(one, AnswersSettings | VectorsSettings) for one in recognisers.values()):
-            map_traversal, query_traversal, references = drives.without_features()
-        else:
-            map_traversal, query_traversal, references, notes = drives.extract_all(images)
-            warnings += notes + _fewer_features(options.library, references, recognisers)
+        pixels = any(not isinstance(one, AnswersSettings | VectorsSettings) for one in recognisers.values())
+        map_traversal, query_traversal, references, notes = drives.extract_all(pixels, images)
+        warnings += notes + _fewer_features(options.library, references, recognisers)
+        if pixels:
             check_descriptors(references, map_traversal.store[0])
         stops = candidate_stops(query_traversal.frames, map_traversal.frames, options.min_gap)
         pairs = drives.known.pairs(query_traversal.frames, map_traversal.frames).below(stops)
@@ -175,30 +168,27 @@ class _Drives:
     """The folders of `CacheChoice.opened`."""
     execution: Execution
 
-    def traversal_of(self, path: Path, log: Log, frames: Ints) -> Traversal:
+    def traversal_of(self, path: Path, log: Log, frames: Ints, pixels: bool = True) -> Traversal:
+        if not pixels:
+            return without_features(log, frames)
         made = FeatureFolder.of(*self.cached, path, self.options.topics, log, self.pipeline.features)
         return extract_traversal(log, self.pipeline.features, made, frames, self.execution)
 
-    def without_features(self) -> tuple[Traversal, Traversal, list[Reference]]:
-        """Return the traversals of the map and the query, and the references of a saved library, for methods that need
-        no pixels: no image is decoded."""
-        map_traversal = query_traversal = without_features(self.map_log, self.known.map_frames)
-        if self.query_log is not self.map_log:
-            query_traversal = without_features(self.query_log, self.known.query_frames)
-        return map_traversal, query_traversal, self.source if isinstance(self.source, list) else []
-
-    def extract_all(self, images: bool) -> tuple[Traversal, Traversal, list[Reference], list[str]]:
+    def extract_all(self, pixels: bool, images: bool) -> tuple[Traversal, Traversal, list[Reference], list[str]]:
         """Traversals of the map and the query (one object for a drive against itself), the references, with their
-        images where these count, and warnings."""
+        images where these count, and warnings. Without `pixels` no image is decoded, and only a saved library has
+        references."""
         source, known, options = self.source, self.known, self.options
-        map_traversal = query_traversal = self.traversal_of(self.other, self.map_log, known.map_frames)
+        map_traversal = query_traversal = self.traversal_of(self.other, self.map_log, known.map_frames, pixels)
         if self.query_log is not self.map_log:
-            query_traversal = self.traversal_of(self.query, self.query_log, known.query_frames)
+            query_traversal = self.traversal_of(self.query, self.query_log, known.query_frames, pixels)
         warnings = list(dict.fromkeys(map_traversal.warnings + query_traversal.warnings))
         if isinstance(source, list):
             if options.library_size is not None or options.library_seed:
                 raise SettingsError(f"{self.library} is a saved library: leave out --library-size and --library-seed.")
             return map_traversal, query_traversal, source, warnings
+        if not pixels:
+            return map_traversal, query_traversal, [], warnings
         itself = self.query_log is self.map_log
         size = options.library_size or (PAPER_SIZE if source is not None else None if itself else MOST)
         wanted = LibrarySettings(choose="random", size=size, seed=options.library_seed)

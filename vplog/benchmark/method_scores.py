@@ -34,7 +34,8 @@ from vplog.storage.mapped_table import mapped_scores
 
 ANSWERS = 10
 """Rows that a timed search returns: what `vplog run` requests by default, and the deepest recall reported."""
-_NO_FEATURES = Features(np.zeros((0, 2), np.float32), *np.zeros((3, 0), np.uint8), 0, 0)
+_NUMBERS = np.zeros(0, np.float32)
+_NO_FEATURES = Features(_NUMBERS.reshape(0, 2), _NUMBERS, np.zeros((0, 0), np.uint8), _NUMBERS, 0, 0)
 _NO_REFERENCE = Reference(NO_IMAGE, _NO_FEATURES, "", 0)
 """The library of methods that need no pixels."""
 
@@ -122,7 +123,7 @@ def evaluate_method(
     if reliable is not None:
         figures["calibration"] = reliable.as_json()
     if inputs.sequence is not None:
-        lines = score_table(*scores.shape, inputs.scratch, "sequences")
+        lines = score_table(len(query_traversal), len(map_traversal), inputs.scratch, "sequences")
         score_sequences(scores, inputs.sequence, stops, lines, execution)
         by_sequence = ranked(lines, truth, stops)
         figures["sequence"] = {**inputs.sequence.model_dump(), **scores_of(by_sequence)}

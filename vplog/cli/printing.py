@@ -554,8 +554,8 @@ def print_comparison(found: dict[str, Any]) -> None:
     if any((lost := found["undecodable"]).values()):
         print_line(
             "undecodable",
-            f"{lost['queries']} of the queries and {lost['map_frames']} of the frames; methods that need pixels do not "
-            "recognise them, and they count all the same",
+            f"{lost['queries']} of the queries and {lost['map_frames']} of the frames; for methods that need pixels "
+            "they count as not found",
         )
     times = {"mining_ms": "encode\nown ms", "feature_ms": "encode\nshared ms", "query_ms": "query\nms"}
     if not found["positives"]:
