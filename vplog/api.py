@@ -109,7 +109,8 @@ def open_log(log: Place | Sequence[Place], topics: Topics | None = None) -> Log:
     """
     from vplog import logs
 
-    return logs.open_drive(_paths(log), _topics(topics))
+    paths = _paths(log)
+    return logs.open(paths[0], _topics(topics)) if len(paths) == 1 else logs.open_drive(paths, _topics(topics))
 
 
 def open_run(folder: Place) -> RunFolder:
@@ -225,10 +226,11 @@ class RunFolder:
     def _recorded(
         self, stamps: Any, log: Place | Sequence[Place] | None, topics: Topics | None
     ) -> Iterator[tuple[int, Callable[[], Any]]]:
+        from vplog import logs
         from vplog.run.provenance import reopened
 
-        parts = _topics(self.record.get("topics") if topics is None else topics)
-        opened = open_log(log, parts) if log is not None else reopened(self.record, None, parts, "Name it: log=LOG.")
+        parts, again = _topics(self.record.get("topics") if topics is None else topics), "Name it: log=LOG."
+        opened = reopened(self.record, None, parts, again) if log is None else logs.open_drive(_paths(log), parts)
         for frame in opened.frames(stamps):
             yield frame.stamp_ns, lambda frame=frame: frame.decode().image
 

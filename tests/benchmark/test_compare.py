@@ -23,6 +23,7 @@ from vplog.benchmark.method_scores import MethodInputs, evaluate_method, stored_
 from vplog.benchmark.recogniser_specs import read_method, read_methods, split_methods
 from vplog.benchmark.sequence_fit import sequence_warning
 from vplog.benchmark.traversals import candidate_stops, extract_traversal, references_of
+from vplog.cli.printing import print_comparison
 from vplog.errors import LogError, SettingsError
 from vplog.evaluate.open_set import score_open_set
 from vplog.evaluate.pairs import index_pairs, listed_pairs
@@ -35,7 +36,7 @@ from vplog.pipeline import Pipeline, load_pipeline
 from vplog.places import KINDS
 from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
-from vplog.places.library_files import name_extractor
+from vplog.places.library_files import load_references, name_extractor
 from vplog.places.sequence import SequenceSettings
 from vplog.places.vectors import VectorsSettings
 from vplog.results.run_record import read_run_json
@@ -116,7 +117,7 @@ def test_a_walk_holds_the_chosen_frames(traversals: tuple[Path, Path], store: Fe
     assert (walk.feature_ms > 0).all()
     assert seen == [("extract day", done, 3) for done in (1, 2, 3)]
     frame = next(iter(log.frames(log.stamps()[[7]]))).decode()
-    np.testing.assert_array_equal(walk.store[2].descriptors, SIFT(frame.image).descriptors)
+    np.testing.assert_array_equal(walk.features(2).descriptors, SIFT(frame.image).descriptors)
 
 
 def test_features_stay_what_they_are_when_another_process_writes_them_again(
@@ -145,7 +146,10 @@ def test_frames_keep_their_numbers_where_others_are_damaged(
         data = (traversals[0] / f"{number}.png").read_bytes()
         (folder / f"{number}.png").write_bytes(data[:100] if number == 1 else data)
     walk = extract_traversal(logs.open(folder), SIFT, store)
-    assert walk.frames.tolist() == [0, 2, 3]
+    assert walk.frames.tolist() == [0, 1, 2, 3]
+    assert walk.decoded.tolist() == [0, 2, 3]
+    assert walk.picture(1) is None
+    np.testing.assert_array_equal(walk.features(2).points, walk.store[1].points)
     assert len(references_of(walk, np.array([1, 2]))) == 1
     assert "1 of 4 frames could not be decoded" in walk.warnings[0]
     with pytest.raises(LogError, match="none of 1 frames could be decoded"):
@@ -575,16 +579,15 @@ def test_a_drives_own_past_with_the_library_of_a_log(traversals: tuple[Path, Pat
     assert (found["from"], found["size"]) == (str(traversals[1]), FRAMES)
 
 
-def test_matches_that_do_not_decode_leave_answers_without_scores(
-    verb: Verb, traversals: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_the_only_query_with_a_match_does_not_decode(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
     shutil.copytree(traversals[1], tmp_path / "dusk")
     os.truncate(tmp_path / "dusk" / "3.png", 200)
     (tmp_path / "truth.csv").write_text("query,match\n3.png,3.png\n")
     arguments = ("compare", tmp_path / "dusk", traversals[0], "--truth", tmp_path / "truth.csv", *QUICK)
-    said = verb(*arguments, "--methods", "thumbnail")
+    said = verb(*arguments, "--methods", "thumbnail", "-o", tmp_path / "out", "--json")
     assert said.code == 0, said.err
-    assert "0 with a true match" in said.out
+    assert said.json["positives"] == 1
+    assert [said.json["methods"]["thumbnail"][name] for name in ("r_at_1", "ap", "anr")] == [0, 0, 100 * 15 / 16]
 
 
 def test_frames_without_truth_are_left_out(verb: Verb, drive: Demo, tmp_path: Path) -> None:
@@ -667,6 +670,118 @@ def test_wrong_usage(verb: Verb, wrong: tuple[str, str]) -> None:
     assert verb("compare", "a", "b", "--truth", "index", "--methods", "bobb", *wrong).code == 2
 
 
+def test_the_time_of_shared_features_is_not_a_methods_own(
+    traversals: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The table has both times side by side; answers from a file have neither."""
+    file = tmp_path / "answers.csv"
+    file.write_text("query,match\n0,0\n")
+    methods = ["gist", f"answers:{file}"]
+    record = compare.compare(*traversals, methods, TruthChoice("index"), SMALL).record
+    gist = record["methods"]["gist"]
+    assert gist["mining_ms"] > 0
+    assert gist["feature_ms"] > 0
+    gist |= {"mining_ms": 0.2, "feature_ms": 46.0, "query_ms": 0.03, "encode_ms": 46.2}
+    print_comparison(record)
+    lines = capsys.readouterr().out.splitlines()
+    rows = {line.split()[0]: line.split()[1:] for line in lines if line.startswith(("gist", "answers:"))}
+    assert rows["gist"][-3:] == ["0.20", "46.00", "0.03"]
+    assert len(rows["gist"]) == len(rows[methods[1]]) + 4
+
+
+@pytest.mark.usefixtures("compiled")
+def test_images_of_several_sizes_are_all_used(verb: Verb, traversals: tuple[Path, Path], tmp_path: Path) -> None:
+    """By `compare` and `library`, chosen or not, each at its own size: every second image is cropped."""
+    folders = tmp_path / "day", tmp_path / "dusk"
+    for traversal, folder in zip(traversals, folders, strict=True):
+        folder.mkdir()
+        for file in traversal.iterdir():
+            image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+            assert image is not None
+            assert cv2.imwrite(str(folder / file.name), image[:, : -16 * (int(file.stem) % 3) or None])
+    for choice in ((), ("--image-topic", "*")):
+        given = ("compare", *folders, "--truth", "index", "--methods", "thumbnail,bovf:words=300", *choice, *QUICK[:4])
+        record = verb(*given, "--json").json
+        assert record["queries"] == record["map_frames"] == record["positives"] == FRAMES
+        assert record["library"]["size"] == FRAMES
+        assert not record["warnings"]
+        assert record["methods"]["thumbnail"]["r_at_1"] > 0.9
+    assert verb("library", folders[1], "-o", tmp_path / "library", *QUICK).code == 0
+    sizes = {one.features.width for one in load_references(tmp_path / "library")}
+    assert len(sizes) > 1
+
+
+def test_the_mixed_sizes_of_the_shared_data(shared_data: Path) -> None:
+    """All 40 queries count, and most are found."""
+    folder = shared_data / "mixed_sizes"
+    done = compare.compare(folder / "query", folder / "map", ["thumbnail"], TruthChoice("index"), Pipeline())
+    assert done.record["queries"] == done.record["positives"] == done.record["map_frames"] == 40
+    assert done.record["methods"]["thumbnail"]["r_at_1"] > 0.5
+
+
+def damaged_copies(traversals: tuple[Path, Path], folder: Path, query: int, other: int) -> tuple[Path, Path]:
+    """Copies of the drives with one image of each cut short."""
+    found = folder / "dusk", folder / "day"
+    for source, target, number in zip(reversed(traversals), found, (query, other), strict=True):
+        shutil.copytree(source, target)
+        file = target / f"{number}.png"
+        file.write_bytes(file.read_bytes()[:100])
+    return found
+
+
+@pytest.mark.usefixtures("compiled")
+def test_an_image_that_cannot_be_used_keeps_its_query(
+    verb: Verb, traversals: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """Query 3 does not decode, nor does the true match of query 7. Both count, as not found; answers need no pixels."""
+    query, other = damaged_copies(traversals, tmp_path, 3, 7)
+    file = tmp_path / "answers.csv"
+    file.write_text("query,match\n" + "".join(f"{row},{row}\n" for row in range(FRAMES)))
+    given = ("compare", query, other, "--truth", "index", "--methods", f"thumbnail,bobb,answers:{file}")
+    out = tmp_path / "out"
+    record = verb(*given, *QUICK, "-o", out, "--json").json
+    assert record["queries"] == record["map_frames"] == record["positives"] == record["truth"]["pairs"] == FRAMES
+    assert record["undecodable"] == {"queries": 1, "map_frames": 1}
+    assert record["library"]["size"] == FRAMES - 1
+    found = [figures["r_at_10"] for figures in record["methods"].values()]
+    assert found == pytest.approx([(FRAMES - 2) / FRAMES, (FRAMES - 2) / FRAMES, 1.0])
+    with (out / "answers.csv").open() as stream:
+        rows = [row for row in csv.DictReader(stream) if row["method"] == "thumbnail"]
+    assert [row["query"] for row in rows] == [str(number) for number in range(FRAMES)]
+    assert (rows[3]["match"], rows[3]["true"], rows[3]["rank"]) == ("", "3", "")
+    assert rows[7]["match"] not in ("", "7")
+    assert (rows[7]["true"], rows[7]["rank"]) == ("7", "")
+    scores = np.load(out / record["methods"]["thumbnail"]["scores"])["scores"]
+    assert scores.shape == (FRAMES, FRAMES)
+    assert np.isnan(scores[3]).all()
+    assert np.isnan(scores[:, 7]).all()
+    said = verb(*given, *QUICK)
+    lines = said.out.splitlines()
+    above = lines[: next(number for number, line in enumerate(lines) if line.startswith("method"))]
+    assert any("1 of the queries and 1 of the frames" in line for line in above)
+
+
+def test_vectors_and_answers_need_no_pixels(
+    traversals: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No image is decoded for them, so that damaged ones count like all others."""
+    folders = damaged_copies(traversals, tmp_path, 3, 7)
+    file, vectors = tmp_path / "answers.csv", tmp_path / "vectors"
+    file.write_text("query,match\n" + "".join(f"{row},{row}\n" for row in range(FRAMES)))
+    vectors.mkdir()
+    for name in ("queries", "database"):
+        np.save(vectors / f"{name}_descriptors.npy", np.eye(FRAMES, dtype=np.float32))
+    decoded: list[int] = []
+    monkeypatch.setattr("vplog.logs.frames.RecordedFrame.decode", lambda frame, _=False: decoded.append(frame.stamp_ns))
+    methods = [f"vectors:{vectors}:order=frames", f"answers:{file}"]
+    done = compare.compare(*folders, methods, TruthChoice("index"), SMALL)
+    assert not decoded
+    assert done.record["positives"] == FRAMES
+    for figures in done.record["methods"].values():
+        assert figures["r_at_1"] == 1.0
+    assert done.record["methods"][methods[0]]["feature_ms"] == 0
+
+
 # Answers from a file
 
 
@@ -694,6 +809,19 @@ def test_answers_of_a_file_stand_beside_the_methods(traversals: tuple[Path, Path
     )  # fmt: skip
     assert said.code == 0
     assert f"answers:{names}" in said.out
+
+
+def test_answers_that_were_not_given_are_not_counted(traversals: tuple[Path, Path], tmp_path: Path) -> None:
+    """One answer a query, every fourth of them right: looking at five finds no more, and the rest has no rank."""
+    file = tmp_path / "answers.csv"
+    file.write_text("query,match\n" + "".join(f"{row},{row if row % 4 == 0 else 1}\n" for row in range(FRAMES)))
+    done = compare.compare(*traversals, [f"answers:{file}"], TruthChoice("index"), SMALL)
+    (found,) = done.record["methods"].values()
+    right = FRAMES // 4 + 1  # and query 1
+    assert [found[name] for name in ("r_at_1", "r_at_5", "r_at_10")] == pytest.approx([right / FRAMES] * 3)
+    assert found["anr"] == pytest.approx(100 * (FRAMES - right) / FRAMES * (FRAMES - 1) / FRAMES)
+    rank = done.answers["rank"].to_pylist()
+    assert [one for one in rank if one is not None] == [1] * right
 
 
 def test_a_number_is_a_frame_also_where_images_are_named_by_numbers(

@@ -54,6 +54,12 @@ def test_ranks_are_means_over_all_orders_of_ties(problem: tuple[np.ndarray, np.n
     for score, true, stop in zip(scores, truth, stops, strict=True):
         if not true[:stop].any():
             continue
+        given = ~np.isnan(score[:stop])
+        if not (true[:stop] & given).any():  # the true row is no answer, and comes after all that are not true
+            first.append((~true[:stop]).sum() / stop)
+            for share in hits.values():
+                share.append(0.0)
+            continue
         found = np.array([np.flatnonzero(true[:stop][order])[0] for order in orders(score[:stop])])
         first.append(found.mean() / stop)
         for k, share in hits.items():
@@ -130,7 +136,15 @@ def test_a_query_without_candidates_or_scores_has_no_answer() -> None:
     curve = retrieval.precision_recall(ranks)
     assert curve.precision.tolist() == [1.0]
     assert curve.recall.tolist() == [0.5]  # of two positives: one has no answer, but could have had one
-    assert retrieval.average_normalised_rank(ranks) == pytest.approx(100 * np.mean([0.5 / 2, 0]))
+    assert retrieval.average_normalised_rank(ranks) == pytest.approx(100 * np.mean([1 / 2, 0]))
+
+
+def test_rows_that_were_not_given_are_not_found_however_many_would_be_counted() -> None:
+    """One answer a query, right, wrong and wrong, among three rows: no more are found by looking at five."""
+    ranks = ranked([[0.9, NAN, NAN], [0.8, NAN, NAN], [NAN, 0.7, NAN]], [[1, 0, 0], [0, 1, 0], [1, 0, 0]])
+    assert [retrieval.recall_at(ranks, k) for k in (1, 2, 5, 10)] == pytest.approx([1 / 3] * 4)
+    assert ranks.true_given.tolist() == [True, False, False]
+    assert retrieval.average_normalised_rank(ranks) == pytest.approx(100 * np.mean([0, 2 / 3, 2 / 3]))
 
 
 @settings(max_examples=25, deadline=None)

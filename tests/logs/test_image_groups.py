@@ -45,7 +45,6 @@ MIXED: dict[str, tuple[list[tuple[str, dict[str, Any]]], set[str]]] = {
     ),
     "same number, two formats": ([("{:04}.jpg", {}), ("{:04}.png", {"bits": 16})], {"*.jpg", "*.png"}),
     "by bits": ([("1{:09}.png", {}), ("1{:09}5.png", {"bits": 16})], {"8 bits", "16 bits"}),
-    "by size": ([("2{:09}.png", {}), ("2{:09}5.png", {"size": (40, 40)})], {"64x48", "40x40"}),
     "stamps of their own": (
         [("rgb_10000{:05}.100000.png", {}), ("depth_10000{:05}.130000.png", {"bits": 16})],
         {"rgb_*.*.png", "depth_*.*.png"},
@@ -88,11 +87,48 @@ def test_one_camera_is_one(kind: str, tmp_path: Path) -> None:
     assert len(logs.open(tmp_path / "drive").stamps()) == len(ONE[kind])
 
 
-def test_a_few_images_of_another_size_are_resampled_or_left_out(tmp_path: Path) -> None:
+def test_images_of_a_set_keep_their_sizes(tmp_path: Path) -> None:
+    """Any number of sizes, in grey and in colour, with a mask and without; each frame has a camera of its size."""
+    sizes = [(48, 64), (24, 32), (40, 40), (64, 48)]
+    for number in range(12):
+        write(tmp_path / "set", [f"{number:03}.png"], size=sizes[number % 4])
+    (tmp_path / "mask.png").write_bytes(cv2.imencode(".png", np.full((24, 32), 255, np.uint8))[1].tobytes())
+    for choice in (None, TopicChoice(image="*")):
+        log = logs.open(tmp_path / "set", choice)
+        for number, frame in enumerate(log.frames(log.stamps())):
+            found = frame.decode(colour=True)
+            read = cv2.imread(str(tmp_path / "set" / f"{number:03}.png"), cv2.IMREAD_GRAYSCALE)
+            np.testing.assert_array_equal(found.image, read)
+            assert (found.camera.height, found.camera.width) == found.image.shape == sizes[number % 4]
+            assert found.colour is not None
+            assert found.colour.shape == (*sizes[number % 4], 3)
+        assert not log.warnings
+    masked = logs.open(tmp_path / "set", TopicChoice(masks={"": tmp_path / "mask.png"}))
+    frame = next(iter(masked.frames(masked.stamps()))).decode()
+    assert frame.mask is not None
+    assert frame.mask.shape == frame.image.shape
+
+
+def test_a_calibration_needs_one_size(tmp_path: Path) -> None:
+    for number in range(4):
+        write(tmp_path / "set", [f"{number}.png"], size=(24, 32) if number == 2 else (48, 64))
+    yaml = tmp_path / "camera.yaml"
+    yaml.write_text(
+        "image_width: 64\nimage_height: 48\ncamera_name: c\ndistortion_model: plumb_bob\n"
+        "camera_matrix: {rows: 3, cols: 3, data: [50, 0, 32, 0, 50, 24, 0, 0, 1]}\n"
+        "distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}\n"
+    )
+    log = logs.open(tmp_path / "set", TopicChoice(calibration_file=yaml))
+    assert log.camera().matrix is not None
+    assert {frame.decode().image.shape for frame in log.frames(log.stamps())} == {(48, 64)}
+    assert any("resampled" in line for line in log.warnings)
+
+
+def test_images_of_another_size_in_a_drive_are_resampled_or_left_out(tmp_path: Path) -> None:
     write(tmp_path, [f"{i:03}.png" for i in range(40)])
     write(tmp_path, ["007.png"], size=(24, 32))
     write(tmp_path, ["009.png"], size=(24, 24))
-    log: Any = logs.open(tmp_path)
+    log: Any = logs.open_drive([tmp_path])
     decoded = []
     for frame in log.frames(log.stamps()):
         try:

@@ -26,8 +26,8 @@ COLUMNS = pa.schema({
 })  # fmt: skip
 """Frame numbers and file names of the query, its best answer and its true match that scores most; `rank` of that match,
 1 the best, means over rows of equal score rounded up; `evidence` is what most of the score is of, see
-`stages.EvidenceState`. Empty where there is none: no answer, no match in the map, no truth, no file names, no
-probability, a method with one kind of evidence."""
+`stages.EvidenceState`. Empty where there is none: no answer, no match in the map, a match that was not given, no truth,
+no file names, no probability, a method with one kind of evidence."""
 
 
 def answers_table(method: str, ranks: Ranks, query: Traversal, other: Traversal) -> pa.Table:
@@ -49,7 +49,7 @@ def answers_table(method: str, ranks: Ranks, query: Traversal, other: Traversal)
         pa.array(probability.astype(np.float32), mask=np.isnan(probability)),
         pa.array([one or None for one in ranks.evidence or [""] * len(query)], pa.string()),
         pa.array(ranks.top_true > 0.5, mask=~positive),
-        pa.array(rank, mask=~positive),
+        pa.array(rank, mask=~ranks.true_given),
         *of_map(ranks.true_row),
     ]
     return pa.table(dict(zip(COLUMNS.names, columns, strict=True)), schema=COLUMNS)

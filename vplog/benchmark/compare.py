@@ -24,7 +24,7 @@ from vplog.benchmark.method_scores import MethodInputs, evaluate_method
 from vplog.benchmark.published_answers import AnswersSettings
 from vplog.benchmark.recogniser_specs import read_methods
 from vplog.benchmark.sequence_fit import sequence_warning
-from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal, references_of
+from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal, references_of, without_features
 from vplog.data import Float32s, Ints, Reference
 from vplog.errors import SettingsError, TruthError
 from vplog.evaluate.pairs import Pairs
@@ -39,6 +39,7 @@ from vplog.places.network_vector import OnnxSettings
 from vplog.places.reference_choice import FRAMES_A_REFERENCE, PAPER_SIZE, LibrarySettings, choose
 from vplog.places.self_recognition import MOST, NO_IMAGE, add_until_enough
 from vplog.places.sequence import SequenceSettings
+from vplog.places.vectors import VectorsSettings
 from vplog.results import run_record
 from vplog.results.staging import check_contents, staged
 from vplog.run.reference_library import check_extractor
@@ -111,9 +112,11 @@ def compare(
         warnings += check_truth(drives.known, drives.query_log, drives.map_log, options.min_gap)  # before the long part
         without = {*KINDS.values(), AnswersSettings} - {OnnxSettings}  # those of vplog that learn from features alone
         images = any(type(one) not in without for one in recognisers.values())
-        map_traversal, query_traversal, references, notes = drives.extract_all(images)
+        pixels = any(not isinstance(one, AnswersSettings | VectorsSettings) for one in recognisers.values())
+        map_traversal, query_traversal, references, notes = drives.extract_all(pixels, images)
         warnings += notes + _fewer_features(options.library, references, recognisers)
-        check_descriptors(references, map_traversal.store[0])
+        if pixels:
+            check_descriptors(references, map_traversal.store[0])
         stops = candidate_stops(query_traversal.frames, map_traversal.frames, options.min_gap)
         pairs = drives.known.pairs(query_traversal.frames, map_traversal.frames).below(stops)
         if sequences is not None:
@@ -165,28 +168,33 @@ class _Drives:
     """The folders of `CacheChoice.opened`."""
     execution: Execution
 
-    def traversal_of(self, path: Path, log: Log, frames: Ints) -> Traversal:
+    def traversal_of(self, path: Path, log: Log, frames: Ints, pixels: bool = True) -> Traversal:
+        if not pixels:
+            return without_features(log, frames)
         made = FeatureFolder.of(*self.cached, path, self.options.topics, log, self.pipeline.features)
         return extract_traversal(log, self.pipeline.features, made, frames, self.execution)
 
-    def extract_all(self, images: bool) -> tuple[Traversal, Traversal, list[Reference], list[str]]:
+    def extract_all(self, pixels: bool, images: bool) -> tuple[Traversal, Traversal, list[Reference], list[str]]:
         """Traversals of the map and the query (one object for a drive against itself), the references, with their
-        images where these count, and warnings."""
+        images where these count, and warnings. Without `pixels` no image is decoded, and only a saved library has
+        references."""
         source, known, options = self.source, self.known, self.options
-        map_traversal = query_traversal = self.traversal_of(self.other, self.map_log, known.map_frames)
+        map_traversal = query_traversal = self.traversal_of(self.other, self.map_log, known.map_frames, pixels)
         if self.query_log is not self.map_log:
-            query_traversal = self.traversal_of(self.query, self.query_log, known.query_frames)
+            query_traversal = self.traversal_of(self.query, self.query_log, known.query_frames, pixels)
         warnings = list(dict.fromkeys(map_traversal.warnings + query_traversal.warnings))
         if isinstance(source, list):
             if options.library_size is not None or options.library_seed:
                 raise SettingsError(f"{self.library} is a saved library: leave out --library-size and --library-seed.")
             return map_traversal, query_traversal, source, warnings
+        if not pixels:
+            return map_traversal, query_traversal, [], warnings
         itself = self.query_log is self.map_log
         size = options.library_size or (PAPER_SIZE if source is not None else None if itself else MOST)
         wanted = LibrarySettings(choose="random", size=size, seed=options.library_seed)
         if source is None or self.library is None:
             rows = self._reference_rows(map_traversal, wanted)
-            references = references_of(map_traversal, map_traversal.frames[rows], images)
+            references = references_of(map_traversal, map_traversal.frames[map_traversal.decoded[rows]], images)
         else:
             chosen = choose(source.stamps(), wanted)
             traversal = self.traversal_of(self.library, source, chosen)
@@ -199,13 +207,13 @@ class _Drives:
         return map_traversal, query_traversal, references, warnings
 
     def _reference_rows(self, traversal: Traversal, wanted: LibrarySettings) -> Ints:
-        """Rows of the map's frames that become references; of a drive in its own past as many as `vplog run` takes,
-        unless their number is given."""
+        """Choose the references among the map's decoded frames, by their number in `traversal.store`; of a drive in its
+        own past as many as `vplog run` takes, unless their number is given."""
+        stamp_ns, most = traversal.stamp_ns[traversal.decoded], len(traversal) // FRAMES_A_REFERENCE
 
         def reference(row: int) -> Reference:
-            return Reference(NO_IMAGE, traversal.store[row], traversal.name, int(traversal.stamp_ns[row]))
+            return Reference(NO_IMAGE, traversal.store[row], traversal.name, int(stamp_ns[row]))
 
-        stamp_ns, most = traversal.stamp_ns, len(traversal) // FRAMES_A_REFERENCE
         rows = choose(stamp_ns, wanted)
         if self.options.library_size is None:
             rows = add_until_enough(rows, stamp_ns, wanted, most, reference, self.execution)
@@ -229,6 +237,10 @@ class _Drives:
             "protocol": protocol(self.known, pairs, options.min_gap),
             "queries": len(inputs.query_traversal),
             "map_frames": len(inputs.map_traversal),
+            "undecodable": {
+                "queries": len(inputs.query_traversal.store.lost),
+                "map_frames": len(inputs.map_traversal.store.lost),
+            },
             "positives": int(pairs.positive.sum()),
             "features": self.pipeline.features.model_dump(mode="json"),
             "methods": {},

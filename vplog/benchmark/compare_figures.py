@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vplog.benchmark.answers import file_stem
-from vplog.data import Bytes, Float32s, Floats, Ints
+from vplog.data import Float32s, Floats, Ints
 from vplog.evaluate.open_set import reliability_of_matches
 from vplog.evaluate.retrieval import Ranks, Reliability, average_precision, precision_recall, recall_at
 from vplog.places.vocabulary import spread_rows
 from vplog.run.figures.canvas import as_text, saved_figure
-from vplog.storage.image_file import decode_image
 
 if TYPE_CHECKING:
     from vplog.benchmark.method_scores import MethodResult
@@ -79,13 +78,14 @@ class Figures:
             grid = figure.subplots(len(shown), len(titles), squeeze=False, subplot_kw=bare)
             for axes, query in zip(grid, shown.tolist(), strict=True):
                 given, right = int(ranks.top_row[query]), int(ranks.true_row[query])
-                rank = 1 + int(ranks.better[query])
-                found = "nowhere in the map" if right < 0 else f"right, rank {rank}: {self.map.name_of(right)}"
+                rank = f"rank {1 + int(ranks.better[query])}" if ranks.true_given[query] else "not given"
+                found = "nowhere in the map" if right < 0 else f"right, {rank}: {self.map.name_of(right)}"
                 texts = (
                     f"query {self.query.name_of(query)}",
                     f"given, {ranks.top_score[query]:.3g}: {self.map.name_of(given)}", found,
                 )  # fmt: skip
-                sides = (picture(self.query, query), picture(self.map, given), picture(self.map, right))
+                true_picture = None if right < 0 else self.map.picture(right)
+                sides = self.query.picture(query), self.map.picture(given), true_picture
                 for one, text, image in zip(axes, texts, sides, strict=False):
                     one.set_title(as_text(_shortened(text)), fontsize=7, y=1.0)  # nothing to look for its place among
                     one.axis("off")
@@ -96,11 +96,6 @@ class Figures:
 def _shortened(text: str, most: int = 44) -> str:
     """A long title without its middle: names differ towards their end."""
     return text if len(text) <= most else f"{text[: most // 3]}...{text[-(2 * most // 3 - 3) :]}"
-
-
-def picture(traversal: Traversal, row: int) -> Bytes | None:
-    """The small grey picture (H, W) of a frame; None where `row` is negative."""
-    return None if row < 0 else np.asarray(decode_image(traversal.store.picture(row)), np.uint8)
 
 
 def queries_shown(ranks: Ranks) -> Ints:

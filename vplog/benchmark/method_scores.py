@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from vplog.benchmark.published_answers import AnswersSettings, fill_scores
 from vplog.benchmark.traversals import Traversal
-from vplog.data import Float32s, Floats, Ints, Reference
+from vplog.data import Features, Float32s, Floats, Ints, Reference
 from vplog.errors import ResultError
 from vplog.evaluate import retrieval
 from vplog.evaluate.open_set import score_open_set
@@ -26,6 +26,7 @@ from vplog.evaluate.retrieval import Ranks, Reliability, reliability
 from vplog.execution.execution import Execution
 from vplog.loops.match_probability import match_probabilities
 from vplog.places import PlaceSettings
+from vplog.places.self_recognition import NO_IMAGE
 from vplog.places.sequence import SequenceSettings, sequence_rows
 from vplog.places.views import views_of
 from vplog.stages import EvidenceState, FrameState, PlaceIndex, PlaceState, ProbableIndex, StoredState
@@ -33,6 +34,10 @@ from vplog.storage.mapped_table import mapped_scores
 
 ANSWERS = 10
 """Rows that a timed search returns: what `vplog run` requests by default, and the deepest recall reported."""
+_NUMBERS = np.zeros(0, np.float32)
+_NO_FEATURES = Features(_NUMBERS.reshape(0, 2), _NUMBERS, np.zeros((0, 0), np.uint8), _NUMBERS, 0, 0)
+_NO_REFERENCE = Reference(NO_IMAGE, _NO_FEATURES, "", 0)
+"""The library of methods that need no pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +60,7 @@ class MethodInputs:
     """Inputs of every method of a comparison."""
 
     references: Sequence[Reference]
+    """Empty if no method needs pixels."""
     map_traversal: Traversal
     query_traversal: Traversal
     """The object of the map for a drive against itself, which is described once."""
@@ -79,24 +85,26 @@ def evaluate_method(
     map_traversal, query_traversal = inputs.map_traversal, inputs.query_traversal
     truth, stops = inputs.truth, inputs.stops
     began = time.process_time()
-    state: Any = settings.learn(inputs.references, execution)
+    state: Any = settings.learn(inputs.references or [_NO_REFERENCE], execution)
     learn_s = time.process_time() - began  # of all threads
     places, mining_ms = describe_traversal(state, map_traversal, "describe map", execution)
-    column = state.to_arrow(places)
-    places = state.from_arrow(column)
-    index, queries = state.index(places), places
+    column = state.to_arrow(places.values)
+    places = replace(places, values=state.from_arrow(column))
+    index, queries = state.index(places.values), places
     if query_traversal is not map_traversal:
         queries, more = describe_traversal(state, query_traversal, "describe queries", execution, query=True)
         mining_ms = np.concatenate([mining_ms, more])
-    scores = score_table(len(queries), len(index), inputs.scratch, "scores")
-    query_ms = search(index, queries, stops, scores, execution)
+    scores = score_table(len(query_traversal), len(map_traversal), inputs.scratch, "scores")
+    query_ms = search(index, queries, places.rows, stops, scores, execution)
     ranks = ranked(scores, truth, stops)
     if isinstance(state, EvidenceState):
-        found = zip(queries, ranks.top_row.tolist(), strict=True)
-        ranks = replace(ranks, evidence=["" if row < 0 else state.evidence(one, places[row]) for one, row in found])
-    traversals = [map_traversal] if query_traversal is map_traversal else [map_traversal, query_traversal]
-    of_features = not isinstance(state, FrameState | StoredState)
-    feature_ms = of_features * float(np.median(np.concatenate([traversal.feature_ms for traversal in traversals])))
+        found = enumerate(ranks.top_row.tolist())
+        evidence = ["" if row < 0 else state.evidence(queries[query], places[row]) for query, row in found]
+        ranks = replace(ranks, evidence=evidence)
+    feature_ms = 0.0
+    if not isinstance(state, FrameState | StoredState):
+        traversals = [map_traversal] if query_traversal is map_traversal else [map_traversal, query_traversal]
+        feature_ms = float(np.median(np.concatenate([traversal.feature_ms for traversal in traversals])))
     figures = {
         **scores_of(ranks),
         "bytes_per_image": round(stored_bytes(column) / len(column), 1),
@@ -111,11 +119,11 @@ def evaluate_method(
     }
     reliable = by_sequence = None
     if isinstance(index, ProbableIndex) and truth.positive.any():
-        reliable = reliability_of(index, queries, stops, ranks, truth, execution)
+        reliable = reliability_of(index, queries, places.rows, stops, ranks, truth, execution)
     if reliable is not None:
         figures["calibration"] = reliable.as_json()
     if inputs.sequence is not None:
-        lines = score_table(len(queries), len(index), inputs.scratch, "sequences")
+        lines = score_table(len(query_traversal), len(map_traversal), inputs.scratch, "sequences")
         score_sequences(scores, inputs.sequence, stops, lines, execution)
         by_sequence = ranked(lines, truth, stops)
         figures["sequence"] = {**inputs.sequence.model_dump(), **scores_of(by_sequence)}
@@ -145,11 +153,27 @@ def evaluate_answers(settings: AnswersSettings, inputs: MethodInputs) -> MethodR
     return MethodResult(scores, ranks, {**scores_of(ranks), **figures})
 
 
+@dataclass(frozen=True, eq=False)
+class Descriptors:
+    """Descriptors of some rows of a traversal."""
+
+    rows: Ints
+    """(K,) increasing."""
+    values: Sequence[Any]
+    """(K,)."""
+
+    def __getitem__(self, row: int) -> Any:
+        """The descriptor of a row that has one."""
+        return self.values[int(np.searchsorted(self.rows, row))]
+
+
 def describe_traversal(
     state: PlaceState, traversal: Traversal, stage: str, execution: Execution, query: bool | None = False
-) -> tuple[list[Any], Floats]:
-    """A descriptor for every row, and the CPU ms (N,) each took."""
-    views = views_of(state, traversal.log, traversal.stamp_ns, traversal.store.__getitem__, query)
+) -> tuple[Descriptors, Floats]:
+    """Describe every row that the method can use, and measure the CPU ms (K,) of each. Descriptors that were computed
+    elsewhere need no pixels, so that all rows have one."""
+    rows = np.arange(len(traversal)) if isinstance(state, StoredState) else traversal.decoded
+    views = views_of(state, traversal.log, traversal.stamp_ns[rows], traversal.store.__getitem__, query)
 
     def work(item: Any) -> tuple[Any, float]:
         loaded = views.load(item)
@@ -157,41 +181,50 @@ def describe_traversal(
         place = views.describe(loaded)
         return place, 1e3 * (time.thread_time() - began)
 
-    return _timed_map(work, views.items, len(traversal), stage, execution)
+    places, spent_ms = _timed_map(work, views.items, len(rows), stage, execution)
+    return Descriptors(rows, places), spent_ms
 
 
 def search(
-    index: PlaceIndex, queries: Sequence[Any], stops: Ints, scores: Float32s, execution: Execution, timed: bool = True
-) -> Floats:
-    """Fill `scores` (Q, M), NaN beyond each query's stop; CPU ms (Q,) of a search for the best ANSWERS rows."""
+    index: PlaceIndex, queries: Descriptors, rows: Ints, stops: Ints, scores: Float32s, execution: Execution,
+    timed: bool = True,
+) -> Floats:  # fmt: skip
+    """Fill `scores` (Q, M) and measure the CPU ms of each query's search for the best ANSWERS rows.
 
-    def work(row: int) -> tuple[None, float]:
-        stop = int(stops[row])
+    `rows` are those of the map that the index holds, in order. NaN stays beyond each query's stop, in rows of queries
+    without a descriptor, and in columns of the map that are not in the index.
+    """
+    scores[:] = np.nan
+
+    def work(query: int) -> tuple[None, float]:
+        stop = int(np.searchsorted(rows, stops[query]))
         began = time.thread_time()
         if timed:
-            index.query(queries[row], ANSWERS, stop)
+            index.query(queries[query], ANSWERS, stop)
         spent = time.thread_time() - began
-        scores[row, :stop] = index.scores(queries[row], stop)
-        scores[row, stop:] = np.nan
+        scores[query, rows[:stop]] = index.scores(queries[query], stop)
         return None, 1e3 * spent
 
-    return _timed_map(work, range(len(queries)), len(queries), "search", execution)[1]
+    return _timed_map(work, queries.rows.tolist(), len(queries.rows), "search", execution)[1]
 
 
 def reliability_of(
-    index: ProbableIndex, queries: Sequence[Any], stops: Ints, ranks: Ranks, truth: Pairs, execution: Execution
-) -> Reliability | None:
+    index: ProbableIndex, queries: Descriptors, rows: Ints, stops: Ints, ranks: Ranks, truth: Pairs,
+    execution: Execution,
+) -> Reliability | None:  # fmt: skip
     """The probabilities of the best answers against how often these are right; None without an answer.
 
     A drive's neighbouring frames show one place, among which its probability is divided. An answer is right where a
-    true row is near, so what is near counts for it: as many rows around it as a true run has, by their median.
+    true row is near, so what is near counts for it: as many rows around it as a true run has, by their median. `rows`
+    are those of the map that the index holds, in order.
     """
     radius = int(np.median(truth.stop - truth.first)) // 2 if len(truth.first) else 0
 
-    def work(row: int) -> float:
-        best = int(ranks.top_row[row])
-        probability = index.posterior(queries[row], int(stops[row]))[0]
-        return min(float(probability[max(best - radius, 0) : best + radius + 1].sum()), 1.0)
+    def work(query: int) -> float:
+        best = int(ranks.top_row[query])
+        near = slice(*np.searchsorted(rows, [best - radius, best + radius + 1]).tolist())
+        probability = index.posterior(queries[query], int(np.searchsorted(rows, stops[query])))[0]
+        return min(float(probability[near].sum()), 1.0)
 
     answered = np.flatnonzero(ranks.top_row >= 0)
     if not len(answered):

@@ -2,33 +2,37 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from vplog.benchmark.feature_cache import FeatureFolder
-from vplog.data import Bytes, Floats, Ints, Reference
+from vplog.data import Bytes, Features, Floats, Ints, Reference
 from vplog.errors import LogError
 from vplog.execution.execution import Execution
 from vplog.geometry.masking import masked
 from vplog.places.self_recognition import NO_IMAGE
 from vplog.run.cache.feature_shards import Extracted
 from vplog.stages import Extractor, Log
+from vplog.storage.image_file import decode_image
 
 
 @dataclass(frozen=True, eq=False)
 class Traversal:
-    """The frames of a drive as features, on disk."""
+    """The frames of a drive, one a row, and the features of those that can be decoded, on disk."""
 
     log: Log
-    store: Extracted
-    """Features and a small picture of row i at i."""
     frames: Ints
     """(N,) numbers of the frames in the drive, increasing."""
     stamp_ns: Ints
     """(N,)."""
     names: list[str] | None
     """File of each frame; None of a recording."""
+    store: Extracted
+    """Features and small pictures of K frames."""
+    decoded: Ints
+    """(K,) rows of the frames in `store`, increasing."""
     feature_ms: Floats
     """CPU ms that the features of each frame took, decoding not included; in no order."""
     warnings: list[str]
@@ -44,6 +48,18 @@ class Traversal:
         """File of a row, or its number in the drive."""
         return str(self.frames[row]) if self.names is None else self.names[row]
 
+    def features(self, row: int) -> Features:
+        """Return the features of a row that is among `decoded`."""
+        return self.store[int(np.searchsorted(self.decoded, row))]
+
+    def picture(self, row: int) -> Bytes | None:
+        """Return the grey picture (H, W) of a row, small if it is stored, or None if it cannot be decoded."""
+        if row in self.decoded:
+            return decode_image(self.store.picture(int(np.searchsorted(self.decoded, row))))
+        with suppress(LogError):
+            return images_at(self.log, self.stamp_ns[[row]])[0]
+        return None
+
 
 def extract_traversal(
     log: Log,
@@ -52,33 +68,43 @@ def extract_traversal(
     frames: Ints | None = None,
     execution: Execution = Execution(),
 ) -> Traversal:
-    """Features of the frames with these numbers (all where None), in files of the folder.
+    """Extract the features of the frames with these numbers (all if None) to files of the folder.
 
-    Frames that cannot be decoded are left out, with a warning. Raises LogError where none is left.
+    Frames that cannot be decoded have no features, and there is a warning. Raises LogError if no frame can be decoded.
     """
-    stamps, names = log.stamps(), log.file_names()
-    frames = np.arange(len(stamps)) if frames is None else frames
-    store = folder.extract(log, stamps[frames], extractor, execution)
+    frames = np.arange(len(log.stamps())) if frames is None else frames
+    stamp_ns = log.stamps()[frames]
+    store = folder.extract(log, stamp_ns, extractor, execution)
     if not len(store):
         why = f" The first: {store.lost[0]}" if store.lost else " `vplog info` shows what is in it."
         raise LogError(f"{log.name}: none of {len(frames)} frames could be decoded.{why}")
     warnings = []
     if lost := store.lost:
         warnings.append(f"{log.name}: {len(lost)} of {len(frames)} frames could not be decoded. First: {lost[0]}")
-    stamp_ns = np.array(store.stamp_ns, np.int64)
-    numbers = np.searchsorted(stamps, stamp_ns)
-    named = None if names is None else [names[number] for number in numbers.tolist()]
-    return Traversal(log, store, numbers, stamp_ns, named, np.array(store.cpu_ms), warnings)
+    decoded = np.searchsorted(stamp_ns, store.stamp_ns)
+    return Traversal(log, frames, stamp_ns, _names_of(log, frames), store, decoded, np.array(store.cpu_ms), warnings)
+
+
+def without_features(log: Log, frames: Ints) -> Traversal:
+    """Return the frames with these numbers for methods that need no pixels: none is decoded."""
+    nothing = np.zeros(0, np.int64)
+    return Traversal(log, frames, log.stamps()[frames], _names_of(log, frames), Extracted(), nothing, nothing / 1.0, [])
+
+
+def _names_of(log: Log, frames: Ints) -> list[str] | None:
+    names = log.file_names()
+    return None if names is None else [names[number] for number in frames.tolist()]
 
 
 def references_of(traversal: Traversal, numbers: Ints, images: bool = True) -> list[Reference]:
     """The frames with these numbers as references, without those that cannot be decoded; their images are not read
     again unless they count. Raises LogError."""
-    log, rows = traversal.log, np.flatnonzero(np.isin(traversal.frames, numbers))
-    stamp_ns = traversal.stamp_ns[rows]
-    shown = images_at(log, stamp_ns) if images else [NO_IMAGE] * len(rows)
-    found = zip(shown, rows.tolist(), stamp_ns.tolist(), strict=True)
-    return [Reference(image, traversal.store[row], log.name, stamp) for image, row, stamp in found]
+    log, decoded = traversal.log, traversal.decoded
+    chosen = np.flatnonzero(np.isin(traversal.frames[decoded], numbers))
+    stamp_ns = traversal.stamp_ns[decoded[chosen]]
+    shown = images_at(log, stamp_ns) if images else [NO_IMAGE] * len(chosen)
+    found = zip(shown, chosen.tolist(), stamp_ns.tolist(), strict=True)
+    return [Reference(image, traversal.store[at], log.name, stamp) for image, at, stamp in found]
 
 
 def images_at(log: Log, stamp_ns: Ints) -> list[Bytes]:

@@ -551,6 +551,13 @@ def print_comparison(found: dict[str, Any]) -> None:
         "r_at_1": "R@1", "r_at_5": "R@5", "r_at_10": "R@10", "anr": "ANR\n%", "ap": "AP", "recall_at_p100": "R@\nP100",
         "f1": "F1",
     }  # fmt: skip
+    if any((lost := found["undecodable"]).values()):
+        print_line(
+            "undecodable",
+            f"{lost['queries']} of the queries and {lost['map_frames']} of the frames; for methods that need pixels "
+            "they count as not found",
+        )
+    times = {"mining_ms": "encode\nown ms", "feature_ms": "encode\nshared ms", "query_ms": "query\nms"}
     if not found["positives"]:
         shares = {}
         _print_best_answers(found["answers"])
@@ -558,14 +565,14 @@ def print_comparison(found: dict[str, Any]) -> None:
     titles = [*shares.values(), *(("AUROC", "R@1%\nalarms") if truth and nowhere else ()), "bytes"]
     rows: list[Sequence[str]] = []
     for name, method in found["methods"].items():
-        costs = [""] * 3  # of answers from a file
+        costs = [""] * (1 + len(times))  # answers from a file have none
         if "bytes_per_image" in method:
-            costs = [f"{method['bytes_per_image']:g}", f"{method['encode_ms']:.2f}", f"{method['query_ms']:.2f}"]
+            costs = [f"{method['bytes_per_image']:g}", *(f"{method[time]:.2f}" for time in times)]
         rows.append((name, *_shares(method, shares, nowhere), *costs))
         if "sequence" in method and shares:
             scores = method["sequence"]
-            rows.append((f"  L={scores['length']}", *_shares(scores, shares, nowhere), "", "", ""))
-    print_table(("method", *titles, "encode\nms", "query\nms"), rows)
+            rows.append((f"  L={scores['length']}", *_shares(scores, shares, nowhere), *[""] * (1 + len(times))))
+    print_table(("method", *titles, *times.values()), rows)
     print_line("protocol", found["protocol"]["text"])
     warn(found["warnings"])
 

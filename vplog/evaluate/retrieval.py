@@ -1,6 +1,7 @@
 """Place retrieval: ranks of the true rows, and precision over recall of every query's best answer.
 
-Each figure is its mean over all orders of rows of equal score. Candidates without a score (NaN) come last, as equals.
+Each figure is its mean over all orders of rows of equal score. A candidate without a score (NaN) was not given as an
+answer: it is never counted as found, and it ranks after all candidates that are not true.
 """
 
 from __future__ import annotations
@@ -38,13 +39,16 @@ class Ranks:
     positive: Bools
     """(Q,) queries with a true row among their candidates."""
     better: Ints
-    """(Q,) candidates that score more than the query's best true row; 0 where it has none, as below."""
+    """(Q,) candidates that rank before the query's best true row: those that score more or, if it has no score, all
+    that are not true. 0 if the query has no true row, as below."""
     tied_false: Ints
     """(Q,) other candidates, not true, that score as much."""
     tied_true: Ints
     """(Q,) true rows that score as much, itself included."""
     true_row: Int32s
     """(Q,) the true row that scores most, the earliest of several; -1 where the query has none."""
+    true_given: Bools
+    """(Q,) queries with a true row that has a score."""
     p_match: Floats | None = None
     """(Q,) probability that the answer is right, NaN without an answer; None where none is stated."""
     evidence: Sequence[str] | None = None
@@ -94,6 +98,7 @@ def rank_queries(scores: Float32s, truth: Pairs, stops: Ints) -> Ranks:
     top_row, top_score = np.full(Q, -1, np.int32), np.full(Q, np.nan, np.float32)
     top_true, true_row = np.zeros(Q), np.full(Q, -1, np.int32)
     better, tied_false, tied_true = (np.zeros(Q, np.int64) for _ in range(3))
+    true_given = np.zeros(Q, bool)
     for q in range(Q):
         score = np.asarray(scores[q, : stops[q]])
         score = np.where(np.isnan(score), -np.inf, score)
@@ -105,17 +110,22 @@ def rank_queries(scores: Float32s, truth: Pairs, stops: Ints) -> Ranks:
             top_true[q] = np.count_nonzero(true == best) / np.count_nonzero(score == best)
         if len(true):
             best, true_row[q] = true.max(), rows[true.argmax()]
-            better[q] = np.count_nonzero(score > best)
-            tied_true[q] = np.count_nonzero(true == best)
-            tied_false[q] = np.count_nonzero(score == best) - tied_true[q]
+            true_given[q] = best > -np.inf
+            if true_given[q]:
+                better[q] = np.count_nonzero(score > best)
+                tied_true[q] = np.count_nonzero(true == best)
+                tied_false[q] = np.count_nonzero(score == best) - tied_true[q]
+            else:
+                better[q] = len(score) - len(true)
     return Ranks(
         np.asarray(stops, np.int64), top_row, top_score, top_true, truth.positive, better, tied_false, tied_true,
-        true_row,
+        true_row, true_given,
     )  # fmt: skip
 
 
 def recall_at(ranks: Ranks, k: int) -> float:
-    """R@k: share of the positives with a true row among their k best. Raises TruthError without positives."""
+    """R@k: share of the positives with a true row among their k best rows, or among all that have a score if these are
+    fewer. Raises TruthError without positives."""
     positive = _positives(ranks)
     slots = k - ranks.better[positive]
     false, tied = ranks.tied_false[positive], ranks.tied_false[positive] + ranks.tied_true[positive]
@@ -123,7 +133,7 @@ def recall_at(ranks: Ranks, k: int) -> float:
     for drawn in range(k):
         chance = np.maximum(false - drawn, 0) / np.maximum(tied - drawn, 1)
         missed *= np.where(drawn < slots, chance, 1.0)
-    return float((1.0 - missed).mean())
+    return float(((1.0 - missed) * ranks.true_given[positive]).mean())
 
 
 def average_normalised_rank(ranks: Ranks) -> float:

@@ -67,8 +67,9 @@ _KNOWN = (
 
 
 def open(path: Path, topics: TopicChoice | None = None) -> RecordedLog:
-    """The drive at `path`, its kind found by content, its topics by the rules of `topic_selection.py` or by name.
-    Raises LogError where there is no log, or where a topic of `topics` is not in it."""
+    """The drive at `path`, its kind found by content, its topics by the rules of `topic_selection.py` or by name. Image
+    files without a calibration keep their sizes. Raises LogError where there is no log, or where a topic of `topics`
+    is not in it."""
     path, choice, notes = located(path), topics or TopicChoice(), Notes()
     path = path.resolve() if path.name in ("", "..") else path  # it has a name
     with _reading(path):
@@ -208,14 +209,20 @@ class _Part(NamedTuple):
     contents: Contents
 
 
-def open_drive(
+def open_drive(paths: Sequence[Path], topics: TopicChoice | None = None) -> RecordedLog:
+    """Open one drive of one camera, recorded in one file or several in any order. Its images all have the size of the
+    first. Raises LogError if there is no log, or the files overlap in time, lie far apart, differ in kind or have no
+    topic in common."""
+    log = open(paths[0], topics) if len(paths) == 1 else _open_parts(paths, topics)
+    log.is_one_drive = True
+    return log
+
+
+def _open_parts(
     paths: Sequence[Path], topics: TopicChoice | None = None, folder: Path | None = None, notes: Notes | None = None
 ) -> RecordedLog:
-    """One drive recorded in several files, in any order, which has the name of the first, or of their `folder`; `notes`
-    are remarks on that. Raises LogError where they overlap in time, lie far apart, differ in kind or have no topic in
-    common."""
-    if len(paths) == 1:
-        return open(paths[0], topics)
+    """Open the files of one drive, which is called like the first or like their `folder`; `notes` are remarks on
+    that."""
     paths = [located(path) for path in paths]
     notes, parts = notes or Notes(), []
     for path in paths:
@@ -402,7 +409,7 @@ def _open_found(path: Path, logs: list[Path], problem: str, choice: TopicChoice,
     if not all(_magic(part) == "ros1" for part in parts):
         notes.add(f"{problem.rstrip('.')}; {plural(len(parts), 'storage file')} found by content.")
     if len(parts) > 1:  # several drives may be numbered, too
-        return open_drive(parts, choice, path, notes)
+        return _open_parts(parts, choice, path, notes)
     return _open_bag(path, Metadata(parts, [], {}, 0, 0), choice, notes)
 
 

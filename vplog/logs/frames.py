@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
@@ -106,11 +106,14 @@ class RecordedFrame:
     right_mask: Mask | None = None
     registration: DepthRegistration | None = None
     """Where the depth is another camera's."""
+    own_size: bool = False
+    """True if the image keeps its size, so that the camera of the decoded frame has the size of the image. False if the
+    image is brought to the size of `camera`."""
 
     def decode(self, colour: bool = False) -> Frame:
         """The frame, without depth or right image where that does not decode or fit. Raises LogError where the image
         does not."""
-        image, affine = self._image()
+        image, camera, affine = self._image()
         mask = self._mask(image)
         rgb = self.image.rgb(self.stamp_ns) if colour else None
         if self.pair is not None:
@@ -119,20 +122,24 @@ class RecordedFrame:
             mask = None if mask is None else self.pair.rectify(255 * mask.astype(np.uint8), 0) > _HALF
             return Frame(self.stamp_ns, self.camera, self.pair.rectify(image, 0), None, right, rgb, mask)
         depth = None if self.depth is None else self._registered(self.depth, image, affine)
-        rgb = None if rgb is None else warped(rgb, affine, self.camera)
+        rgb = None if rgb is None else warped(rgb, affine, camera)
         if mask is not None and affine is not None:
-            mask = warped(255 * mask.astype(np.uint8), affine, self.camera) > _HALF
-        return Frame(self.stamp_ns, self.camera, warped(image, affine, self.camera), depth, colour=rgb, mask=mask)
+            mask = warped(255 * mask.astype(np.uint8), affine, camera) > _HALF
+        return Frame(self.stamp_ns, camera, warped(image, affine, camera), depth, colour=rgb, mask=mask)
 
-    def _image(self) -> tuple[Bytes, Floats | None]:
-        """The image, and what leads from its px to the camera's. Raises LogError."""
+    def _image(self) -> tuple[Bytes, Camera, Floats | None]:
+        """Return the image, its camera, and the (2, 3) transform from px of the image to px of the camera, None for the
+        identity. Raises LogError if the image does not decode or fit."""
         channel, image = self.image.channel, None
         try:
             image = self.image.grey(self.stamp_ns)
             if self.pair is not None:
                 self._check_size(channel, image)
-                return image, None
-            affine = camera_from_image(self.camera, (image.shape[1], image.shape[0]), self.calibration)
+                return image, self.camera, None
+            height, width = image.shape
+            if self.own_size:
+                return image, replace(self.camera, width=width, height=height), None
+            affine = camera_from_image(self.camera, (width, height), self.calibration)
             size = f"{self.camera.width} x {self.camera.height} px"
             if affine is None:
                 raise LogError(
@@ -143,12 +150,12 @@ class RecordedFrame:
             self._count_undecodable(channel, "" if image is None else str(error))
             raise
         if image.shape == (self.camera.height, self.camera.width) and np.array_equal(affine, np.eye(2, 3)):
-            return image, None
+            return image, self.camera, None
         self.notes.add(
             f"The images of {channel.topic} change their size or region of interest; those unlike the first are "
             f"resampled to its {size}."
         )
-        return image, affine
+        return image, self.camera, affine
 
     def _mask(self, image: Bytes) -> Bools | None:
         """(H, W) px of the image as it comes that count; None where all do. Raises LogError where its mask does not fit

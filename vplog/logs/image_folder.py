@@ -19,7 +19,7 @@ from vplog.data import Ints
 from vplog.errors import LogError
 from vplog.logs.clocks import LONGEST_PAUSE_NS
 from vplog.logs.topic_selection import EVERY_IMAGE
-from vplog.storage.image_file import PNG, image_size
+from vplog.storage.image_file import PNG
 
 PERIOD_NS = 100_000_000
 """Time between images whose names hold no time: 10 Hz, KITTI's rate."""
@@ -38,10 +38,6 @@ _SHARE = 0.5
 """Share of a group's images whose numbers lie within another's, from which the two were taken at the same time."""
 _IN_GROUPS = 0.9
 """Share of a folder's images that cameras by name have together: names of random letters make groups of few."""
-_OTHERS = 0.1
-"""Share of a folder's images that a size has where it is another camera's; fewer are resampled, or left out, by one."""
-_SIZED = 16
-"""Images whose size is looked at, in pairs of neighbours spread over the folder."""
 
 
 def is_image(path: Path) -> bool:
@@ -158,9 +154,9 @@ _NUMBER = re.compile(r"((?:cam(?:era)?|infra|fisheye)[_-]?\d(?!\d))|(\d+)", re.I
 
 
 def select_camera(folder: Path, files: list[Path], choice: str | None) -> list[Path]:
-    """The files in order, of one camera, by names, bits or size: of several, that which `choice` names, as
-    `left_*.png`. Raises LogError where none of them is chosen."""
-    splits = (partial(by_folder, folder), _by_name, _by_bits, _by_size)
+    """Return the files of one camera, in order. Names and bits tell cameras apart; of several cameras `choice` names
+    the one to use, as `left_*.png`. Raises LogError if it names none of them."""
+    splits = (partial(by_folder, folder), _by_name, _by_bits)
     groups = next((found for split in splits if len(found := split(files)) > 1), {})
     if not groups:
         return files
@@ -247,20 +243,6 @@ def _bits(file: Path) -> str:
     """`16 bits`, `8 bits`, or nothing where the file is damaged or of another kind."""
     head = first_bytes(file, 25)
     return "" if head[:8] != PNG or len(head) < 25 else "16 bits" if head[24] == 16 else "8 bits"
-
-
-def _by_size(files: list[Path]) -> Group:
-    """Groups by width and height, where a few images spread over the folder have several sizes."""
-    step = max(2 * len(files) // _SIZED, 1)
-    if len({size for file in {*files[::step], *files[1::step]} if (size := _size(file))}) < 2:
-        return {}
-    groups = grouped(files, _size)
-    return {name: group for name, group in groups.items() if len(group) >= max(_LEAST, _OTHERS * len(files))}
-
-
-def _size(file: Path) -> str:
-    size = image_size(file.read_bytes())
-    return "" if size is None else f"{size[0]}x{size[1]}"
 
 
 def named_stamps(files: Sequence[Path]) -> tuple[Ints, bool]:

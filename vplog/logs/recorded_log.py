@@ -56,6 +56,11 @@ _LISTED = 8
 class RecordedLog:
     """A drive in a container, as `vplog.stages.Log`."""
 
+    is_one_drive: bool = False
+    """Controls uncalibrated image files of different sizes. True for a drive whose motion may be computed: the images
+    are brought to the size of the first. False: each image keeps its size. A calibration always needs one size, and a
+    recorded topic is of one camera."""
+
     def __init__(
         self, path: Path, name: str, kind: str, container: Container, notes: Notes, choice: TopicChoice
     ) -> None:
@@ -129,6 +134,7 @@ class RecordedLog:
         """Raises LogError where a stamp is not one of `stamps()`."""
         content, images, pair, camera = self._content, self._images, self._pair, self.camera()
         registration = self._depth[1] if self._depth else None
+        own_size = bool(self._contents.names) and camera.matrix is None and not self.is_one_drive
         for row in rows_of(content.stamp_ns, stamp_ns, self.name):
             at_ns, image = int(content.stamp_ns[row]), images.image(row)
             depth = images.companion("depth", row) if self._depth else None
@@ -137,7 +143,7 @@ class RecordedLog:
             right_mask = self._masks[1].of(int(content.right_ns[row])) if right else None
             later = bisect_right(self._later_calibrations, at_ns, key=lambda calibration: calibration.stamp_ns)
             own = self._later_calibrations[later - 1] if later else None
-            beside = depth, right, pair, self._notes, own, mask, right_mask, registration
+            beside = depth, right, pair, self._notes, own, mask, right_mask, registration, own_size
             yield RecordedFrame(at_ns, camera, image, *beside)
 
     def file_names(self) -> list[str] | None:

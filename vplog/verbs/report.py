@@ -101,7 +101,7 @@ def pictures_from(log: Path, folder: Path, record: dict[str, Any], execution: Ex
     keyframes, _ = tables.read_keyframes(folder / "keyframes.parquet")
     closures = tables.read_closures(folder / "closures.parquet")
     state, column = recorded_places(folder, record, pipeline, execution)
-    opened = logs.open(log, logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json"))
+    opened = logs.open_drive([log], logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json"))
     rows = choose_views(closures)
     nodes = np.unique(np.concatenate([closures.query[rows], closures.match[rows]])) if rows else np.zeros(0, np.int32)
     stamps = keyframes.stamp_ns[nodes]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -195,6 +197,22 @@ def test_an_interrupted_study_leaves_the_one_before_and_goes_on(
     assert list(found["experiments"]) == ["pairs", "conditions"]
     figures = {file for one in found["experiments"].values() for file in one["figures"]}
     assert {file.name for file in out.iterdir()} == figures | {"study.json", "trials.json"}
+
+
+def test_frames_that_do_not_decode_keep_their_queries(
+    verb: Verb, traversals: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """Frame 2 is lost by day and by dusk: its query counts as not found, and figures show other frames."""
+    day, dusk = tmp_path / "walk_day", tmp_path / "walk_dusk"
+    for source, folder in zip(traversals, (day, dusk), strict=True):
+        shutil.copytree(source, folder)
+        os.truncate(folder / "2.png", 100)
+    arguments = ("study", day, dusk, "--truth", "index", "-o", tmp_path / "study", *QUICK)
+    found = verb(*arguments, "--only", "pairs,references,examples,sequence", "--json").json
+    assert [one["with_match"] for one in found["protocol"]] == [FRAMES, FRAMES]
+    recalls = [row["r_at_10"] for row in found["experiments"]["pairs"]["rows"]]
+    assert recalls == pytest.approx(2 * 3 * [(FRAMES - 1) / FRAMES], abs=1e-5)
+    assert 2 not in found["experiments"]["sequence"]["frames"]
 
 
 def test_a_drive_and_its_own_past(verb: Verb, drive: Demo, tmp_path: Path) -> None:

@@ -138,6 +138,22 @@ def test_without_calibration_it_says_what_is_missing(verb: Callable[..., Said], 
     assert not out.exists()
 
 
+def test_pictures_of_several_sizes_are_answered_one_by_one(
+    verb: Callable[..., Said], run: Path, pictures: Path, tmp_path: Path
+) -> None:
+    """The calibration is that of the whole pictures, so cropped ones have no pose, and each says why."""
+    files = sorted((pictures / "pictures").iterdir())
+    for number, file in enumerate(files):
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        assert cv2.imwrite(str(tmp_path / file.name), image[:, :-40] if number % 2 else image)
+    for calibration in ((), ("--calibration", pictures / "camera.yaml")):
+        record = verb("localize", run, tmp_path, *calibration, "--json").json
+        assert [one["picture"] for one in record["answers"]] == [file.name for file in files]
+        assert [one["localized"] for one in record["answers"][::2]] == [bool(calibration)] * len(files[::2])
+        assert all("calibration" in one["sentence"] for one in record["answers"][1::2])
+
+
 def test_a_log_is_joined_by_its_odometry(drive: Demo, run: Path, tmp_path: Path) -> None:
     """Its odometry begins elsewhere, and half of its frames are dark: all samples still are where they were."""
     log = vplog.open_log(drive.log)

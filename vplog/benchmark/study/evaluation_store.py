@@ -6,12 +6,12 @@ Results are stored under a hash of all their inputs, so an interrupted study res
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vplog.benchmark.feature_cache import FeatureFolder
-from vplog.benchmark.method_scores import describe_traversal, ranked, score_table, search, stored_bytes
+from vplog.benchmark.method_scores import Descriptors, describe_traversal, ranked, score_table, search, stored_bytes
 from vplog.benchmark.traversals import Traversal, candidate_stops, extract_traversal, images_at, references_of
 from vplog.data import Bytes, Ints, Reference
 from vplog.errors import ResultError
@@ -116,14 +116,15 @@ class Bench:
             self._learned = library, self.references(library)
         return self.methods[method].learn(self._learned[1], self.execution)
 
-    def rank(self, state: PlaceState, query: int, other: int, places: dict[int, Sequence[Any]]) -> tuple[Ranks, Pairs]:
+    def rank(self, state: PlaceState, query: int, other: int, places: dict[int, Descriptors]) -> tuple[Ranks, Pairs]:
         """Ranks of every query of a pair, and its true pairs."""
         traversals = self.traversal(query), self.traversal(other)
         stops = candidate_stops(traversals[0].frames, traversals[1].frames, self.min_gap)
         truth = self.truth[query, other].pairs(traversals[0].frames, traversals[1].frames).below(stops)
-        index = state.index(places[other])
+        index = state.index(places[other].values)
         scores = score_table(len(traversals[0]), len(traversals[1]), self.scratch, "scores")
-        search(index, places[query], stops, scores, Execution(self.execution.threads), timed=False)
+        execution = Execution(self.execution.threads)
+        search(index, places[query], places[other].rows, stops, scores, execution, timed=False)
         return ranked(scores, truth, stops), truth
 
     def run(self, stage: str, evaluations: Iterable[Evaluation]) -> list[dict[str, Any]]:
@@ -146,23 +147,23 @@ class Bench:
                 described += len(self.frames[drive])
             for evaluation in some:
                 ranks, _ = self.rank(state, evaluation.query, evaluation.map, places)
-                size = stored_bytes(state.to_arrow(places[evaluation.map])) / len(places[evaluation.map])
+                column = state.to_arrow(places[evaluation.map].values)
                 done[keys[evaluation]] = {
                     **asdict(retrieval.score_retrieval(ranks)),
                     "p_match_error": score_open_set(ranks).get("p_match", {}).get("expected_calibration_error"),
-                    "bytes_per_image": round(size, 1),
+                    "bytes_per_image": round(stored_bytes(column) / len(column), 1),
                     "bits": state.bits,
                     "library_hash": references_hash(self._learned[1], self.methods[method]),
                 }
             write_run_json(self.results, dict(sorted(done.items())))
         return [done[keys[evaluation]] for evaluation in wanted]
 
-    def describe(self, state: PlaceState, drive: int, stage: str, before: int, total: int) -> Sequence[Any]:
+    def describe(self, state: PlaceState, drive: int, stage: str, before: int, total: int) -> Descriptors:
         """Places of a traversal as a table would give them back; `before` frames of the stage's `total` are done."""
         query = None if len(self.logs) > 1 else False
         execution = self.execution.part(before, total)
         places, _ = describe_traversal(state, self.traversal(drive), stage, execution, query)
-        return state.from_arrow(state.to_arrow(places))
+        return replace(places, values=state.from_arrow(state.to_arrow(places.values)))
 
     def _key(self, evaluation: Evaluation) -> str:
         about = {

@@ -35,7 +35,7 @@ def references(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str
     images = 0
     total = sum(len(frames) for frames in bench.frames)
     for drive in range(len(bench.names)):
-        for place in bench.describe(state, drive, "references", images, total):
+        for place in bench.describe(state, drive, "references", images, total).values:
             found = state.boxes(place)
             for reference, corners in zip(found.references.tolist(), found.corners, strict=True):
                 on[reference].append(corners)
@@ -69,12 +69,13 @@ def examples(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, 
             done += len(bench.frames[drive])
         ranks, truth = bench.rank(state, query, other, places)
         for kind, right in (("found", True), ("missed", False)):
-            among = np.flatnonzero(ranks.positive & ((ranks.top_true == 1.0) if right else (ranks.better > 0)))
+            is_of_kind = (ranks.top_true == 1.0) if right else ranks.true_given & (ranks.better > 0)
+            among = np.flatnonzero(ranks.positive & is_of_kind)
             if not len(among):
                 continue
             by_rank = np.argsort(ranks.top_score[among] if right else ranks.better[among], kind="stable")
             row = int(among[by_rank[len(among) // 2]])
-            true = truth.rows(row)
+            true = np.intersect1d(truth.rows(row), places[other].rows)
             answer = int(ranks.top_row[row])
             match = answer if right else int(true[len(true) // 2])
             file = f"examples-{len(files) + 1:02d}-{kind}"
@@ -110,7 +111,7 @@ def sequence(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, 
     query, other = bench.pairs[0]
     name, state = _learned(bench, options, other)
     places = bench.describe(state, query, "sequence", 0, len(bench.frames[query]))
-    found = [state.boxes(place) for place in places]
+    found = [state.boxes(place) for place in places.values]
     length = min(_FRAMES, len(found))
     # the run whose frames agree most on three references: Fig. 7 is about what boxes tell where the numbers do not
     agreed = []
@@ -121,7 +122,7 @@ def sequence(bench: Bench, options: StudyOptions, out: Path) -> tuple[dict[str, 
     run = found[start : start + length]
     used = np.bincount(np.concatenate([one.references for one in run]), minlength=len(state.references))
     order = [int(r) for r in np.argsort(-used, kind="stable") if used[r]]
-    rows = list(range(start, start + length))
+    rows = places.rows[start : start + length].tolist()
     _draw_sequence(bench, state, rows, run, order, out)
     about = {
         "method": name,
@@ -211,7 +212,7 @@ def _draw_example(
             axes.set_title(
                 as_text(f"{role}: {bench.names[drive]}, frame {int(bench.traversal(drive).frames[row])}"), fontsize=8.5
             )
-            features = bench.traversal(drive).store[row]
+            features = bench.traversal(drive).features(row)
             for column, j in enumerate(chosen, start=1):
                 reference = int(mine.references[j])
                 _show(grid[line, column], state.references[reference].image)
