@@ -80,12 +80,13 @@ def run_batch(
     ):
         versions = background.submit(made_by)
         digest = map_library(store, given, library, pipeline, execution)
-        store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
         known = store.drives()
         hashes = known_hashes(given, _hashes_record(store), execution, options.retries)
         common = common_record(pipeline, digest) | versions.result()
         plan = plan_drives(store, given, common, hashes)
         check_plan(plan, known, pipeline, common)
+        if any(one.state != "failed" for one in plan):
+            store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
         done = dict[str, DriveState]()
         for one in plan:
             if one.state != "compute":

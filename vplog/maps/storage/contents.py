@@ -317,7 +317,8 @@ class Store:
     def write_head(self, head: Head) -> None:
         """Write map.json, unless it holds that already."""
         if self.mirror is not None:
-            write_head(self.mirror, head.library, head.settings)
+            if not self.exists or self.head() != head:
+                write_head(self.mirror, head.library, head.settings)
             return
         record = {"format": FORMAT, "vplog": __version__, "library": head.library, "settings": head.settings}
         write_changed(self.root / "map.json", record)  # a finished map is not touched
