@@ -125,7 +125,7 @@ def run_batch(
             joined, join_error = _join(store, pipeline, execution, executor_for, places and places.result, urls)
         if not options.keep_cache and not join_error:  # another join would need it
             _clear_caches(store)
-    outcomes = [done[one.drive] for one in plan]
+    outcomes, between = [done[one.drive] for one in plan], (joined or {}).get("between", {})
     return {
         "map": str(root),
         "library": digest,
@@ -134,7 +134,7 @@ def run_batch(
         "threads_per_job": each,
         "seconds": round(time.perf_counter() - began, 3),
         "failed": sum(one.state == "failed" for one in outcomes),
-        "drives": [asdict(one) for one in outcomes],
+        "drives": [{**asdict(one), "between": between.get(one.drive, 0) if joined else None} for one in outcomes],
         "joined": joined,
         "join_error": join_error,
         "warnings": [

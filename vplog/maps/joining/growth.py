@@ -23,7 +23,7 @@ from vplog.graph.joint import middle
 from vplog.graph.refine import Refined
 from vplog.maps.joining import joint_graph
 from vplog.maps.joining.joint_graph import SolvedDrive, verified, verified_closures, with_solve
-from vplog.maps.joining.joint_record import fetch_poses, is_whole
+from vplog.maps.joining.joint_record import fetch_poses, is_whole, joint_ledgers
 from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.layout import folder_name
 from vplog.maps.storage.map_store import Store
@@ -214,10 +214,7 @@ class Growth:
     def _ledgers(self, part: Part) -> dict[tuple[str, str], Closures]:
         """The verified closures of all pairs of a component, as they were decided; of pairs whose drives were not in
         one component then, as rejected."""
-        found, folders = dict[tuple[str, str], "Closures"](), sorted({*part.folders.values()} - {""})
-        self._store.fetch_beside(f"joint/{folder}/joins.parquet" for folder in folders)
-        for folder in folders:
-            found |= tables.read_joins(self._store.root / "joint" / folder / "joins.parquet")
+        found = joint_ledgers(self._store, {*part.folders.values()} - {""})
         pairs = [pair for pair in self._pairs if pair[0] in part.folders and pair[1] in part.folders]
         known = {pair: found[pair] if pair in found else self._pairs[pair]() for pair in pairs}
         return {pair: one.rows(rows) for pair, one in known.items() if len(rows := verified(one))}

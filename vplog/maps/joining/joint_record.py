@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, NotRequired
+from typing import Any, NamedTuple, NotRequired, TypeVar
 
 from pydantic import TypeAdapter
 from typing_extensions import TypedDict  # as pydantic needs it below Python 3.12
 
-from vplog.data import Floats
+from vplog.data import Closures, Floats
 from vplog.errors import ResultError
 from vplog.maps.storage.damage import damaged_table, reading_drive
 from vplog.maps.storage.layout import Below, folder_name, write_changed
 from vplog.maps.storage.map_store import Store
 from vplog.results import run_record, tables
 from vplog.storage.parquet_limits import check_version
+
+T = TypeVar("T")
 
 
 class Component(NamedTuple):
@@ -90,6 +93,36 @@ def components_in(store: Store) -> list[dict[str, Any]] | None:
     return groups and [component for group in groups for component in group["components"]]
 
 
+def joint_ledgers(store: Store, folders: Iterable[str]) -> dict[tuple[str, str], Closures]:
+    """Return the closures between drives of the components in these folders of MAP/joint, by query and match drive.
+    Raises ResultError if a table is damaged."""
+    return _in_joins(store, folders, tables.read_joins)
+
+
+def closures_between(store: Store) -> dict[str, int]:
+    """Return how many accepted closures each drive has with the other drives of its component; empty if no drives are
+    joined. Raises ResultError if joint.json or a table is damaged."""
+    joint, found = joint_components(store), Counter[str]()
+    for pair, count in _in_joins(store, {one.folder.name for one in joint.values()}, tables.count_joins).items():
+        if joint.keys() >= set(pair):
+            found.update(dict.fromkeys(pair, count))
+    return found
+
+
+def _in_joins(
+    store: Store, folders: Iterable[str], read: Callable[[Path], dict[tuple[str, str], T]]
+) -> dict[tuple[str, str], T]:
+    names = [f"joint/{folder}/joins.parquet" for folder in sorted(folders)]
+    store.fetch_beside(names)
+    found: dict[tuple[str, str], T] = {}
+    for name in names:
+        try:
+            found |= read(store.root / name)
+        except ResultError:
+            raise ResultError(f"{store}/{name} is damaged. Join the drives again: vplog map join {store}") from None
+    return found
+
+
 def recorded_components(store: Store, without: Callable[[str], bool] = lambda _: False) -> dict[str, Component]:
     """The component of each drive as joint.json has them, `without` some drives. Raises ResultError where it is
     damaged."""
@@ -120,6 +153,15 @@ def keyframe_poses(store: Store, joint: Mapping[str, Component], drive: str) -> 
         return tables.read_keyframes(path)[1]
     except ResultError:
         raise ResultError(f"{path} is damaged. Join the drives again: vplog map join {store}") from None
+
+
+def joint_folder(store: Store, joint: Mapping[str, Component], drive: str) -> Path | None:
+    """Return the folder with the trajectory of a drive in the frame of its component; None for a drive in none."""
+    if drive not in joint:
+        return None
+    folder = joint[drive].folder / folder_name(drive)
+    store.fetch_beside([(folder / "trajectory.parquet").relative_to(store.root).as_posix()])
+    return folder
 
 
 def replaced_since(root: Path, drives: Mapping[str, Mapping[str, Any]]) -> list[str]:
