@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +12,14 @@ from vplog.batch.drive_inputs import MANIFESTS, manifest
 from vplog.batch.plan import absolute_log
 from vplog.errors import TruthError, VplogError
 from vplog.evaluate.trajectory import ate_together
-from vplog.maps.joining.joint_record import Component, closures_between, joint_components, joint_folder, joint_ledgers
+from vplog.maps.joining.joint_record import (
+    Component,
+    between_by_drive,
+    components_in,
+    joint_components,
+    joint_folder,
+    joint_ledgers,
+)
 from vplog.maps.storage import map_store
 from vplog.maps.storage.map_store import Store
 from vplog.results import run_record
@@ -42,7 +50,8 @@ def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None =
     named = _named_truths(located(truth)) if located(truth).suffix.lower() in MANIFESTS else None
     with map_store.reading(root) as store:
         options = options or TruthOptions()
-        known, joint, between = store.drives(), joint_components(store), closures_between(store)
+        known, joint = store.drives(), joint_components(store)
+        between = between_by_drive(components_in(store) or [], known)
         counts = {"between": 0, "false_between": None}
         nothing = {"tags": {}, "vplog": None, "truth": "", **figures_of({}), **counts}
         truths = dict[str, SharedTruth]()
@@ -51,7 +60,7 @@ def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None =
             own = truth if named is None else named.get(about["log"]) or named.get(drive) or ""
             own = about.get("truth", "auto") if own == "auto" else own
             row = {"drive": drive, "tags": about.get("tags", {}), "vplog": None, "truth": shown(own), **counts}
-            row["between"] = between.get(drive, 0)
+            row["between"] = between[drive]
             try:
                 folder = store.run(drive, [*map_store.RUN_TABLES, "result.mcap"])
                 record = run_record.read_finished_run(folder)
@@ -66,7 +75,8 @@ def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None =
             noted = {name: found.get(name) for name in ("truth_is", "interpolated", "warnings")}
             drives.append({**row, **figures_of(found), **noted, "error": found.get("error", "")})
             store.evict(drive)
-        components = _components(store, joint, truths, {row["drive"]: row for row in drives}, options)
+        rows = {str(one["drive"]): one for one in drives}
+        components = _components(store, joint, truths, rows, options)
     if all(one["error"] for one in drives):
         why = f" Of {drives[0]['drive']}: {drives[0]['error']}" if drives else ""
         raise TruthError(f"No drive of {root} can be evaluated.{why}")
@@ -74,7 +84,7 @@ def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None =
 
 
 def _components(
-    store: Store, joint: Mapping[str, Component], truths: Mapping[str, SharedTruth], rows: Mapping[str, dict[str, Any]],
+    store: Store, joint: Mapping[str, Component], truths: Mapping[str, SharedTruth], rows: dict[str, dict[str, Any]],
     options: TruthOptions,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Align the drives of each component together and judge the closures between them. The rows of these drives get the
@@ -93,10 +103,11 @@ def _components(
             if len(drives) < 2:
                 continue
             whole, *each = ate_together([one.matched for one in drives.values()], options.align or "se3")
-            joins = judge_joins(ledgers, drives, options)
+            joins, false = judge_joins(ledgers, drives, options), Counter[str]()
+            for pair in joins:
+                false.update(dict.fromkeys((pair["query_drive"], pair["match_drive"]), pair["accepted_false"]))
             for drive, ate in zip(drives, each, strict=True):
-                own = [pair["accepted_false"] for pair in joins if drive in (pair["query_drive"], pair["match_drive"])]
-                rows[drive] |= {"ate_m": ate.rmse_m, "false_between": sum(own) if own else None}
+                rows[drive] |= {"ate_m": ate.rmse_m, "false_between": false[drive] if joins else None}
             truth = rows[next(iter(drives))]["truth"]
             found.append({"drives": list(drives), "truth": truth, "ate_after": asdict(whole), "joins": joins})
     return found

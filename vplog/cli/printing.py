@@ -357,8 +357,7 @@ def print_batch(found: dict[str, Any]) -> None:
         f"{found['map']}:",
         f"{drives}, {found['failed']} failed, {found['seconds']:.1f} s, {found['jobs']} at once, {threads} each",
     )
-    if found["joined"]:
-        _print_components(found["joined"])
+    _print_components((found["joined"] or {}).get("components", []))
     for drive in found["drives"]:
         for warning in drive["warnings"]:
             print_status(f"warning: {drive['drive']}: {warning}")
@@ -398,7 +397,7 @@ def print_map(found: dict[str, Any]) -> None:
     if found["components"] is not None:
         joined = sum(len(one["drives"]) for one in found["components"])
         groups = len(found["components"])
-        closures = sum(one["between"] for one in found["drives"]) // 2  # each has two ends
+        closures = sum(one["between"] or 0 for one in found["drives"]) // 2  # each has two ends
         by = f"by {plural(closures, 'closure')}"
         print(f"joined    {plural(joined, 'drive')} in {plural(groups, 'group')} {by}, each in one frame")
     costs = ("seconds", "peak_memory_mb")
@@ -428,7 +427,7 @@ def print_export(found: dict[str, Any]) -> None:
 
 def print_joined(found: dict[str, Any]) -> None:
     print(f"{found['map']}: {plural(found['pairs'], 'pair')} of drives compared, {found['pairs_computed']} of them now")
-    _print_components(found)
+    _print_components(found["components"])
     if found["alone"]:
         print_line("alone", ", ".join(found["alone"]))
     warn(found["warnings"])
@@ -436,10 +435,10 @@ def print_joined(found: dict[str, Any]) -> None:
     print_next(f"{found['map']}/joint/KEY of the drives together", f"vplog evaluate {named} --truth FILE.tum")
 
 
-def _print_components(joined: dict[str, Any]) -> None:
+def _print_components(components: list[dict[str, Any]]) -> None:
     """Print the drives of each component of a join, with the closures between them."""
-    for component in joined["components"]:
-        closures = sum(joined["between"].get(drive, 0) for drive in component["drives"]) // 2  # each has two ends
+    for component in components:
+        closures = sum(component["between"].values()) // 2  # each has two ends
         text = f"{', '.join(component['drives'])}, by {plural(closures, 'closure')}, in joint/{component['folder']}"
         print_line("together", text)
 

@@ -10,7 +10,7 @@ from typing import Any
 from vplog.errors import LibraryError, ResultError
 from vplog.maps.geo_bounds import bounds_of, is_finite
 from vplog.maps.import_places import PLACES_ONLY
-from vplog.maps.joining.joint_record import closures_between, components_in, replaced_since
+from vplog.maps.joining.joint_record import between_by_drive, components_in, replaced_since
 from vplog.maps.storage import layout, map_store
 from vplog.maps.storage.contents import damage_warnings, library_mismatch, skip_damaged
 from vplog.maps.storage.damage import damaged_files, damaged_table
@@ -61,8 +61,9 @@ def _describe(store: Store) -> dict[str, Any]:
             other.append(about["log"])
     with ThreadPoolExecutor(_READ_AT_ONCE if store.mirror else 1) as pool:
         drives = list(pool.map(lambda drive: _drive(store, drive, abouts[drive]), abouts))
-    components, between = _joined(store, abouts, problems)
-    drives = [{**one, "between": between.get(one["drive"], 0)} for one in drives]
+    components = _components(store, abouts, problems)
+    between = between_by_drive(components or [], abouts)
+    drives = [{**one, "between": between[one["drive"]]} for one in drives]
     if other:
         problems.append(
             f"{len(other)} of {len(drives)} drives were made with other settings than the last batch had, or by "
@@ -125,18 +126,13 @@ def _figure(record: Any, *names: str) -> float | None:
     return record if is_finite(record) else None
 
 
-def _joined(
-    store: Store, known: Mapping[str, Any], problems: list[str]
-) -> tuple[list[dict[str, Any]] | None, dict[str, int]]:
-    """Return the drives that closures join in one frame, as joint.json has them, and `closures_between`. The components
-    are None if nothing was joined yet."""
-    found = None
+def _components(store: Store, known: Mapping[str, Any], problems: list[str]) -> list[dict[str, Any]] | None:
+    """The drives that closures join in one frame, as joint.json has them; None where nothing was joined yet."""
     try:
         found = components_in(store)
-        between = closures_between(store)
     except ResultError as error:
         problems.append(str(error))
-        return found, {}
+        return None
     if replaced := replaced_since(store.root, known):
         problems.append(
             f"{', '.join(replaced)} was replaced after the joint graphs were solved. Solve them again: vplog map "
@@ -147,7 +143,7 @@ def _joined(
             f"{', '.join(gone)} was removed and is still in the joint graphs. Solve them without it: vplog map join "
             f"{store}"
         )
-    return found, between
+    return found
 
 
 def _unused_folders(store: Store, drives: list[str]) -> list[str]:

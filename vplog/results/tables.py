@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import json
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,7 +21,6 @@ import numpy as np
 import pyarrow as pa
 
 from vplog.data import (
-    ACCEPTED,
     Closures,
     EdgeKind,
     Floats,
@@ -389,16 +387,6 @@ def read_joins(path: Path) -> dict[tuple[str, str], Closures]:
         rows.setdefault(pair, []).append(row)
     found = {pair: table.take(pa.array(own)) for pair, own in rows.items()}
     return {pair: _ledger_from(own, path, read_poses(own, "")) for pair, own in found.items()}
-
-
-def count_joins(path: Path) -> dict[tuple[str, str], int]:
-    """Return the number of accepted closures of each pair of drives (query's, match's) in a table of joins. Raises
-    ResultError."""
-    names = ["query_drive", "match_drive", "verdict"]
-    with reading(path), open_table(path) as file:
-        _check_name(path, "joins", file.schema_arrow)
-        rows = zip(*(column.to_pylist() for column in read_table(path, file, names).columns), strict=True)
-    return Counter((query, match) for query, match, verdict in rows if verdict in ACCEPTED)
 
 
 def _ledger_from(table: pa.Table, path: Path | str, match_from_query: Floats) -> Closures:

@@ -164,7 +164,7 @@ def evaluate_poses(
 ) -> RunEvaluation:  # fmt: skip
     """A run of one drive against a TUM file, or the poses `known` that were read from it; `joint` as in
     `evaluate_drive`. Raises as `evaluate`."""
-    options, frame = options.of(record), truth if known is None or truth != "auto" else ""
+    options, frame = options.of(record), "" if truth == "auto" else truth
     known = _shifted(read_truth(truth), options) if known is None else known
     after, odometry = tables.read_trajectory((joint or folder) / "trajectory.parquet")
     scale, mount = 1.0, unit_camera(record)

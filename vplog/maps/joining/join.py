@@ -17,7 +17,7 @@ from types import MappingProxyType
 from typing import Any, cast
 
 from vplog.data import ACCEPTED
-from vplog.errors import ResultError, VplogError
+from vplog.errors import VplogError
 from vplog.execution.cores import limited
 from vplog.execution.execution import Execution
 from vplog.execution.tasks import run_tasks
@@ -28,7 +28,6 @@ from vplog.maps.joining.components import Drives, PairLedger, solve_groups
 from vplog.maps.joining.drive_pairs import PairTask
 from vplog.maps.joining.inter_session import DrivePair, likely_pairs
 from vplog.maps.joining.join_states import JoinState, read_states, write_states
-from vplog.maps.joining.joint_record import closures_between
 from vplog.maps.joining.members import CameraTrust, Member, member_of
 from vplog.maps.storage.contents import damage_warnings, skip_damaged
 from vplog.maps.storage.damage import damaged_table
@@ -138,11 +137,6 @@ def _join(work: _Work, places: Callable[[], PlaceState] | None) -> dict[str, Any
             f"Closures of {one['query_drive']} to {one['match_drive']} were not enough to join them. {one['reason']}"
             for one in group["apart"]
         ]
-    between = dict[str, int]()
-    try:
-        between = closures_between(store)
-    except ResultError as error:
-        unjoined.append(str(error))
     unjoined += pipeline.rating.false_rate.warnings_between()
     searched = [drives.names[at] for at in work.new]
     cameras = [(drives.names[at], drive_pairs.known_camera(store, drives.member(at), pipeline)) for at in work.new]
@@ -154,7 +148,6 @@ def _join(work: _Work, places: Callable[[], PlaceState] | None) -> dict[str, Any
         "pairs_computed": computed,
         "components": [component for group in record["groups"] for component in group["components"]],
         "alone": record["alone"],
-        "between": between,
         "warnings": [*damage_warnings(store), *drives.excluded.values(), *unjoined],
         "stages": watch.stages,
     }

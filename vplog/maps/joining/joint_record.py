@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, NotRequired, TypeVar
+from typing import Any, NamedTuple, NotRequired
 
 from pydantic import TypeAdapter
 from typing_extensions import TypedDict  # as pydantic needs it below Python 3.12
@@ -17,8 +17,6 @@ from vplog.maps.storage.layout import Below, folder_name, write_changed
 from vplog.maps.storage.map_store import Store
 from vplog.results import run_record, tables
 from vplog.storage.parquet_limits import check_version
-
-T = TypeVar("T")
 
 
 class Component(NamedTuple):
@@ -36,6 +34,8 @@ class _Component(TypedDict):
     drives: list[str]
     grown: NotRequired[dict[str, Below]]
     """Folders of the drives that came or moved since."""
+    between: NotRequired[dict[str, int]]
+    """`count_between`; an older vplog wrote none."""
 
 
 class _Group(TypedDict):
@@ -50,7 +50,8 @@ def read_joint(root: Path) -> dict[str, Any]:
     """joint.json as plain values; empty where nothing was joined yet. Raises ResultError where it is damaged.
 
     `groups` are the drives that verified closures join, each with the `components` that came of it (`folder` in
-    MAP/joint, `drives`, and `grown`: the folders of those that came since the whole was solved) and the pairs kept
+    MAP/joint, `drives`, `grown`: the folders of those that came since the whole was solved, and `between`: how many
+    closures each drive has with other drives) and the pairs kept
     `apart`; `alone` are the drives in no component, `apart` says of some why; `keys` are those that the drives of
     components had in their drive.json, `judged` those of what the closures of each drive were decided by.
     """
@@ -96,30 +97,31 @@ def components_in(store: Store) -> list[dict[str, Any]] | None:
 def joint_ledgers(store: Store, folders: Iterable[str]) -> dict[tuple[str, str], Closures]:
     """Return the closures between drives of the components in these folders of MAP/joint, by query and match drive.
     Raises ResultError if a table is damaged."""
-    return _in_joins(store, folders, tables.read_joins)
-
-
-def closures_between(store: Store) -> dict[str, int]:
-    """Return how many accepted closures each drive has with the other drives of its component; empty if no drives are
-    joined. Raises ResultError if joint.json or a table is damaged."""
-    joint, found = joint_components(store), Counter[str]()
-    for pair, count in _in_joins(store, {one.folder.name for one in joint.values()}, tables.count_joins).items():
-        if joint.keys() >= set(pair):
-            found.update(dict.fromkeys(pair, count))
+    names, found = [f"joint/{folder}/joins.parquet" for folder in sorted(folders)], dict[tuple[str, str], Closures]()
+    store.fetch_beside(names)
+    for name in names:
+        try:
+            found |= tables.read_joins(store.root / name)
+        except ResultError:
+            raise ResultError(f"{store}/{name} is damaged. Join the drives again: vplog map join {store}") from None
     return found
 
 
-def _in_joins(
-    store: Store, folders: Iterable[str], read: Callable[[Path], dict[tuple[str, str], T]]
-) -> dict[tuple[str, str], T]:
-    names = [f"joint/{folder}/joins.parquet" for folder in sorted(folders)]
-    store.fetch_beside(names)
-    found: dict[tuple[str, str], T] = {}
-    for name in names:
-        try:
-            found |= read(store.root / name)
-        except ResultError:
-            raise ResultError(f"{store}/{name} is damaged. Join the drives again: vplog map join {store}") from None
+def count_between(ledgers: Mapping[tuple[str, str], Closures]) -> Counter[str]:
+    """Return how many accepted closures each drive has with other drives. Each closure counts for both of its ends."""
+    found = Counter[str]()
+    for pair, ledger in ledgers.items():
+        found.update(dict.fromkeys(pair, int(ledger.accepted.sum())))
+    return found
+
+
+def between_by_drive(components: Iterable[Mapping[str, Any]], drives: Iterable[str]) -> dict[str, int | None]:
+    """Return `count_between` of each drive by the components of joint.json, 0 for a drive in none, and None for a drive
+    in a component that an older vplog wrote."""
+    found: dict[str, int | None] = dict.fromkeys(drives, 0)
+    for component in components:
+        counts = component.get("between")
+        found |= {drive: None if counts is None else counts.get(drive, 0) for drive in component["drives"]}
     return found
 
 
@@ -156,12 +158,15 @@ def keyframe_poses(store: Store, joint: Mapping[str, Component], drive: str) -> 
 
 
 def joint_folder(store: Store, joint: Mapping[str, Component], drive: str) -> Path | None:
-    """Return the folder with the trajectory of a drive in the frame of its component; None for a drive in none."""
+    """Return the folder with the trajectory of a drive in the frame of its component, or None for a drive in none.
+    Raises ResultError if the trajectory is damaged."""
     if drive not in joint:
         return None
-    folder = joint[drive].folder / folder_name(drive)
-    store.fetch_beside([(folder / "trajectory.parquet").relative_to(store.root).as_posix()])
-    return folder
+    path = joint[drive].folder / folder_name(drive) / "trajectory.parquet"
+    store.fetch_beside([path.relative_to(store.root).as_posix()])
+    if damaged_table(path):
+        raise ResultError(f"{path} is damaged. Join the drives again: vplog map join {store}")
+    return path.parent
 
 
 def replaced_since(root: Path, drives: Mapping[str, Mapping[str, Any]]) -> list[str]:
