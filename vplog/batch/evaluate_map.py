@@ -52,14 +52,14 @@ def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None =
         options = options or TruthOptions()
         known, joint = store.drives(), joint_components(store)
         between = between_by_drive(components_in(store) or [], known)
-        counts = {"between": 0, "false_between": None}
-        nothing = {"tags": {}, "vplog": None, "truth": "", **figures_of({}), **counts}
+        nothing: dict[str, Any] = {"tags": {}, "vplog": None, "truth": "", **figures_of({})}
+        nothing |= {"between": None, "false_between": None}
         truths = dict[str, SharedTruth]()
         drives = [{"drive": drive, **nothing, "error": why} for drive, why in sorted(store.damaged.items())]
         for drive, about in known.items():
             own = truth if named is None else named.get(about["log"]) or named.get(drive) or ""
             own = about.get("truth", "auto") if own == "auto" else own
-            row = {"drive": drive, "tags": about.get("tags", {}), "vplog": None, "truth": shown(own), **counts}
+            row = {"drive": drive, **nothing, "tags": about.get("tags", {}), "truth": shown(own)}
             row["between"] = between[drive]
             try:
                 folder = store.run(drive, [*map_store.RUN_TABLES, "result.mcap"])

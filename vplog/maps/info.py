@@ -63,7 +63,8 @@ def _describe(store: Store) -> dict[str, Any]:
         drives = list(pool.map(lambda drive: _drive(store, drive, abouts[drive]), abouts))
     components = _components(store, abouts, problems)
     between = between_by_drive(components or [], abouts)
-    drives = [{**one, "between": between[one["drive"]]} for one in drives]
+    for one in drives:
+        one["between"] = between[one["drive"]]
     if other:
         problems.append(
             f"{len(other)} of {len(drives)} drives were made with other settings than the last batch had, or by "
