@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -35,8 +34,6 @@ if TYPE_CHECKING:
     """Topics and files to use instead of those that the rules choose, by part: `{"image": "/left"}`."""
     Settings = dict[str, Any] | Sequence[str]
     """Single settings by dotted name, `{"library.size": 50}`, or as --set has them, `["library.size=50"]`."""
-
-logging.getLogger("vplog").addHandler(logging.NullHandler())  # warnings are in the records
 
 
 def _let_numba_cache() -> None:

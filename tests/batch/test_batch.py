@@ -491,6 +491,14 @@ def test_a_map_goes_on_with_its_own_settings(
     assert f"the first is {logs[1]}" in json.loads(said.out)["warnings"][0]
 
 
+def test_logs_that_cannot_be_read_leave_the_settings_of_the_map(whole: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(whole, tmp_path / "map"))
+    before = (root / "map.json").read_bytes()
+    done = run_batch([tmp_path / "gone.bag"], root, load_pipeline("default", [*QUICK, "propose.per_query=2"]))
+    assert done["failed"] == 1
+    assert (root / "map.json").read_bytes() == before
+
+
 def test_a_log_that_cannot_be_asked_for_stops_no_other(
     whole: Path, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,7 +12,8 @@ from scipy.integrate import quad
 from tests.evaluate.data import data
 from vplog.data import Gps, Trajectory
 from vplog.errors import TruthError
-from vplog.evaluate.truth import ate_to_gps, local_enu, read_truth
+from vplog.evaluate.trajectory import ate_together
+from vplog.evaluate.truth import ate_to_gps, local_enu, matched_fixes, read_truth
 from vplog.geometry import se3
 
 if TYPE_CHECKING:
@@ -80,6 +81,24 @@ def test_ate_to_fixes_between_the_poses() -> None:
     found = ate_to_gps(straight(100, 5.0), shifted)
     assert found.count == 8
     assert found.max_m < 1e-3  # the curvature of the earth over 35 m
+
+
+def test_drives_with_fixes_are_aligned_together() -> None:
+    """Two halves of a straight drive, the second of them 3 m off to the side. A line that is fitted to a step of 3 m
+    leaves half of the 1.5 m that its mean would leave."""
+    degree_m = A_M * np.radians(1.0)
+    fixes = gps([0.0] * 16, np.arange(16) * 5.0 / degree_m, 0.0)
+    halves = [
+        Gps(*(getattr(fixes, one.name)[rows] for one in dataclasses.fields(Gps)[:5]))
+        for rows in (slice(8), slice(8, None))
+    ]
+    whole, aside = straight(160, 5.0), se3.pose(np.eye(3), np.array([3.0, 0.0, 0.0]))
+    for second, wrong_m in ((whole, 0.0), (Trajectory(whole.stamp_ns, aside @ whole.world_from_body), 0.75)):
+        matched = [matched_fixes(whole, halves[0]), matched_fixes(second, halves[1])]
+        together, *each = ate_together(matched)
+        assert (together.count, [one.count for one in each]) == (16, [8, 8])
+        assert together.rmse_m == pytest.approx(wrong_m, abs=0.01)
+        assert all(ate_to_gps(*one).rmse_m < 1e-3 for one in ((whole, halves[0]), (second, halves[1])))
 
 
 def test_fixes_outside_the_drive_are_one_line() -> None:

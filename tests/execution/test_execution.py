@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from vplog.execution.cores import limited
-from vplog.execution.execution import Execution, logged_warnings
+from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -94,22 +93,6 @@ def test_progress_of_parts_adds_up_to_that_of_the_whole() -> None:
     for before, count in ((0, 2), (2, 0), (2, 3)):
         list(execution.part(before, 5).counted("extract", range(count), count))
     assert reports == [("drive: extract", done, 5) for done in range(1, 6)]
-
-
-@pytest.mark.parametrize("level", [logging.NOTSET, logging.CRITICAL])
-def test_warnings_are_recorded_where_the_caller_silences_them(level: int, caplog: pytest.LogCaptureFixture) -> None:
-    logger = logging.getLogger("vplog")
-    before = logger.level
-    logger.setLevel(level)
-    try:
-        with logged_warnings(warnings := []):
-            logging.getLogger("vplog.run").warning("poor")
-        assert logger.level == level
-        assert logger.propagate
-    finally:
-        logger.setLevel(before)
-    assert warnings == ["poor"]
-    assert caplog.messages == (["poor"] if level == logging.NOTSET else [])
 
 
 def test_opencv_has_as_many_threads_afterwards_as_before() -> None:

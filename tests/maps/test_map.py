@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import subprocess
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -63,6 +64,8 @@ def test_a_map_tells_what_is_in_it(root: Path, finished: Path, library: str, ver
     assert told["descriptor_bytes"] == sum(sizes)
     assert told["bytes_per_place"] == pytest.approx(sum(sizes) / told["places"], abs=0.1)
     assert "3 drives" in verb("map", "info", root).out
+    du = subprocess.run(["du", "-sk", root], capture_output=True, text=True, check=True).stdout
+    assert told["bytes"] == 1024 * int(du.split()[0])
 
 
 def test_a_drive_goes_with_its_folders(root: Path, verb: Verb) -> None:

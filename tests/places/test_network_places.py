@@ -314,6 +314,9 @@ def test_a_file_of_one_drive_is_taken_for_no_other(
     assert "which of 2 drives" in batch(root, night, day, file=pair).error
     assert not root.exists()
     assert batch(root, day, file=pair).code == 0
+    settings_before = (root / "map.json").read_bytes()
+    assert "which of 2 drives" in batch(root, night, file=pair / "queries_descriptors.npy").error
+    assert (root / "map.json").read_bytes() == settings_before
     places = tables.read_descriptors(root / "runs" / "drive=day" / "descriptors.parquet")[0]
     settings = VectorsSettings(file=str(pair))
     own = settings.learn([reference(0)], Execution())

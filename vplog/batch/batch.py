@@ -24,6 +24,7 @@ from vplog.logs import TopicChoice
 from vplog.maps.import_places import PLACES_ONLY
 from vplog.maps.joining.join import join as join_drives
 from vplog.maps.joining.join import load_places
+from vplog.maps.joining.joint_record import between_by_drive
 from vplog.maps.storage import map_store
 from vplog.maps.storage.contents import damage_warnings
 from vplog.maps.storage.damage import UnreachableError
@@ -80,12 +81,13 @@ def run_batch(
     ):
         versions = background.submit(made_by)
         digest = map_library(store, given, library, pipeline, execution)
-        store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
         known = store.drives()
         hashes = known_hashes(given, _hashes_record(store), execution, options.retries)
         common = common_record(pipeline, digest) | versions.result()
         plan = plan_drives(store, given, common, hashes)
         check_plan(plan, known, pipeline, common)
+        if any(one.state != "failed" for one in plan):
+            store.write_head(map_store.Head(digest, pipeline.model_dump(mode="json")))
         done = dict[str, DriveState]()
         for one in plan:
             if one.state != "compute":
@@ -99,9 +101,11 @@ def run_batch(
         each, concurrency = _divide_cores(workers, options.jobs, len(wanted))
         execution.progress("drives", len(done), len(plan))
         keep = options.join or options.keep_cache
-        template = Task("", "", store.staging, store.library(digest), pipeline, TopicChoice(), each, {}, None, keep)
-        remote = root.url if isinstance(root, RemotePath) else ""
-        template = replace(template, time_s=options.drive_timeout_s, memory_mb=options.drive_memory_mb, remote=remote)
+        template = Task(
+            "", "", store.staging, store.library(digest), pipeline, TopicChoice(), each, {}, None, keep,
+            time_s=options.drive_timeout_s, memory_mb=options.drive_memory_mb,
+            remote=root.url if isinstance(root, RemotePath) else "",
+        )  # fmt: skip
         tasks = _tasks(store, wanted, template, longest_first=concurrency > 1)
         places = None
         is_alone = len(known.keys() | {one.drive for one in plan}) < 2
@@ -125,6 +129,7 @@ def run_batch(
         if not options.keep_cache and not join_error:  # another join would need it
             _clear_caches(store)
     outcomes = [done[one.drive] for one in plan]
+    between = {} if joined is None else between_by_drive(joined["components"], done)
     return {
         "map": str(root),
         "library": digest,
@@ -133,7 +138,7 @@ def run_batch(
         "threads_per_job": each,
         "seconds": round(time.perf_counter() - began, 3),
         "failed": sum(one.state == "failed" for one in outcomes),
-        "drives": [asdict(one) for one in outcomes],
+        "drives": [{**asdict(one), "between": between.get(one.drive)} for one in outcomes],
         "joined": joined,
         "join_error": join_error,
         "warnings": [

@@ -10,7 +10,7 @@ from vplog import logs
 from vplog.batch.plan import DriveInput, PlannedDrive
 from vplog.errors import LibraryError, LogError, VplogError
 from vplog.execution.execution import Execution
-from vplog.maps.storage import map_store
+from vplog.maps.merge import put_library
 from vplog.maps.storage.map_store import Store
 from vplog.places.library_files import read_library_record
 from vplog.places.reference_choice import PAPER_SIZE, evenly
@@ -66,21 +66,19 @@ def check_plan(
 def map_library(
     store: Store, drives: Sequence[DriveInput], given: Path | None, pipeline: Pipeline, execution: Execution
 ) -> str:
-    """`known_library`, which is put into the map where it has none yet. Where none of the logs can be read, nothing is
-    made."""
+    """Return the hash of `known_library`. A map without a library gets the library and these settings. Nothing is
+    written if none of the logs can be read, or if the map has its library already."""
     digest = known_library(store, len(drives), given, pipeline)
-    begun, made = store.exists, store.staging / "library"
-    if begun and digest is not None and store.recovered_head().library == digest:
+    if store.exists and digest is not None and store.recovered_head().library == digest:
         return digest
+    made = store.staging / "library"
     if given is not None:
         _decodable(drives, 1)
         digest = pipeline.places.load(given, Execution(execution.threads)).hash  # checked against its record
         copy_folder(given, made, f"the library {given} into {store}")
     else:
         digest = library_of_logs(_decodable(drives, PAPER_SIZE), made, pipeline, execution).hash
-    if not begun:  # a folder that holds a library alone is known as a map
-        store.write_head(map_store.Head(None, pipeline.model_dump(mode="json")))
-    map_store.add_library(store, made, digest)
+    put_library(store, made, digest, pipeline.model_dump(mode="json"))
     return digest
 
 

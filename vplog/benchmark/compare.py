@@ -30,7 +30,8 @@ from vplog.errors import SettingsError, TruthError
 from vplog.evaluate.pairs import Pairs
 from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, no_truth, open_truth
 from vplog.evaluate.retrieval import Ranks
-from vplog.execution.execution import Execution, logged_warnings
+from vplog.execution.execution import Execution
+from vplog.execution.run_warnings import collect_warnings
 from vplog.logs import EVERY_IMAGE
 from vplog.pipeline import Pipeline
 from vplog.places import KINDS
@@ -101,11 +102,10 @@ def compare(
         tree = {**pipeline.sequence.model_dump(), "length": options.sequence}
         sequences = SequenceSettings.read(tree, "--sequence")
     _check_gap(query, same_drive(query, other), options.min_gap)
-    warnings: list[str] = []
     with ExitStack() as stack:
         out = options.out
         made = None if out is None else stack.enter_context(staged(out, lambda: _comparison_in(out, query, other)))
-        stack.enter_context(logged_warnings(warnings))
+        warnings = stack.enter_context(collect_warnings())
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=".vplog-", dir=made)))
         cached = stack.enter_context(options.cache.opened(scratch))
         drives = _open(query, other, truth, pipeline, options, cached, execution)

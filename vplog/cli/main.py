@@ -27,6 +27,7 @@ from vplog.cli.results import add_results
 from vplog.errors import LogError, ResultError, SettingsError, VplogError, causes, plural, was_interrupted
 from vplog.execution.cores import available, limited
 from vplog.execution.execution import Execution
+from vplog.execution.run_warnings import collect_warnings
 from vplog.storage.urls import without_secrets
 from vplog.version import __version__
 
@@ -194,11 +195,11 @@ def library(arguments: argparse.Namespace) -> None:
     from vplog.places.library_files import read_library_record
     from vplog.run.reference_library import build_library
 
-    pipeline, warnings = parser.pipeline_of(arguments), []
-    with Progress(arguments) as progress:
+    pipeline = parser.pipeline_of(arguments)
+    with Progress(arguments) as progress, collect_warnings() as warnings:
         state = build_library(
             arguments.logs, arguments.output, pipeline, parser.topics_of(arguments),
-            Execution(arguments.threads, progress), warnings.append, force=arguments.force,
+            Execution(arguments.threads, progress), force=arguments.force,
         )  # fmt: skip
     record = read_library_record(arguments.output)
     if arguments.json:

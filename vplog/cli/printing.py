@@ -251,10 +251,18 @@ def print_evaluation(found: dict[str, Any]) -> None:
 
 def print_evaluated_map(found: dict[str, Any]) -> None:
     figures = {"ATE m": "ate_m:.3f", "recall": "recall:.3f", "false": "false_closures"}
+    between = {"closures to\nother drives": "between", "of them\nfalse": "false_between"}
     drives = [one | {"tags": _tags(one)} for one in found["drives"]]
-    print_records({"drive": "drive", "tags": "tags", "vplog": "vplog", **figures, "error": "error"}, drives)
+    print_records({"drive": "drive", "tags": "tags", "vplog": "vplog", **figures, **between, "error": "error"}, drives)
     groups = [one | {"group": name} for name, one in found["groups"].items()]
     print_records({"mean of": "group", "drives": "drives", **figures}, groups)
+    for one in found["components"]:
+        ate, judged = one["ate_after"], one["joins"]
+        counts = {name: sum(pair[name] for pair in judged) for name in ("accepted", "accepted_true", "accepted_false")}
+        text = f"{', '.join(one['drives'])}: ATE rmse {ate['rmse_m']:.6f} m in one frame ({ate['alignment']})"
+        if judged:
+            text += "; {accepted} closures between them, {accepted_true} true, {accepted_false} false".format(**counts)
+        print_line("together", text)
     warn(_notes_of_drives(found["drives"]))
 
 
@@ -339,8 +347,9 @@ def print_batch(found: dict[str, Any]) -> None:
     rows = [one | {name: one[name] or None for name in costs} for one in found["drives"]]
     rows = [one | ({} if one["state"] == "computed" else {"keyframes": None, "accepted": None}) for one in rows]
     columns = {
-        "drive": "drive", "state": "state", "keyframes": "keyframes", "closures": "accepted", "attempts": "attempts",
-        "seconds": "seconds:.1f", "peak MB": "peak_memory_mb:.0f", "worker": "worker", "error": "error",
+        "drive": "drive", "state": "state", "keyframes": "keyframes", "closures": "accepted",
+        "closures to\nother drives": "between", "attempts": "attempts", "seconds": "seconds:.1f",
+        "peak MB": "peak_memory_mb:.0f", "worker": "worker", "error": "error",
     }  # fmt: skip
     print_records(columns, rows)
     drives, threads = plural(len(found["drives"]), "drive"), plural(found["threads_per_job"], "thread")
@@ -348,8 +357,7 @@ def print_batch(found: dict[str, Any]) -> None:
         f"{found['map']}:",
         f"{drives}, {found['failed']} failed, {found['seconds']:.1f} s, {found['jobs']} at once, {threads} each",
     )
-    for component in (found["joined"] or {}).get("components", []):
-        print_line("together", ", ".join(component["drives"]))
+    _print_components((found["joined"] or {}).get("components", []))
     for drive in found["drives"]:
         for warning in drive["warnings"]:
             print_status(f"warning: {drive['drive']}: {warning}")
@@ -389,14 +397,17 @@ def print_map(found: dict[str, Any]) -> None:
     if found["components"] is not None:
         joined = sum(len(one["drives"]) for one in found["components"])
         groups = len(found["components"])
-        print(f"joined    {plural(joined, 'drive')} in {plural(groups, 'group')}, each in one frame")
+        closures = sum(one["between"] or 0 for one in found["drives"]) // 2  # each has two ends
+        by = f"by {plural(closures, 'closure')}"
+        print(f"joined    {plural(joined, 'drive')} in {plural(groups, 'group')} {by}, each in one frame")
     costs = ("seconds", "peak_memory_mb")
     drives = [
         one | {name: one[name] or 0 for name in costs} | {"mb": one["bytes"] / 1e6, "tags": _tags(one)}
         for one in found["drives"]
     ]
     columns = {name: name for name in ("drive", "keyframes", "candidates", "accepted")}
-    columns |= {"MB": "mb:.1f", "seconds": "seconds:.1f", "peak MB": "peak_memory_mb:.1f", "tags": "tags"}
+    columns |= {"to other\ndrives": "between", "MB": "mb:.1f", "seconds": "seconds:.1f"}
+    columns |= {"peak MB": "peak_memory_mb:.1f", "tags": "tags"}
     print_records(columns, drives)
     for drive, failure in found["failures"].items():
         print_status(f"failed: {drive}: {failure['error']}")
@@ -416,13 +427,20 @@ def print_export(found: dict[str, Any]) -> None:
 
 def print_joined(found: dict[str, Any]) -> None:
     print(f"{found['map']}: {plural(found['pairs'], 'pair')} of drives compared, {found['pairs_computed']} of them now")
-    for component in found["components"]:
-        print_line("together", f"{', '.join(component['drives'])}, in joint/{component['folder']}")
+    _print_components(found["components"])
     if found["alone"]:
         print_line("alone", ", ".join(found["alone"]))
     warn(found["warnings"])
     named = shlex.quote(str(found["map"]))
     print_next(f"{found['map']}/joint/KEY of the drives together", f"vplog evaluate {named} --truth FILE.tum")
+
+
+def _print_components(components: list[dict[str, Any]]) -> None:
+    """Print the drives of each component of a join, with the closures between them."""
+    for component in components:
+        closures = sum(component["between"].values()) // 2  # each has two ends
+        text = f"{', '.join(component['drives'])}, by {plural(closures, 'closure')}, in joint/{component['folder']}"
+        print_line("together", text)
 
 
 def print_merge(found: dict[str, Any]) -> None:

@@ -16,7 +16,7 @@ from vplog.cli.parser import call, flag, option, place
 from vplog.cli.printing import print_json, print_result
 from vplog.cli.progress import Progress, one_stage
 from vplog.errors import ResultError, SettingsError
-from vplog.execution.execution import Execution, logged_warnings
+from vplog.execution.execution import Execution
 
 if TYPE_CHECKING:
     from vplog.verbs.evaluate_run import TruthOptions
@@ -129,10 +129,8 @@ def export(arguments: argparse.Namespace) -> None:
     if arguments.output.is_dir() and arguments.format not in _FOLDERS:
         raise SettingsError(f"{arguments.output} is a folder, and {arguments.format} a file. Name one with -o.")
     with _file_or_stdout(arguments, arguments.format in _BINARY) as path, Progress(arguments) as progress:
-        execution, warnings = Execution(arguments.threads, progress), list[str]()
-        with logged_warnings(warnings):
-            found = export_run(arguments.run, arguments.format, path, arguments.log, execution, arguments.truth)
-    found["warnings"] += warnings
+        execution = Execution(arguments.threads, progress)
+        found = export_run(arguments.run, arguments.format, path, arguments.log, execution, arguments.truth)
     printing.warn(found["warnings"])
     if arguments.json:
         print_json(found)

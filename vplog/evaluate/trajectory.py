@@ -6,8 +6,9 @@ Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -132,27 +133,42 @@ def _seconds(stamp_ns: Ints) -> Floats:
     return np.array([stamp / 1_000_000_000 for stamp in stamp_ns.tolist()])
 
 
+Matched: TypeAlias = tuple[Floats, Floats]
+"""Estimated and true poses (K, 4, 4) of one trajectory at the same times."""
+
+
+def matched_poses(estimate: Trajectory, truth: Trajectory) -> Matched:
+    """Return the poses of `associate`. Raises TruthError as `associate`."""
+    here, there = associate(estimate, truth)
+    return estimate.world_from_body[here], truth.world_from_body[there]
+
+
 def ate(estimate: Trajectory, truth: Trajectory, alignment: str = "se3") -> Ate:
     """ATE after an alignment of ALIGNMENTS, by default as `evo_ape tum TRUTH ESTIMATE -a` (Umeyama 1991).
 
     Raises TruthError where fewer than three poses can be compared.
     """
-    here, there = associate(estimate, truth)
-    estimated, true = estimate.world_from_body[here], truth.world_from_body[there]
-    if alignment != "origin":
-        return aligned_error(estimated[:, :3, 3], true[:, :3, 3], alignment)
-    moved = true[0] @ se3.inverse(estimated[0]) @ estimated
-    return _ate(moved[:, :3, 3] - true[:, :3, 3], alignment)
+    return ate_together([matched_poses(estimate, truth)], alignment)[0]
 
 
-def aligned_error(estimate: Floats, truth: Floats, alignment: str = "se3") -> Ate:
-    """ATE of positions (T, 3) that belong together. Raises TruthError where T is less than three."""
-    if len(estimate) < 3:
+def ate_together(trajectories: Sequence[Matched], alignment: str = "se3") -> list[Ate]:
+    """Align trajectories that share one frame with one transform. Return the ATE of all poses, then of each trajectory.
+
+    Raises TruthError if an alignment of three poses is not possible.
+    """
+    estimated, true = (np.concatenate(poses) for poses in zip(*trajectories, strict=True))
+    positions, scale = true[:, :3, 3], 1.0
+    if alignment == "origin":
+        truth_from_estimate = true[0] @ se3.inverse(estimated[0])
+    elif len(true) < 3:
         raise TruthError(
-            f"Only {plural(len(estimate), 'pose')} with a truth; an alignment needs 3. Give one that covers the drive."
+            f"Only {plural(len(true), 'pose')} with a truth; an alignment needs 3. Give one that covers the drive."
         )
-    truth_from_estimate, scale = se3.umeyama(estimate, truth, alignment == "sim3")
-    return _ate(se3.transform(truth_from_estimate, scale * estimate) - truth, alignment, scale)
+    else:
+        truth_from_estimate, scale = se3.umeyama(estimated[:, :3, 3], positions, alignment == "sim3")
+    difference = se3.transform(truth_from_estimate, scale * estimated[:, :3, 3]) - positions
+    ends = np.cumsum([len(poses) for _, poses in trajectories])
+    return [_ate(one, alignment, scale) for one in (difference, *np.split(difference, ends[:-1]))]
 
 
 def _ate(difference: Floats, alignment: str, scale: float = 1.0) -> Ate:

@@ -10,7 +10,7 @@ import numpy as np
 
 from vplog.data import Floats, Gps, Ints, Trajectory
 from vplog.errors import TruthError, nearest
-from vplog.evaluate.trajectory import Ate, aligned_error
+from vplog.evaluate.trajectory import Ate, Matched, ate_together
 from vplog.geometry import geodesy, se3
 from vplog.geometry.tum import read_tum
 from vplog.storage.remote_path import located
@@ -37,19 +37,31 @@ def local_enu(gps: Gps) -> tuple[Ints, Floats]:
 
     Raises TruthError where no fix holds a position.
     """
-    local = geodesy.local_enu(gps)
-    if not len(local):
-        raise TruthError(f"None of the {len(gps.stamp_ns)} GPS fixes holds a position. Give a TUM file with --truth.")
+    local = _usable(gps)
     return local.stamp_ns, local.enu_m
 
 
-def ate_to_gps(estimate: Trajectory, gps: Gps, alignment: str = "se3") -> Ate:
-    """ATE of the estimate, interpolated at the fixes, after an alignment. It is that of the antenna where its place on
-    the body is known, in the estimate's unit of length.
+def _usable(gps: Gps) -> geodesy.LocalFixes:
+    local = geodesy.local_enu(gps)
+    if not len(local):
+        raise TruthError(f"None of the {len(gps.stamp_ns)} GPS fixes holds a position. Give a TUM file with --truth.")
+    return local
 
-    Raises TruthError where fewer than three fixes lie within the estimate.
+
+def ate_to_gps(estimate: Trajectory, gps: Gps, alignment: str = "se3") -> Ate:
+    """Return the ATE of `matched_fixes` after an alignment of ALIGNMENTS. Raises TruthError as `matched_fixes`."""
+    return ate_together([matched_fixes(estimate, gps)], alignment)[0]
+
+
+def matched_fixes(estimate: Trajectory, gps: Gps) -> Matched:
+    """Return the estimate at the stamps of the fixes, and the fixes as poses without rotation in m from the centre of
+    the earth.
+
+    The estimate is interpolated, and moved to the antenna if its place on the body is known, in the estimate's unit of
+    length. Raises TruthError if fewer than three fixes lie within the estimate.
     """
-    stamp_ns, positions = local_enu(gps)
+    fixes = _usable(gps)
+    stamp_ns, positions = fixes.stamp_ns, geodesy.earth_centred(fixes.enu_m, fixes.origin)
     if len(estimate.stamp_ns) < 2:
         raise TruthError("The trajectory has fewer than 2 poses: too few to compare with GPS. Run on more of the log.")
     if not np.isfinite(estimate.world_from_body).all():
@@ -62,7 +74,7 @@ def ate_to_gps(estimate: Trajectory, gps: Gps, alignment: str = "se3") -> Ate:
         )
     poses = se3.interpolate_at(estimate.stamp_ns, estimate.world_from_body, stamp_ns[inside])
     antenna_m = np.zeros(3) if gps.antenna_m is None else gps.antenna_m
-    return aligned_error(se3.transform(poses, antenna_m[None])[:, 0], positions[inside], alignment)
+    return poses @ se3.pose(np.eye(3), antenna_m), se3.pose(np.eye(3), positions[inside])
 
 
 def truth_warnings(found: dict[str, Any]) -> list[str]:

@@ -1,15 +1,15 @@
-"""Execution of work: number of threads, progress and warnings."""
+"""Execution of work: number of threads and progress."""
 
 from __future__ import annotations
 
-import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
+from contextvars import copy_context
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
@@ -54,7 +54,7 @@ class Execution:
         """
         waiting: deque[Future[Out]] = deque()
         threads = max(self.threads, 1)
-        with _one_blas_thread(), ThreadPoolExecutor(threads, initializer=_one_thread_each) as pool:
+        with _one_blas_thread(), ContextThreads(threads, initializer=_one_thread_each) as pool:
             try:
                 for item in items:
                     waiting.append(pool.submit(work, item))
@@ -65,6 +65,13 @@ class Execution:
             finally:
                 for future in waiting:
                     future.cancel()
+
+
+class ContextThreads(ThreadPoolExecutor):
+    """Threads that work with the context variables of the thread that submits: its thread limit and its warnings."""
+
+    def submit(self, function: Callable[..., Out], /, *args: Any, **kwargs: Any) -> Future[Out]:
+        return super().submit(copy_context().run, function, *args, **kwargs)
 
 
 @cache
@@ -91,22 +98,3 @@ def _one_thread_each() -> None:
 
     cv2.setNumThreads(1)
     faiss.omp_set_num_threads(1)
-
-
-@contextmanager
-def logged_warnings(warnings: list[str]) -> Iterator[None]:
-    """Appends what the package logs as warnings within the block, also where the caller has silenced its logger."""
-    handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda record: warnings.append(record.getMessage())
-    logger = logging.getLogger("vplog")
-    level, propagate = logger.level, logger.propagate
-    if not logger.isEnabledFor(logging.WARNING):
-        logger.setLevel(logging.WARNING)
-        logger.propagate = False
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(level)
-        logger.propagate = propagate

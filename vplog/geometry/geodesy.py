@@ -64,15 +64,21 @@ def _earth_centred(latitude: Floats, longitude: Floats, altitude_m: Floats) -> F
     return np.stack([x, y, (normal * (1.0 - _ECCENTRICITY_2) + altitude_m) * np.sin(latitude)], axis=1)
 
 
+def earth_centred(enu_m: Floats, origin: tuple[float, float, float]) -> Floats:
+    """Return points (T, 3), given in m east, north and up of the origin (see `LocalFixes`), in m from the centre of the
+    earth."""
+    latitude, longitude = np.radians(origin[0]), np.radians(origin[1])
+    at = _earth_centred(np.array([latitude]), np.array([longitude]), np.array([origin[2]]))
+    return enu_m @ _enu_from_earth(latitude, longitude) + at
+
+
 def geodetic(enu_m: Floats, origin: tuple[float, float, float]) -> Floats:
     """(T, 3) latitude and longitude in degrees and altitude in m of points in m east, north and up of the origin.
 
     The way back of `local_enu`: earth-centred, then to the ellipsoid by Bowring's formula (Survey Review 1976), which
     is exact to a micrometre within 10 km of the ground.
     """
-    latitude, longitude = np.radians(origin[0]), np.radians(origin[1])
-    at = _earth_centred(np.array([latitude]), np.array([longitude]), np.array([origin[2]]))[0]
-    x, y, z = (enu_m @ _enu_from_earth(latitude, longitude) + at).T
+    x, y, z = earth_centred(enu_m, origin).T
     semi_minor = _SEMI_MAJOR_M * (1.0 - _FLATTENING)
     second_2 = _ECCENTRICITY_2 / (1.0 - _ECCENTRICITY_2)
     axis = np.hypot(x, y)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vplog.data import Camera, Closures, Floats, Int32s, Ints, Keyframes
+from vplog.execution.run_warnings import warn
 from vplog.features.matching import PairMatches
 from vplog.geometry import se3
 from vplog.loops import undistort
@@ -27,7 +27,6 @@ from vplog.loops.propose import Proposals
 if TYPE_CHECKING:
     from vplog.execution.execution import Execution
 
-_LOG = logging.getLogger(__name__)
 _WARNED_SHARE = 0.05
 """Relative disagreement of camera and odometry that is warned of: five times a careful calibration's error."""
 _WARNED_AXES_RAD = np.radians(30.0)
@@ -112,26 +111,20 @@ def calibration_share(drive: Drive, execution: Execution) -> float:
     metric = [row.scale != "odometry" for _, row in good]
     far = times_as_far(by_odometry[metric], by_images[metric])
     if (apart := axes_apart(by_odometry, by_images)) > _WARNED_AXES_RAD:
-        _LOG.warning(
-            "Camera %r turns about another axis than the odometry, %.0f degrees off. Check its mount: the static "
-            "transforms, or --calibration.",
-            camera.name,
-            np.degrees(apart),
+        warn(
+            f"Camera {camera.name!r} turns about another axis than the odometry, {np.degrees(apart):.0f} degrees off. "
+            "Check its mount: the static transforms, or --calibration."
         )
     elif not _WARNED_SCALES[0] < far < _WARNED_SCALES[1]:
-        _LOG.warning(
-            "Camera %r moves %.2g times as far by its depth as by odometry. Check the unit of the depth, or the "
-            "baseline, and the scale of the odometry.",
-            camera.name,
-            far,
+        warn(
+            f"Camera {camera.name!r} moves {far:.2g} times as far by its depth as by odometry. Check the unit of the "
+            "depth, or the baseline, and the scale of the odometry."
         )
     elif share > _WARNED_SHARE:
-        _LOG.warning(
-            "Camera %r and odometry disagree by %.0f %%%s on rotations, so closures get a larger covariance. "
-            "Check the focal length.",
-            camera.name,
-            100.0 * share,
-            " or more" if share == settings.most_share else "",
+        or_more = " or more" if share == settings.most_share else ""
+        warn(
+            f"Camera {camera.name!r} and odometry disagree by {100.0 * share:.0f} %{or_more} on rotations, so closures "
+            "get a larger covariance. Check the focal length."
         )
     return share
 

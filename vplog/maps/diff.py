@@ -11,7 +11,7 @@ import numpy as np
 from vplog.data import USED, Closures, Floats, Ints
 from vplog.evaluate.trajectory import motion_figures
 from vplog.geometry import se3
-from vplog.maps.joining.joint_record import joint_components, keyframe_poses
+from vplog.maps.joining.joint_record import joint_components, joint_ledgers, keyframe_poses
 from vplog.maps.storage.map_store import Store, reading
 from vplog.results import tables
 from vplog.storage.json_records import differences
@@ -75,11 +75,8 @@ def _content(store: Store) -> _Content:
     for drive in abouts:
         closures |= _pairs(tables.read_closures(store.file(drive, "closures.parquet")), drive, drive, stamps)
     own = len(closures)
-    for component in dict.fromkeys(one.folder.name for one in joint.values()):
-        path = store.root / "joint" / component / "joins.parquet"
-        store.fetch_beside([path.relative_to(store.root).as_posix()])
-        for (query, match), ledger in tables.read_joins(path).items():
-            closures |= _pairs(ledger, query, match, stamps)
+    for (query, match), ledger in joint_ledgers(store, {one.folder.name for one in joint.values()}).items():
+        closures |= _pairs(ledger, query, match, stamps)
     frame = {drive: joint[drive].drives[0] if drive in joint else drive for drive in abouts}
     return _Content(store.head().settings, stamps, poses, frame, closures, len(closures) - own)
 

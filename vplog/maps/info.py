@@ -10,7 +10,7 @@ from typing import Any
 from vplog.errors import LibraryError, ResultError
 from vplog.maps.geo_bounds import bounds_of, is_finite
 from vplog.maps.import_places import PLACES_ONLY
-from vplog.maps.joining.joint_record import components_in, replaced_since
+from vplog.maps.joining.joint_record import between_by_drive, components_in, replaced_since
 from vplog.maps.storage import layout, map_store
 from vplog.maps.storage.contents import damage_warnings, library_mismatch, skip_damaged
 from vplog.maps.storage.damage import damaged_files, damaged_table
@@ -23,8 +23,9 @@ _READ_AT_ONCE = 16
 
 
 def describe_map(root: Path, check: bool = False) -> dict[str, Any]:
-    """Drives, places, bytes, library, what joins the drives, and failures of a map, without reading a descriptor; with
-    `check` every file of its drives is read, and `damaged_files` are those that are not as they were written.
+    """Drives, places, library, what joins the drives, and failures of a map, without reading a descriptor. `bytes` is
+    the size on disk as `du` reports it, or the size of the objects in a bucket. With `check` every file of the drives
+    is read, and `damaged_files` are those that are not as they were written.
 
     Raises ResultError.
     """
@@ -60,6 +61,10 @@ def _describe(store: Store) -> dict[str, Any]:
             other.append(about["log"])
     with ThreadPoolExecutor(_READ_AT_ONCE if store.mirror else 1) as pool:
         drives = list(pool.map(lambda drive: _drive(store, drive, abouts[drive]), abouts))
+    components = _components(store, abouts, problems)
+    between = between_by_drive(components or [], abouts)
+    for one in drives:
+        one["between"] = between[one["drive"]]
     if other:
         problems.append(
             f"{len(other)} of {len(drives)} drives were made with other settings than the last batch had, or by "
@@ -81,9 +86,9 @@ def _describe(store: Store) -> dict[str, Any]:
         "places": places,
         "descriptor_bytes": stored,
         "bytes_per_place": round(stored / places, 1) if places else None,
-        "bytes": sum(one["bytes"] for one in drives),
+        "bytes": store.bytes_stored(),
         "on_earth": sum(one["on_earth"] for one in drives),
-        "components": _components(store, abouts, problems),
+        "components": components,
         "drives": drives,
         "failures": store.failures(),
         "damaged": dict(sorted(store.damaged.items())),

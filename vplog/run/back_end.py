@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,6 +24,7 @@ from vplog.data import (
     Verdict,
 )
 from vplog.errors import GraphError
+from vplog.execution.run_warnings import warn
 from vplog.geometry import se3
 from vplog.graph import build, consistency, correct_trajectory
 from vplog.graph.consistency import is_loop
@@ -41,7 +41,6 @@ from vplog.graph.variance_components import Sigmas, claimed_times
 from vplog.loops.false_rate import log_odds_false
 from vplog.run.cache.steps import step
 
-_log = logging.getLogger(__name__)
 _FIXES_OF_A_PIECE = 2
 """Satellite fixes that place a piece of the trajectory on earth, and by which way it heads."""
 _CONFIRMED = 0.99
@@ -111,7 +110,7 @@ def solve(
     warnings += _contradicted(present, partial(decided, optimiser=settings.solve, cost=cost))
     warnings += _confirmed(closures, refined.solution.world_from_body)
     for warning in warnings:
-        _log.warning(warning)
+        warn(warning)
     trajectory = correct_trajectory.correct_trajectory(odometry, keyframes, refined.solution.world_from_body)
     return BackEndResult(
         judged_ledger(closures, graph, refined, rows), refined, trajectory, source, warnings, odometry.of_images,
@@ -196,7 +195,7 @@ def keyframe_covariances(solved: BackEndResult) -> Floats | None:
     try:
         return pose_covariances(objective, poses, refined.unknown)
     except GraphError as error:
-        _log.warning("The covariance of the keyframes is not known: %s", error)
+        warn(f"The covariance of the keyframes is not known: {error}")
         return None
 
 

@@ -6,7 +6,6 @@ camera has it; its closure is carried to the keyframes by the odometry of the mo
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -18,6 +17,7 @@ from vplog import logs
 from vplog.data import Bytes, Camera, Closures, Ints, Keyframes, Odometry, Reference, Verdict
 from vplog.errors import LogError
 from vplog.execution.execution import Execution
+from vplog.execution.run_warnings import warn
 from vplog.geometry import se3
 from vplog.loops.propose import Proposals, ProposeSettings, candidate_stops, propose
 from vplog.loops.verify import VerifySettings, verify_between
@@ -39,7 +39,6 @@ from vplog.storage.input_hashes import files_of
 if TYPE_CHECKING:
     from vplog.places import PlaceSettings
 
-_log = logging.getLogger(__name__)
 VIEW_BY_VIEW = SequenceSettings(length=1)
 """Between two cameras the places of a way may come in either order."""
 
@@ -100,7 +99,7 @@ def read_cameras(
     """The pictures of the other cameras, extracted; a camera that cannot be used is left out with a warning."""
     found = list[View]()
     if isinstance(settings.places, VectorsSettings):
-        _log.warning("%s not used: vectors from a file do not say of which camera they are.", ", ".join(others))
+        warn(f"{', '.join(others)} not used: vectors from a file do not say of which camera they are.")
         return found
     for topic, choice in others.items():
         try:
@@ -112,13 +111,13 @@ def read_cameras(
             chosen = (other, pictures, features, settings.library)
             images = steps.part(own_images, *chosen) if own_library else ()
         except LogError as error:
-            _log.warning("Camera %s is not used: %s", topic, error)
+            warn(f"Camera {topic} is not used: {error}")
             continue
         row = row[np.searchsorted(selected.stamp_ns, pictures.stamp_ns)]
         found.append(View(other, DriveFeatures(pictures, camera, features, settings.verify), row, images))
         for warning in other.warnings:
             if warning not in log.warnings:
-                _log.warning(warning)
+                warn(warning)
     return found
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import logging
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from vplog.data import Closures, Keyframes, Verdict
 from vplog.errors import SettingsError
 from vplog.evaluate.truth_tables import read_lines
 from vplog.execution.execution import Execution
+from vplog.execution.run_warnings import warn
 from vplog.loops.candidate import lenient
 from vplog.loops.propose import Proposals
 from vplog.loops.verify import verify_between
@@ -26,7 +26,6 @@ from vplog.run.verification import DriveFeatures, calibrated, for_verification, 
 from vplog.settings import FileName, Settings
 from vplog.storage.scratch import replacing
 
-_log = logging.getLogger(__name__)
 _COLUMNS = ["query", "match", "decision", "who", "when", "reason"]
 _REQUIRED = 3
 _CHOICES = ("accept", "reject", "add", "same", "")
@@ -141,15 +140,15 @@ def decide(
         if np.isfinite(closures.match_from_query[row, 0, 0]):
             verdict[row] = Verdict.ACCEPTED_BY_DECISION
         else:
-            _log.warning(
-                "Decision to accept keyframes %d and %d: geometry finds no pose between them (%s), so it has no "
-                "effect.", query, match, verdict[row].value,
-            )  # fmt: skip
+            warn(
+                f"Decision to accept keyframes {query} and {match}: geometry finds no pose between them "
+                f"({verdict[row].value}), so it has no effect."
+            )
     candidates = [row_at[pair] for pair in decisions.rejected if pair in row_at]
     for row in candidates:
         verdict[row] = Verdict.REJECTED_BY_DECISION
     if others := len(decisions.rejected) - len(candidates):
-        _log.warning("%d of the %d rejected pairs are no candidates.", others, len(decisions.rejected))
+        warn(f"{others} of the {len(decisions.rejected)} rejected pairs are no candidates.")
     return replace(closures, verdict=verdict)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -12,6 +11,7 @@ from vplog.data import Bools, Closures, Ints, Keyframes, Odometry, Verdict
 from vplog.evaluate.body_truth import TruthAt
 from vplog.evaluate.closure_pose import pose_bounds, pose_errors
 from vplog.execution.execution import Execution
+from vplog.execution.run_warnings import warn
 from vplog.geometry import se3
 from vplog.graph.build import build_graph
 from vplog.graph.consistency import OdometryChain
@@ -34,7 +34,6 @@ from vplog.run.cache.codecs import closures_codec
 from vplog.run.cache.steps import step
 from vplog.run.verification import DriveFeatures, for_verification
 
-_log = logging.getLogger(__name__)
 _FAR_M = 1e6
 """m between two pieces of a drive, of which nothing is known."""
 
@@ -145,10 +144,10 @@ def _admitted(closures: Closures, settings: FalseRateSettings, ruled_out: int, m
     verified = closures.of(Verdict.ACCEPTED)
     least = closures.p_false[verified].min(initial=1.0)
     if verified.any() and least > rate:
-        _log.warning(
-            "--false-rate %g: no closure is that certain. Of the %d verified the best have a false rate of %.2g, by "
-            "%d pairs that odometry rules out and %d mirrored ones. Allow more than that%s.",
-            rate, verified.sum(), least, ruled_out, mirrored,
-            ", or raise --set false_rate.null_pairs" if settings.null_pairs else "",  # 0 where none can be mirrored
-        )  # fmt: skip
+        more_pairs = ", or raise --set false_rate.null_pairs" if settings.null_pairs else ""  # 0: none can be mirrored
+        warn(
+            f"--false-rate {rate:g}: no closure is that certain. Of the {verified.sum()} verified the best have a "
+            f"false rate of {least:.2g}, by {ruled_out} pairs that odometry rules out and {mirrored} mirrored ones. "
+            f"Allow more than that{more_pairs}."
+        )
     return at_rate(closures, rate)

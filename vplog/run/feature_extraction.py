@@ -11,7 +11,6 @@ keyframes become references.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -24,6 +23,7 @@ from vplog import logs
 from vplog.data import Bools, Features, Floats, Frame, Keyframes, Odometry
 from vplog.errors import LogError, ResultError
 from vplog.execution.execution import Execution
+from vplog.execution.run_warnings import warn
 from vplog.features.extraction import extract_frames
 from vplog.geometry import se3
 from vplog.results.previews import PictureSettings, preview
@@ -56,7 +56,6 @@ if TYPE_CHECKING:
     Decoded = tuple[int, Frame | None, Features | None, str]
     """Stamp, frame, features, and why there are none, as `extract_frames` gives them."""
 
-_log = logging.getLogger(__name__)
 
 PART_KEYFRAMES = 64
 """Keyframes of a part: about 6 s of one core and 20 MB. A kill costs at most one part, and who computes one elsewhere
@@ -252,17 +251,18 @@ def decoded(
     warning where that is so, where images are lost, or where they are poor."""
     rows, total = np.searchsorted(keyframes.stamp_ns, found.stamp_ns), len(keyframes.stamp_ns)
     for why in found.lost[:1]:
-        _log.warning("%d of %d keyframes were lost to damaged images. First: %s", total - len(rows), total, why)
+        warn(f"{total - len(rows)} of {total} keyframes were lost to damaged images. First: {why}")
     if why := poor_pictures(found, getattr(settings, "least_features", 0)):
-        _log.warning(why)
+        warn(why)
     poses = keyframes.odom_from_body[rows]
     # without metres the motion is that of the pictures, or not known
     if odometry.metric and (stale := stale_pictures(poses, found)).any():
-        _log.warning(
-            "%d of %d keyframes of %s show the picture of the one before although the odometry moves on, the first of "
-            "them %.0f s after the start. They are matched with nothing: did the camera freeze?",
-            int(stale.sum()), total, camera, (found.stamp_ns[int(stale.argmax())] - found.stamp_ns[0]) / 1e9,
-        )  # fmt: skip
+        first_s = (found.stamp_ns[int(stale.argmax())] - found.stamp_ns[0]) / 1e9
+        warn(
+            f"{stale.sum()} of {total} keyframes of {camera} show the picture of the one before although the odometry "
+            f"moves on, the first of them {first_s:.0f} s after the start. They are matched with nothing: did the "
+            "camera freeze?"
+        )
         found = found.blank(stale)
     return Keyframes(keyframes.drive, keyframes.stamp_ns[rows], poses), found
 

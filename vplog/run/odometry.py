@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Literal
@@ -12,6 +11,7 @@ import numpy as np
 from vplog.data import Camera, Imu, Keyframes, Odometry
 from vplog.errors import LogError, plural
 from vplog.execution.execution import Execution
+from vplog.execution.run_warnings import warn
 from vplog.graph.gps_factors import NO_FIXES
 from vplog.logs import TopicChoice
 from vplog.logs.cameras import AHEAD
@@ -27,15 +27,6 @@ from vplog.run.visual_odometry.metres import in_metres
 from vplog.run.visual_odometry.visual import PERIOD_NS, visual_odometry
 from vplog.stages import Log
 
-_log = logging.getLogger(__name__)
-_UNCALIBRATED = (
-    "Camera %s is not calibrated, so no closure gets a metric pose: the trajectory is the odometry's. "
-    "Record its camera_info, or name it with --camera-info-topic."
-)
-_BY_HEIGHT = "The camera's height of %.2f m over the ground gives visual odometry its metres."
-_NO_GROUND = (
-    "The images show no flat ground ahead of the camera often enough, so that its height of %.2f m gives no metres."
-)
 UNIT = (
     "A single camera has no metres: lengths are in a unit of its own, about a tenth of the distance of what is seen, "
     "and its scale wanders."
@@ -65,17 +56,20 @@ def read(
     if source == "visual" and (imu := log.imu()) is not None and not _is_unknown(odometry):
         odometry = _with_imu(odometry, imu, camera)
     if topics.camera_height_m is not None and (is_metric(log) or source != "visual"):
-        _log.warning("--camera-height-m has no effect: the odometry is no single camera's.")
+        warn("--camera-height-m has no effect: the odometry is no single camera's.")
     if not odometry.metric:
         odometry = _with_scale(odometry, log, camera, use_gps)
     stamp_ns = odometry.stamp_ns if odometry.of_images else log.stamps()  # frames that were followed
     selected, warnings = select_keyframes(log.name, stamp_ns, odometry, settings)
     for warning in warnings + ways_without_images(log, topics, selected, odometry):
-        _log.warning(warning)
+        warn(warning)
     if _is_unknown(odometry):
         camera = replace(camera, matrix=None, distortion_model="none", distortion=np.zeros(0))
     elif camera.matrix is None:
-        _log.warning(_UNCALIBRATED, camera.name)
+        warn(
+            f"Camera {camera.name} is not calibrated, so no closure gets a metric pose: the trajectory is the "
+            "odometry's. Record its camera_info, or name it with --camera-info-topic."
+        )
     return odometry, camera, selected
 
 
@@ -83,20 +77,20 @@ def _with_imu(odometry: Odometry, imu: Imu, camera: Camera) -> Odometry:
     """Odometry with what the IMU says, noted."""
     found = with_imu(odometry, imu, camera)
     if isinstance(found, str):
-        _log.warning("Visual odometry does without the IMU %s: %s.", imu.name, found)
+        warn(f"Visual odometry does without the IMU {imu.name}: {found}.")
         return odometry
     what = "gravity"
     if not odometry.metric and found.odometry.metric:
         what += f" and metres, its unit {found.scale:.3g} m with a sigma of {found.sigma:.1%}"
     if found.bridged:
         what += f", and goes on across {plural(found.bridged, 'break')}"
-    _log.warning("Visual odometry takes %s from the IMU %s.", what, imu.name)
+    warn(f"Visual odometry takes {what} from the IMU {imu.name}.")
     if not found.odometry.metric:
         sigma = f"{found.sigma:.0%}" if found.sigma < 1 else "more than its size"
-        _log.warning(
-            "The drive accelerates too little for metres by the IMU: they would have a sigma of %s, at most %.0f %% "
-            "is taken.", sigma, 100 * SURE,
-        )  # fmt: skip
+        warn(
+            f"The drive accelerates too little for metres by the IMU: they would have a sigma of {sigma}, at most "
+            f"{100 * SURE:.0f} % is taken."
+        )
     return found.odometry
 
 
@@ -106,13 +100,13 @@ def _with_scale(odometry: Odometry, log: Log, camera: Camera, use_gps: bool) -> 
     if _is_unknown(odometry):
         return odometry
     if gps is None:
-        _log.warning("%s `vplog evaluate` aligns with a scale; --camera-height-m gives metres over flat ground.", UNIT)
+        warn(f"{UNIT} `vplog evaluate` aligns with a scale; --camera-height-m gives metres over flat ground.")
     elif not use_gps:
-        _log.warning("%s --gps takes metres from the fixes.", UNIT)
+        warn(f"{UNIT} --gps takes metres from the fixes.")
     elif (found := in_metres(odometry, gps, camera)) is not None:
         return found
     else:
-        _log.warning("%s The fixes do not go far enough for metres.", UNIT)
+        warn(f"{UNIT} The fixes do not go far enough for metres.")
     return odometry
 
 
@@ -199,7 +193,7 @@ def by_images(
     """Visual odometry, its breaks noted, in metres where the height of a single camera gives them. Where tracking fails
     from the first frame to the last: without depth a motion of which nothing is known, else raises LogError."""
     if unasked:
-        _log.warning("The log has no odometry, so visual odometry of its images is used (--odometry visual).")
+        warn("The log has no odometry, so visual odometry of its images is used (--odometry visual).")
     stamp_ns, metric = log.stamps(), is_metric(log)
     odometry = visual_odometry(decoded(log, stamp_ns, execution, "odometry"), camera, metric, height_m)
     if odometry is None and metric:
@@ -208,16 +202,20 @@ def by_images(
             "in common from one frame to the next. --odometry-file takes poses from a file."
         )
     if odometry is None:
-        _log.warning(
-            "No two of %d frames could be tracked: too few corners, too little in common from one frame to the next, "
-            "or a camera that only turns. Nothing is known of the motion: only the places recognised mean something, "
-            "and the trajectory does not. --odometry-file takes poses from a file.",
-            len(stamp_ns),
+        warn(
+            f"No two of {len(stamp_ns)} frames could be tracked: too few corners, too little in common from one frame "
+            "to the next, or a camera that only turns. Nothing is known of the motion: only the places recognised mean "
+            "something, and the trajectory does not. --odometry-file takes poses from a file."
         )
         return _unknown(stamp_ns)
     if height_m is not None and not metric:
-        _log.warning(_BY_HEIGHT if odometry.metric else _NO_GROUND, height_m)
-    _log_breaks("Visual odometry", odometry, stamp_ns, "frames")
+        warn(
+            f"The camera's height of {height_m:.2f} m over the ground gives visual odometry its metres."
+            if odometry.metric
+            else "The images show no flat ground ahead of the camera often enough, so that its height of "
+            f"{height_m:.2f} m gives no metres."
+        )
+    _warn_of_breaks("Visual odometry", odometry, stamp_ns, "frames")
     return odometry
 
 
@@ -228,7 +226,7 @@ def by_lidar(log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], *,
     if lidar is None:
         raise LogError(f"{log.name} has no lidar. {log.without_odometry()}")
     if unasked:
-        _log.warning("The log has no odometry, so that of its lidar %s is used (--odometry lidar).", lidar.name)
+        warn(f"The log has no odometry, so that of its lidar {lidar.name} is used (--odometry lidar).")
     stamp_ns = lidar.stamp_ns
     range_m = range_of(log.scans(stamp_ns[:: max(len(stamp_ns) // _SAMPLES, 1)]))
     scans = execution.counted("odometry", log.scans(stamp_ns), len(stamp_ns))
@@ -238,7 +236,7 @@ def by_lidar(log: Log, unasked: bool, inputs: Inputs, images: dict[str, Any], *,
             f"{log.name}: no two of {len(stamp_ns)} scans of {lidar.name} match: too few points, or too little in "
             "common from one scan to the next. --odometry-file takes poses from a file."
         )
-    _log_breaks(f"Odometry of {lidar.name}", odometry, stamp_ns, "scans")
+    _warn_of_breaks(f"Odometry of {lidar.name}", odometry, stamp_ns, "scans")
     return odometry
 
 
@@ -256,21 +254,20 @@ def _is_unknown(odometry: Odometry) -> bool:
     return not odometry.metric and len(odometry.breaks) == len(odometry.stamp_ns) - 1
 
 
-def _log_breaks(what: str, odometry: Odometry, stamp_ns: np.ndarray, of: str) -> None:
+def _warn_of_breaks(what: str, odometry: Odometry, stamp_ns: np.ndarray, of: str) -> None:
     """Warn of lost frames or scans, whose stamps are given, and of breaks."""
     if lost := int((~has_odometry(stamp_ns, odometry.stamp_ns, PERIOD_NS)).sum()):
-        _log.warning("%s lost its track in %d of %d %s.", what, lost, len(stamp_ns), of)
+        warn(f"{what} lost its track in {lost} of {len(stamp_ns)} {of}.")
     breaks = odometry.breaks
     if not len(breaks):
         return
     seconds = (odometry.stamp_ns[breaks] - stamp_ns[0]) / 1e9
     named = ", ".join(f"{second:.1f} s" for second in seconds[:_NAMED].tolist())
     more = f" and {len(breaks) - _NAMED} more" if len(breaks) > _NAMED else ""
-    _log.warning(
-        "%s starts again at %s%s after the first of the %s: the drive has %d pieces, which only closures relate to "
-        "each other.",
-        what, named, more, of, len(breaks) + 1,
-    )  # fmt: skip
+    warn(
+        f"{what} starts again at {named}{more} after the first of the {of}: the drive has {len(breaks) + 1} pieces, "
+        "which only closures relate to each other."
+    )
 
 
 _ARRAYS = {"stamp_ns": np.int64, "odom_from_body": np.float64, "covariance": np.float64, "breaks": np.int64}

@@ -159,7 +159,7 @@ def write(
 @step("report")
 def report(folder: Path, run: Run, written: Written, head: dict[str, Any], *, steps: Steps) -> dict[str, Any]:
     """Write report.html of the run in `folder`; the record for its run.json, but for the time that this step takes."""
-    warnings = run.log.warnings + steps.warnings
+    warnings = run.log.warnings + steps.warnings + steps.cache.problems
     record = {
         **head,
         **_results_record(run, head["settings"]["join"]["spacing"]),

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -14,6 +13,7 @@ from vplog import logs
 from vplog.data import Bytes, Ints, Keyframes, Reference
 from vplog.errors import LibraryError, SettingsError
 from vplog.execution.execution import Execution
+from vplog.execution.run_warnings import warn
 from vplog.features.extraction import extract_frames
 from vplog.geometry.masking import masked
 from vplog.places.coverage import (
@@ -46,9 +46,6 @@ if TYPE_CHECKING:
     from vplog.places import PlaceSettings
     from vplog.run.cache.feature_shards import Extracted
     from vplog.stages import Log, PlaceState
-
-
-_log = logging.getLogger(__name__)
 
 
 class Describing(Protocol):
@@ -149,7 +146,7 @@ def cover(
     library = index_words(references, WordSettings(), execution, own=False)
     coverage = measure_coverage(keyframes, features.__getitem__, library, execution)
     if doubt := coverage_warning(coverage, len(features), given, len(library)):
-        _log.warning(doubt)
+        warn(doubt)
     return coverage
 
 
@@ -159,12 +156,11 @@ def build_library(
     pipeline: Describing,
     topics: logs.TopicChoice | None = None,
     execution: Execution = Execution(),
-    warn: Callable[[str], object] = lambda _: None,
     *,
     force: bool = True,
 ) -> PlaceState:
     """`library_of_logs` of the logs at these paths, opened with the same topics."""
-    return library_of_logs([logs.open(path, topics) for path in paths], out, pipeline, execution, warn, force=force)
+    return library_of_logs([logs.open(path, topics) for path in paths], out, pipeline, execution, force=force)
 
 
 def library_of_logs(
@@ -172,13 +168,12 @@ def library_of_logs(
     out: Path,
     pipeline: Describing,
     execution: Execution = Execution(),
-    warn: Callable[[str], object] = lambda _: None,
     *,
     force: bool = True,
 ) -> PlaceState:
     """A library of frames of the logs: an equal share of each, or by coverage those that explain the frames of all.
 
-    `warn` gets what the logs warn of, once they are read. A library that `out` holds stays until the new one is whole;
+    The warnings of the logs are passed to `warn`. A library that `out` holds stays until the new one is whole;
     without `force` one with references of other logs is not replaced.
     Raises VplogError where that cannot be.
     """

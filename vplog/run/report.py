@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import pyarrow as pa
 
 from vplog.data import USED, Closures, Floats, Ints, Keyframes, Odometry, PoseGraph, Trajectory
 from vplog.errors import GraphError, ResultError
+from vplog.execution.run_warnings import warn
 from vplog.geometry import se3
 from vplog.results import mcap_read, tables
 from vplog.results.geo import Earth
@@ -33,8 +33,6 @@ from vplog.run.figures.run_figures import earth_of
 from vplog.run.questions import ask_ledger
 from vplog.storage.image_file import decode_image
 from vplog.storage.scratch import replacing
-
-_log = logging.getLogger(__name__)
 
 _QUESTIONS = 10
 _MOST_THUMBNAILS = 5000
@@ -113,7 +111,7 @@ def _questions(folder: Path, tracks: Tracks, closures: Closures) -> list[Closure
     try:
         graph, weight, _ = tables.read_edges(folder / "edges.parquet", tracks.world_from_body)
     except ResultError as error:
-        _log.warning("No questions are asked: %s", error)
+        warn(f"No questions are asked: {error}")
         return []
     return questions_of(graph, weight, closures)
 
@@ -123,7 +121,7 @@ def questions_of(graph: PoseGraph, weight: Floats, closures: Closures) -> list[C
     try:
         return ask_ledger(graph, weight, closures)[:_QUESTIONS]
     except (GraphError, ResultError) as error:
-        _log.warning("No questions are asked: %s", error)
+        warn(f"No questions are asked: {error}")
         return []
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from vplog.data import Camera, Frame
 from vplog.errors import LogError
 from vplog.execution.execution import Execution
+from vplog.execution.run_warnings import warn
 from vplog.geometry.masking import masked
 from vplog.run.cache.codecs import json_codec
 from vplog.run.cache.stage_cache import Inputs
@@ -20,7 +20,6 @@ from vplog.run.cache.steps import step
 from vplog.run.visual_odometry.self_calibration import EXCERPT, Lens, lens_of
 from vplog.stages import EncodedFrame, Log
 
-_log = logging.getLogger(__name__)
 _FOCAL_LENGTH = 1.2
 """Focal length of a camera that is not calibrated as a share of the longer side of its images, where they do not tell
 it: COLMAP's, a field of view of 45 degrees; phones have some 0.7 to 1.2."""
@@ -65,15 +64,17 @@ def self_calibrated(log: Log, inputs: Inputs, images: dict[str, Any], *, executi
     camera = log.camera()
     lens = lens_of(_excerpts(log, execution), camera)
     if lens is None:
-        _log.warning(
-            "Camera %s is not calibrated, and the motion of its images does not tell its focal length: %s",
-            camera.name, _about_assumed(camera),
-        )  # fmt: skip
+        warn(
+            f"Camera {camera.name} is not calibrated, and the motion of its images does not tell its focal length: "
+            f"{_about_assumed(camera)}"
+        )
         return assumed(camera)
-    _log.warning(
-        "Camera %s is not calibrated: by the motion of its images a focal length of %.0f px and a radial distortion of "
-        "%.3f are used, its centre in their middle. --calibration takes all from a file.", camera.name, *lens,
-    )  # fmt: skip
+    focal_px, distortion = lens
+    warn(
+        f"Camera {camera.name} is not calibrated: by the motion of its images a focal length of {focal_px:.0f} px and "
+        f"a radial distortion of {distortion:.3f} are used, its centre in their middle. --calibration takes all from a "
+        "file."
+    )
     return lens
 
 

@@ -22,6 +22,8 @@ _LOGS = (b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3\0", b"\x28\xb5\x2f\xf
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PICTURES = (b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"GIF8", b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51", b"\x1a\x45\xdf\xa3")
 """JPEG, TIFF, GIF, JPEG 2000 and Matroska."""
+_BLOCK_BYTES = 512
+"""Unit of `st_blocks` (POSIX sys/stat.h leaves it to the system: 512 on Linux and macOS)."""
 _BOXES, _RIFF = (b"ftyp", b"moov", b"mdat"), (b"AVI ", b"WEBP")
 """Second four bytes of an ISO base media file (MP4, QuickTime, AVIF, HEIC); third four of a RIFF file."""
 
@@ -51,6 +53,17 @@ def regular_files(folder: Path) -> Iterator[str]:
                     f"{folder / entry.name} is a {kind}, and maps, runs and libraries hold only files of their own. "
                     "Replace it with a copy of the file."
                 )
+
+
+def disk_bytes(folder: Path) -> int:
+    """Return the disk space that a folder and everything below it occupies, as `du` reports it: whole blocks, and each
+    file once however many names it has. Links are not followed. Files that are removed meanwhile are left out."""
+    blocks = dict[tuple[int, int], int]()
+    for path in [folder, *folder.rglob("*")]:
+        with suppress(FileNotFoundError):
+            found = path.lstat()
+            blocks[found.st_dev, found.st_ino] = found.st_blocks
+    return _BLOCK_BYTES * sum(blocks.values())
 
 
 def names_in(folder: Path) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -14,9 +14,9 @@ from vplog import logs
 from vplog.data import Closures, Floats, Gps, Keyframes, Trajectory
 from vplog.errors import ResultError, SettingsError, TruthError
 from vplog.evaluate import closures, trajectory
-from vplog.evaluate.body_truth import BodyTruth, body_truth
+from vplog.evaluate.body_truth import BodyTruth, TruthAt, body_truth
 from vplog.evaluate.closure_pose import pose_bounds
-from vplog.evaluate.truth import ate_to_gps, read_truth, truth_warnings
+from vplog.evaluate.truth import ate_to_gps, matched_fixes, read_truth, truth_warnings
 from vplog.geometry import se3
 from vplog.loops.propose import ProposeSettings, candidate_stops
 from vplog.results import mcap_read, run_record, tables
@@ -58,11 +58,27 @@ class TruthOptions(closures.PlaceCriterion):
 
 
 @dataclass(frozen=True, eq=False)
+class SharedTruth:
+    """The truth of a drive, as the comparison of several drives in one frame needs it."""
+
+    frame: str
+    """Name of the frame of the truth, equal for drives whose truths share it; empty if no other drive shares it."""
+    matched: trajectory.Matched
+    """The result and the truth at the same times."""
+    at_keyframes: TruthAt | None = None
+    """None for satellite fixes, which judge no closure."""
+    oriented: bool = False
+    cameras: Sequence[Floats] = ()
+    """body_from_camera (4, 4) of each camera."""
+
+
+@dataclass(frozen=True, eq=False)
 class RunEvaluation:
     """A run of one drive against a file of poses."""
 
     record: dict[str, Any]
     """The record that `evaluate` returns."""
+    shared: SharedTruth
     keyframes: Keyframes
     truth: BodyTruth
     judged: closures.Judgement
@@ -82,10 +98,24 @@ def evaluate(
     options = (options or TruthOptions()).of(record)
     if "maps" in record:
         return _joint(folder, record, truth, options)
+    return evaluate_drive(folder, record, truth, topics, options)[0]
+
+
+def evaluate_drive(
+    folder: Path, record: dict[str, Any], truth: str, topics: logs.TopicChoice | None, options: TruthOptions,
+    joint: Path | None = None,
+) -> tuple[dict[str, Any], SharedTruth]:  # fmt: skip
+    """Compare the run of one drive with a truth, and return the record of `evaluate`. `joint` is the folder with the
+    trajectory of the drive in the frame of a joint graph, which is then compared instead of the run's own. Raises as
+    `evaluate`."""
+    options = options.of(record)
     known = log_truth(record, topics, options) if truth == "auto" else None
     if isinstance(known, Trajectory) or truth not in ("gps", "auto"):
-        return evaluate_poses(folder, record, truth, options, known if isinstance(known, Trajectory) else None).record
-    return {"truth": truth, **_against_gps(folder, record, topics, options, known)}
+        poses = known if isinstance(known, Trajectory) else None
+        found = evaluate_poses(folder, record, truth, options, poses, joint)
+        return found.record, found.shared
+    account, matched = _against_gps(folder, record, topics, options, known, joint)
+    return {"truth": truth, **account}, SharedTruth("earth", matched)
 
 
 def figures_of(found: dict[str, Any]) -> dict[str, Any]:
@@ -129,12 +159,14 @@ def log_truth(record: dict[str, Any], topics: logs.TopicChoice | None, options: 
 
 
 def evaluate_poses(
-    folder: Path, record: dict[str, Any], truth: str, options: TruthOptions, known: Trajectory | None = None
-) -> RunEvaluation:
-    """A run of one drive against a TUM file, or the poses `known` that were read from it. Raises as `evaluate`."""
-    options = options.of(record)
+    folder: Path, record: dict[str, Any], truth: str, options: TruthOptions, known: Trajectory | None = None,
+    joint: Path | None = None,
+) -> RunEvaluation:  # fmt: skip
+    """A run of one drive against a TUM file, or the poses `known` that were read from it; `joint` as in
+    `evaluate_drive`. Raises as `evaluate`."""
+    options, frame = options.of(record), "" if truth == "auto" else truth
     known = _shifted(read_truth(truth), options) if known is None else known
-    after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
+    after, odometry = tables.read_trajectory((joint or folder) / "trajectory.parquet")
     scale, mount = 1.0, unit_camera(record)
     if mount is not None:
         path = Trajectory(after.stamp_ns, after.world_from_body @ mount)
@@ -176,7 +208,9 @@ def evaluate_poses(
     if record.get("gps") is None:  # with GPS they are relative to earth, where the truth need not be
         found["poses"] = asdict(closures.score_poses(keyframes, world_from_body, covariance, of_body))
     found["warnings"] = [*truth_warnings(found), *run_record.piece_warnings(record)]
-    return RunEvaluation(found, keyframes, of_body, judged)
+    matched = trajectory.matched_poses(trajectory.at_truth(after, known)[0], known)
+    shared = SharedTruth(frame, matched, of_body.at(keyframes.stamp_ns), of_body.oriented, cameras)
+    return RunEvaluation(found, shared, keyframes, of_body, judged)
 
 
 def _stretched(
@@ -257,7 +291,8 @@ def _joint(folder: Path, record: dict[str, Any], truth: str, options: TruthOptio
             maps.append({"drives": own, "ate_after": asdict(ate)})
     if not drives:
         raise TruthError(next(iter(uncovered.values()), f"{folder} holds no drive."))
-    joins = _joins(folder, drives, options)
+    shared = {name: drive.shared for name, drive in drives.items()}
+    joins = judge_joins(tables.read_joins(folder / "joins.parquet"), shared, options)
     return {"truth": shown(truth), "maps": maps, "joins": joins, "uncovered": uncovered}
 
 
@@ -272,15 +307,24 @@ def _check_apart_in_time(folder: Path, drives: dict[str, Keyframes]) -> None:
             )
 
 
-def _joins(folder: Path, drives: dict[str, RunEvaluation], place: closures.PlaceCriterion) -> list[dict[str, Any]]:
-    """The closures between each two drives, as those of one are judged."""
+def judge_joins(
+    ledgers: Mapping[tuple[str, str], Closures], drives: Mapping[str, SharedTruth], place: closures.PlaceCriterion
+) -> list[dict[str, Any]]:
+    """Judge the closures between drives whose truths share a frame, and return the counts of each pair of drives.
+
+    `ledgers` are by query and match drive. Pairs with a drive that is not in `drives`, or without poses as its truth,
+    are left out.
+    """
     found = []
-    for (later, earlier), ledger in tables.read_joins(folder / "joins.parquet").items():
-        if later in drives and earlier in drives:
-            query, match = (drives[name].truth.at(drives[name].keyframes.stamp_ns) for name in (later, earlier))
+    for (later, earlier), ledger in ledgers.items():
+        if later not in drives or earlier not in drives:
+            continue
+        ends = drives[later], drives[earlier]
+        query, match = ends[0].at_keyframes, ends[1].at_keyframes
+        if query is not None and match is not None:
             bounds = pose_bounds(*(at.world_from_body[at.known][:, :3, 3] for at in (query, match)))
-            oriented = drives[later].truth.oriented and drives[earlier].truth.oriented
-            cameras = _cameras(folder / later), _cameras(folder / earlier)
+            oriented = all(one.oriented for one in ends)
+            cameras = ends[0].cameras, ends[1].cameras
             judged = closures.judge_closures(ledger, query, match, bounds, place, cameras, oriented)
             counts = closures.count_closures(ledger, judged, place)
             found.append({"query_drive": later, "match_drive": earlier, **counts})
@@ -292,8 +336,10 @@ def _against_gps(
     record: dict[str, Any],
     topics: logs.TopicChoice | None,
     options: TruthOptions,
-    fixes: Gps | None = None,
-) -> dict[str, Any]:
+    fixes: Gps | None,
+    joint: Path | None,
+) -> tuple[dict[str, Any], trajectory.Matched]:
+    """Return the record of `evaluate`, and the result and the fixes at the same times."""
     if options != TruthOptions(align=options.align):
         raise TruthError(
             "--truth gps takes no --distance-m, --heading-deg or --truth-offset-s: fixes judge no closure and are in "
@@ -301,7 +347,7 @@ def _against_gps(
         )
     if options.align == "origin":
         raise TruthError("--truth gps takes no --align origin: fixes have no orientation. Choose se3 or sim3.")
-    after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
+    after, odometry = tables.read_trajectory((joint or folder) / "trajectory.parquet")
     fixes = reopened(record, None, recorded_topics(record, topics), _PUT_BACK).gps() if fixes is None else fixes
     if fixes is None or not len(fixes.stamp_ns):
         raise TruthError(f"{record.get('log')} has no GPS fixes. Give a truth file: --truth FILE.tum")
@@ -310,8 +356,10 @@ def _against_gps(
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
     in_run = record.get("gps") is not None or (record.get("topics") or {}).get("odometry") == "gps"
     warnings = [_OWN_FIXES] * in_run + run_record.piece_warnings(record)
+    matched = matched_fixes(after, fixes)
+    ate_after = trajectory.ate_together([matched], options.align)[0]
     return {
         "warnings": warnings,
         "ate_before": asdict(ate_to_gps(before, fixes, options.align)),
-        "ate_after": asdict(ate_to_gps(after, fixes, options.align)),
-    }
+        "ate_after": asdict(ate_after),
+    }, matched

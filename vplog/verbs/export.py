@@ -9,6 +9,7 @@ from typing import Any
 
 from vplog.errors import ResultError
 from vplog.execution.execution import Execution
+from vplog.execution.run_warnings import collect_warnings
 from vplog.geometry import tum
 from vplog.results import geo, poses, tables
 from vplog.results.foxglove_layout import foxglove_layout
@@ -42,10 +43,11 @@ def export(
     """
     record = read_single_run(folder)
     tracks = gather_tracks(folder, record)
-    written = [str(path)]
+    written, noted = [str(path)], list[str]()
     match kind:
         case _ if kind in FOLDERS:
-            written = export_images(folder, record, kind, path, log, execution)
+            with collect_warnings() as noted:
+                written = export_images(folder, record, kind, path, log, execution)
         case "tum":
             tum.write_tum(path, tracks.after)
         case "kitti":
@@ -76,7 +78,7 @@ def export(
                 stream.write(f"{json.dumps(tree, indent=2)}\n".encode())
         case _:
             raise ResultError(f"No format {kind!r}. Formats: {', '.join([*FORMATS, *FOLDERS])}.")
-    warnings = [*unit_warnings(record), *piece_warnings(record)]
+    warnings = [*unit_warnings(record), *piece_warnings(record), *noted]
     poses_written = len(tracks.after.stamp_ns)
     return {"run": str(folder), "format": kind, "written": written, "poses": poses_written, "warnings": warnings}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from dataclasses import dataclass, replace
 from glob import escape
@@ -16,6 +15,7 @@ import numpy as np
 from vplog import logs
 from vplog.data import Bytes, Camera, Features, Floats, Ints, Structure
 from vplog.execution.execution import Execution
+from vplog.execution.run_warnings import warn
 from vplog.features.extraction import describe
 from vplog.features.store import FeatureStore
 from vplog.geometry import se3
@@ -31,7 +31,6 @@ from vplog.storage.folders import check_regular, is_below
 from vplog.storage.scratch import files_in, scratch
 from vplog.version import __version__
 
-_log = logging.getLogger(__name__)
 _WRITERS = {"colmap": colmap.write_colmap, "nerfstudio": colmap.write_nerfstudio}
 FOLDERS = tuple(_WRITERS)
 """Formats that are a folder."""
@@ -100,7 +99,7 @@ def _cameras(folder: Path, record: dict[str, Any], topics: logs.TopicChoice, log
         other = reopened(record, log, topics.of_camera(topic))
         camera = recorded_camera(record, number)
         if camera.matrix is None:
-            _log.warning("Camera %s is not calibrated, so its pictures have no place and are left out.", camera.name)
+            warn(f"Camera {camera.name} is not calibrated, so its pictures have no place and are left out.")
             continue
         trajectory, _ = tables.read_trajectory(folder / "trajectory.parquet")
         row, pictures = camera_pictures(folder, number)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,14 @@ import pytest
 
 from tests.benchmarks.city import City, Cost, errors, undecided, with_join
 from vplog.maps.joining import components
-from vplog.maps.joining.joint_record import keyframe_poses, read_joint, recorded_components, write_joint
+from vplog.maps.joining.joint_record import (
+    count_between,
+    joint_ledgers,
+    keyframe_poses,
+    read_joint,
+    recorded_components,
+    write_joint,
+)
 from vplog.maps.storage.map_store import Store
 from vplog.pipeline import load_pipeline
 from vplog.results import tables
@@ -90,6 +98,9 @@ def test_a_drive_more_touches_no_other(city: City) -> None:
     for drive, known in poses.items():
         np.testing.assert_array_equal(keyframe_poses(store, joint, drive), known)
     assert errors(city, COUNT, 2)[1] < 3.0
+    ledgers = joint_ledgers(store, {one.folder.name for one in joint.values()})
+    assert Counter(found["between"]) == count_between(ledgers)
+    assert min(found["between"].values()) > 0
 
 
 def test_one_batch_or_two_or_a_killed_one_end_with_the_same_bytes(

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+import vplog
 from tests.maps.bucket import counting, serving
 from tests.maps.joining.test_join import LOGS, PIPELINE, joined, put
 from vplog.execution.execution import Execution
 from vplog.graph.joint import JoinSettings
+from vplog.maps.info import describe_map
 from vplog.maps.joining import candidate_drives
 from vplog.maps.joining import join as map_join
 from vplog.maps.joining.joint_record import joint_components, keyframe_poses
@@ -28,6 +30,8 @@ from vplog.storage.remote_path import located
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
+
+    from vplog.verbs.demo.record import Demo
 
 
 @pytest.fixture(scope="module")
@@ -64,9 +68,13 @@ def poses(root: Any) -> dict[str, Any]:
         return {drive: keyframe_poses(store, found, drive).tolist() for drive in store.drives()}
 
 
-def test_it_is_joined_as_in_a_folder(root: Any, whole: Path) -> None:
+def test_it_is_joined_as_in_a_folder(root: Any, whole: Path, drive: Demo) -> None:
     assert joined(root)["components"][0]["drives"] == ["after", "before"]
     assert poses(root) == poses(whole)
+    (there, here) = (vplog.evaluate(place, drive.truth) for place in (root, whole))
+    assert there["components"] == here["components"] != []
+    assert [one["between"] for one in there["drives"]] == [one["between"] for one in here["drives"]]
+    assert describe_map(root)["bytes"] > 0
     assert {name for name in rest(root) if name.startswith("joins/states-")} == {"joins/states-00000.json.gz"}
     with counting() as asked:
         told = joined(root)

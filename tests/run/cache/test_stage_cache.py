@@ -20,7 +20,7 @@ def test_no_flipped_bit_of_a_logs_identity_is_believed(tmp_path: Path) -> None:
     """The log has the name it had in the cache, or another that nothing is kept by."""
     file, cache, chance = tmp_path / "a.mcap", tmp_path / "cache", random.Random(5)
     file.write_bytes(b"a log")
-    with StageCache(cache, file, []) as stages:
+    with StageCache(cache, file) as stages:
         stages.store("extract-000000", "0" * 64, [], b"")
         stages.finish(["extract-000000.stage"])
     os.utime(file, ns=(0, 0))
@@ -41,6 +41,6 @@ def test_a_run_that_has_failed_does_not_read_its_log_to_the_end(tmp_path: Path) 
     with log.open("wb") as stream:
         stream.truncate(20 * 10**9)
     began = time.process_time()
-    with pytest.raises(LogError), StageCache(tmp_path / "cache", log, []):
+    with pytest.raises(LogError), StageCache(tmp_path / "cache", log):
         raise LogError("no odometry")
     assert time.process_time() - began < 2.0

@@ -27,7 +27,8 @@ from vplog.benchmark.study.score_charts import CHARTS
 from vplog.benchmark.traversals import candidate_stops
 from vplog.errors import ResultError, SettingsError, TruthError, nearest
 from vplog.evaluate.place_truth import PlaceTruth, TruthChoice, open_truth
-from vplog.execution.execution import Execution, logged_warnings
+from vplog.execution.execution import Execution
+from vplog.execution.run_warnings import collect_warnings
 from vplog.pipeline import Pipeline
 from vplog.places.vectors import VectorsSettings, vectors_files
 from vplog.results.run_record import is_ours, read_run_json, write_run_json
@@ -73,9 +74,8 @@ def study(
     recognisers = read_methods(options.methods, pipeline)
     chosen = _choose(options.only, len(drives), any(one.kind in KINDS_OF_BOXES for one in recognisers.values()))
     _check_drives(drives, min_gap)
-    warnings: list[str] = []
     with staged(out, lambda: _figures_in(out)) as made, ExitStack() as stack:
-        stack.enter_context(logged_warnings(warnings))
+        warnings = stack.enter_context(collect_warnings())
         opened = [logs.open(path, topics) for path in drives]
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=made)))
         names = short_names([log.name for log in opened])

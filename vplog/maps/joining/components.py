@@ -31,7 +31,7 @@ from vplog.maps.joining.drive_pairs import fetch_inputs
 from vplog.maps.joining.growth import Growth, LostPosesError
 from vplog.maps.joining.join_states import JoinState, PairState, write_states
 from vplog.maps.joining.joint_graph import pair_record, read_drive, solution_record, solve_drives, write_component
-from vplog.maps.joining.joint_record import is_whole, read_joint, write_joint
+from vplog.maps.joining.joint_record import count_between, is_whole, read_joint, write_joint
 from vplog.maps.joining.members import Member
 from vplog.maps.storage.damage import DamagedDriveError
 from vplog.maps.storage.map_store import Store
@@ -153,12 +153,13 @@ def solve_group(store: Store, group: Group, pipeline: Pipeline, library: str, go
     for members, refined in joined.solved.items():
         names = [group.drives[member] for member in members]
         folder = f"component={key_of({'group': group.key, 'drives': names})[:16]}"
-        components.append({"folder": folder, "drives": names})
+        inside = {pair: ledger for pair, ledger in ledgers.items() if set(pair) <= set(members)}
+        named = {(group.drives[later], group.drives[earlier]): one for (later, earlier), one in inside.items()}
+        components.append({"folder": folder, "drives": names, "between": count_between(named)})
         if is_whole(store, folder, names):  # of a join that was killed: it is the same
             continue
-        inside = {pair: ledger for pair, ledger in ledgers.items() if set(pair) <= set(members)}
         rows = [(drives[later].keyframes, drives[earlier].keyframes, one) for (later, earlier), one in inside.items()]
-        joins = [pair_record(group.drives[pair[0]], group.drives[pair[1]], one) for pair, one in inside.items()]
+        joins = [pair_record(*pair, one) for pair, one in named.items()]
         record = {**solution_record(names, joins, refined), "made_from": group.key}
         own = {name: drives[member] for name, member in zip(names, members, strict=True)}
         poses = {name: joined.world_from_body[member] for name, member in zip(names, members, strict=True)}

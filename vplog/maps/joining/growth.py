@@ -8,6 +8,7 @@ what they were: its entry in `judged`.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -23,7 +24,7 @@ from vplog.graph.joint import middle
 from vplog.graph.refine import Refined
 from vplog.maps.joining import joint_graph
 from vplog.maps.joining.joint_graph import SolvedDrive, verified, verified_closures, with_solve
-from vplog.maps.joining.joint_record import fetch_poses, is_whole
+from vplog.maps.joining.joint_record import count_between, fetch_poses, is_whole, joint_ledgers
 from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.layout import folder_name
 from vplog.maps.storage.map_store import Store
@@ -54,6 +55,8 @@ class Part:
     """Folder in MAP/joint of each drive, the one whose frame it is first; empty for one that is alone, in its own."""
     placed: set[str] = field(default_factory=set)
     """Drives that came or moved since the whole was solved."""
+    between: Counter[str] = field(default_factory=Counter)
+    """`count_between` of the component."""
 
     @property
     def record(self) -> dict[str, Any]:
@@ -61,7 +64,8 @@ class Part:
         rest = [folder for drive, folder in self.folders.items() if drive not in self.placed]
         grown = {drive: self.folders[drive] for drive in self.folders if drive in self.placed}
         main = rest[0] if rest else next(iter(self.folders.values()))
-        return {"folder": main, "drives": list(self.folders), **({"grown": grown} if grown else {})}
+        record = {"folder": main, "drives": list(self.folders), "between": dict(self.between)}
+        return record | ({"grown": grown} if grown else {})
 
 
 class Growth:
@@ -90,7 +94,7 @@ class Growth:
         for one in known:
             grown = one.get("grown", {})
             there = {drive: grown.get(drive, one["folder"]) for drive in one["drives"] if drive in left}
-            part = Part(there, set(grown) & set(there))
+            part = Part(there, set(grown) & set(there), Counter(one.get("between")))
             self._part |= dict.fromkeys(there, part)
             if there and len(there) < len(one["drives"]):  # what held the others together may be gone
                 self._solve(part)
@@ -147,8 +151,10 @@ class Growth:
                 continue
             for at, pair in enumerate(pairs):
                 ledgers[pair] = with_solve(found[pair], placed.weight[at], placed.residual[at])
+                home.between += count_between({pair: ledgers[pair]})
                 if at not in placed.apart:
                     self.apart.pop(pair, None)
+            home.between += part.between
             if not moved:
                 home.folders, home.placed = {**part.folders, drive: ""}, set(part.placed)
                 moved = {one: self._keyframes(one)[1] for one, folder in part.folders.items() if not folder}
@@ -209,15 +215,12 @@ class Growth:
             ledgers = {pair: one for pair, one in judged.items() if solved.keys() >= set(pair)}
             drives = {names[at]: own[at] for at in members}
             folder = self._write([made_from, inside], solved, drives, ledgers, joined.solved[members])
-            self._part |= dict.fromkeys(inside, Part(dict.fromkeys(inside, folder)))
+            self._part |= dict.fromkeys(inside, Part(dict.fromkeys(inside, folder), between=count_between(ledgers)))
 
     def _ledgers(self, part: Part) -> dict[tuple[str, str], Closures]:
         """The verified closures of all pairs of a component, as they were decided; of pairs whose drives were not in
         one component then, as rejected."""
-        found, folders = dict[tuple[str, str], "Closures"](), sorted({*part.folders.values()} - {""})
-        self._store.fetch_beside(f"joint/{folder}/joins.parquet" for folder in folders)
-        for folder in folders:
-            found |= tables.read_joins(self._store.root / "joint" / folder / "joins.parquet")
+        found = joint_ledgers(self._store, {*part.folders.values()} - {""})
         pairs = [pair for pair in self._pairs if pair[0] in part.folders and pair[1] in part.folders]
         known = {pair: found[pair] if pair in found else self._pairs[pair]() for pair in pairs}
         return {pair: one.rows(rows) for pair, one in known.items() if len(rows := verified(one))}

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, NotRequired
 
 from pydantic import TypeAdapter
 from typing_extensions import TypedDict  # as pydantic needs it below Python 3.12
 
-from vplog.data import Floats
+from vplog.data import Closures, Floats
 from vplog.errors import ResultError
 from vplog.maps.storage.damage import damaged_table, reading_drive
 from vplog.maps.storage.layout import Below, folder_name, write_changed
@@ -33,6 +34,8 @@ class _Component(TypedDict):
     drives: list[str]
     grown: NotRequired[dict[str, Below]]
     """Folders of the drives that came or moved since."""
+    between: NotRequired[dict[str, int]]
+    """`count_between`; an older vplog wrote none."""
 
 
 class _Group(TypedDict):
@@ -47,7 +50,8 @@ def read_joint(root: Path) -> dict[str, Any]:
     """joint.json as plain values; empty where nothing was joined yet. Raises ResultError where it is damaged.
 
     `groups` are the drives that verified closures join, each with the `components` that came of it (`folder` in
-    MAP/joint, `drives`, and `grown`: the folders of those that came since the whole was solved) and the pairs kept
+    MAP/joint, `drives`, `grown`: the folders of those that came since the whole was solved, and `between`: how many
+    closures each drive has with other drives) and the pairs kept
     `apart`; `alone` are the drives in no component, `apart` says of some why; `keys` are those that the drives of
     components had in their drive.json, `judged` those of what the closures of each drive were decided by.
     """
@@ -90,6 +94,37 @@ def components_in(store: Store) -> list[dict[str, Any]] | None:
     return groups and [component for group in groups for component in group["components"]]
 
 
+def joint_ledgers(store: Store, folders: Iterable[str]) -> dict[tuple[str, str], Closures]:
+    """Return the closures between drives of the components in these folders of MAP/joint, by query and match drive.
+    Raises ResultError if a table is damaged."""
+    names, found = [f"joint/{folder}/joins.parquet" for folder in sorted(folders)], dict[tuple[str, str], Closures]()
+    store.fetch_beside(names)
+    for name in names:
+        try:
+            found |= tables.read_joins(store.root / name)
+        except ResultError:
+            raise ResultError(f"{store}/{name} is damaged. Join the drives again: vplog map join {store}") from None
+    return found
+
+
+def count_between(ledgers: Mapping[tuple[str, str], Closures]) -> Counter[str]:
+    """Return how many accepted closures each drive has with other drives. Each closure counts for both of its ends."""
+    found = Counter[str]()
+    for pair, ledger in ledgers.items():
+        found.update(dict.fromkeys(pair, int(ledger.accepted.sum())))
+    return found
+
+
+def between_by_drive(components: Iterable[Mapping[str, Any]], drives: Iterable[str]) -> dict[str, int | None]:
+    """Return `count_between` of each drive by the components of joint.json, 0 for a drive in none, and None for a drive
+    in a component that an older vplog wrote."""
+    found: dict[str, int | None] = dict.fromkeys(drives, 0)
+    for component in components:
+        counts = component.get("between")
+        found |= {drive: None if counts is None else counts.get(drive, 0) for drive in component["drives"]}
+    return found
+
+
 def recorded_components(store: Store, without: Callable[[str], bool] = lambda _: False) -> dict[str, Component]:
     """The component of each drive as joint.json has them, `without` some drives. Raises ResultError where it is
     damaged."""
@@ -120,6 +155,18 @@ def keyframe_poses(store: Store, joint: Mapping[str, Component], drive: str) -> 
         return tables.read_keyframes(path)[1]
     except ResultError:
         raise ResultError(f"{path} is damaged. Join the drives again: vplog map join {store}") from None
+
+
+def joint_folder(store: Store, joint: Mapping[str, Component], drive: str) -> Path | None:
+    """Return the folder with the trajectory of a drive in the frame of its component, or None for a drive in none.
+    Raises ResultError if the trajectory is damaged."""
+    if drive not in joint:
+        return None
+    path = joint[drive].folder / folder_name(drive) / "trajectory.parquet"
+    store.fetch_beside([path.relative_to(store.root).as_posix()])
+    if damaged_table(path):
+        raise ResultError(f"{path} is damaged. Join the drives again: vplog map join {store}")
+    return path.parent
 
 
 def replaced_since(root: Path, drives: Mapping[str, Mapping[str, Any]]) -> list[str]:

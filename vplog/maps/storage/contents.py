@@ -22,7 +22,7 @@ from vplog.maps.storage.remote_map import Mirror
 from vplog.maps.storage.upload import send_rest, update_failures, write_head
 from vplog.results import run_record
 from vplog.results.geo import Earth
-from vplog.storage.folders import names_in, regular_files
+from vplog.storage.folders import disk_bytes, names_in, regular_files
 from vplog.storage.parquet_limits import check_version
 from vplog.version import __version__
 
@@ -102,6 +102,15 @@ class Store:
             return {name: about["bytes"] for name, about in self.mirror.drives[drive]["files"].items()}
         run = self.run(drive)
         return {name: (run / name).lstat().st_size for name in regular_files(run)}
+
+    def bytes_stored(self) -> int:
+        """Return the size of all files of the map: on disk with all hard links of a file counted once, as `du` has it,
+        or in an object store. Files of older versions in an object store are not counted."""
+        if self.mirror is None:
+            return disk_bytes(self.root)
+        now = self.mirror.manifest.now
+        groups = [*now["libraries"].values(), now["rest"], *(one["files"] for one in self.mirror.drives.values())]
+        return sum(about["bytes"] for files in groups for about in files.values())
 
     def damaged_files(self, drive: str) -> list[str]:
         """A line for each file of a drive that is not as it was written; of a map on a store, by what the store says of
@@ -317,7 +326,8 @@ class Store:
     def write_head(self, head: Head) -> None:
         """Write map.json, unless it holds that already."""
         if self.mirror is not None:
-            write_head(self.mirror, head.library, head.settings)
+            if not self.exists or self.head() != head:
+                write_head(self.mirror, head.library, head.settings)
             return
         record = {"format": FORMAT, "vplog": __version__, "library": head.library, "settings": head.settings}
         write_changed(self.root / "map.json", record)  # a finished map is not touched

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Self, TypeVar
 import numpy as np
 
 from vplog.errors import ResultError
+from vplog.execution.run_warnings import warn
 from vplog.results.run_record import read_run_json, write_run_json
 from vplog.settings import Settings
 from vplog.storage.input_hashes import hash_inputs, stat_signature
@@ -177,14 +178,13 @@ def _read_inputs(cache: Path) -> dict[str, Any]:
 class StageCache:
     """The results of one drive's stages, those of this run and those found."""
 
-    def __init__(self, folder: Path, drive: Path | Sequence[Path], warnings: list[str], keep: bool = True) -> None:
-        """`warnings` are those of the run.
-
-        What a stage adds to the warnings is repeated when its result is found. Without `keep` nothing is found, and
-        what has to be written is gone when the block ends. Raises ResultError where the folder cannot be made.
-        """
+    def __init__(self, folder: Path, drive: Path | Sequence[Path], keep: bool = True) -> None:
+        """Without `keep` nothing is found, and what has to be written is gone when the block ends. Raises ResultError
+        if the folder cannot be made."""
         self.folder, self.keep, self.drive = folder, keep, drive
-        self._warnings, self._used, self._disk_full = warnings, set[str](), False
+        self.problems: list[str] = []
+        """Warnings about the cache itself. They are not cached with the result of a stage."""
+        self._used, self._disk_full = set[str](), False
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -211,7 +211,8 @@ class StageCache:
         return self._hashes.result()
 
     def find(self, name: str, key: str, codec: Codec[T]) -> T:
-        """A result that an earlier run stored. Raises AbsentError where there is none that is whole."""
+        """Return a result that an earlier run stored, and repeat its warnings. Raises AbsentError if there is none that
+        is whole."""
         if not self.keep:
             raise AbsentError
         path = self.folder / file_name(name, key)
@@ -225,7 +226,8 @@ class StageCache:
         except Exception as error:  # whatever bytes do to a reader
             self.damaged(path, error)
             raise AbsentError from None
-        self._warnings += map(str, warnings)
+        for warning in warnings:
+            warn(str(warning))
         self._used.add(path.name)
         return value
 
@@ -237,7 +239,7 @@ class StageCache:
             self.put(file_name(name, key), sealed(key, json.dumps(warnings).encode() + b"\n" + content))
         except ResultError as error:
             self._disk_full = True
-            self._warnings.append(f"The results of the stages are not cached for another run. {error}")
+            self.problems.append(f"The results of the stages are not cached for another run. {error}")
 
     def put(self, name: str, data: bytes) -> Path:
         """Write a file as a whole. Raises ResultError."""
@@ -253,7 +255,7 @@ class StageCache:
     def damaged(self, path: Path, error: Exception) -> None:
         """Say that a file was found damaged and is not used."""
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        self._warnings.append(f"{path.name} in {self.folder} is not used, its stage runs again: {reason}.")
+        self.problems.append(f"{path.name} in {self.folder} is not used, its stage runs again: {reason}.")
 
     def _hash_inputs(self) -> dict[str, str]:
         """sha256 of the files of the drive, which are read unless it is known; a later run then knows it.
@@ -279,7 +281,7 @@ class StageCache:
         self.hashes()
         inputs, changed = self.inputs, stat_signature(self.drive) != self.inputs.signature
         if changed:
-            self._warnings.append("The log changed while it was read, so nothing is cached for another run.")
+            self.problems.append("The log changed while it was read, so nothing is cached for another run.")
             self.keep = False
         if self.keep:
             known = {

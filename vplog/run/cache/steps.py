@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, Self, TypeVar
 
 from vplog.execution.cores import limited
-from vplog.execution.execution import Execution, logged_warnings
+from vplog.execution.execution import Execution
+from vplog.execution.run_warnings import collect_warnings
 from vplog.execution.timing import StageTimer
 from vplog.run.cache.code_hash import code_of
 from vplog.run.cache.stage_cache import AbsentError, StageCache, digest_of
@@ -76,7 +77,7 @@ class Steps:
         """Results of the steps of `drive` are kept in `folder`. Raises ResultError where it cannot be made."""
         self.warnings: list[str] = []
         """Warnings of the run so far. What a cached step warned of is repeated when its result is found."""
-        self.cache = StageCache(folder, drive, self.warnings, use_cache)
+        self.cache = StageCache(folder, drive, use_cache)
         self._execution, self._watch = execution, StageTimer()
         self._results: dict[str, dict[str, Any]] = {}
         self._stack = ExitStack()
@@ -84,7 +85,7 @@ class Steps:
     def __enter__(self) -> Self:
         self._stack.enter_context(limited(self._execution.threads))
         self._stack.enter_context(self.cache)
-        self._stack.enter_context(logged_warnings(self.warnings))
+        self.warnings = self._stack.enter_context(collect_warnings())
         return self
 
     def __exit__(self, *error: Any) -> None:

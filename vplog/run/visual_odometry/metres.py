@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -11,10 +10,10 @@ import numpy as np
 from scipy import sparse
 
 from vplog.data import RECEIVER_SIGMA_M, SCALE_WANDER, Camera, Floats, Gps, Ints, Odometry
+from vplog.execution.run_warnings import warn
 from vplog.geometry import se3
 from vplog.geometry.geodesy import local_enu
 
-_log = logging.getLogger(__name__)
 _APART = 10.0
 """Sigmas of a fix between two that are compared: their distance then is known to a seventh."""
 _REACH = (1, 2, 4, 8)
@@ -80,11 +79,11 @@ def without_scale(odometry: Odometry, pieces: list[tuple[int, int]], what: str) 
         covariance[a + 1 : b, 3:, 3:] += (b - a) * _ANY_SCALE**2 * step[:, :, None] * step[:, None, :]
     since_s = (odometry.stamp_ns - odometry.stamp_ns[0]) / 1e9
     named = ", ".join(f"{since_s[a]:.1f} to {since_s[b - 1]:.1f} s" for a, b in pieces[:_NAMED])
-    _log.warning(
-        "Visual odometry has no %s by which to tell its scale in %d of its pieces (%s%s): that of the others is "
-        "assumed, and may be wrong there.",
-        what, len(pieces), named, ", ..." if len(pieces) > _NAMED else "",
-    )  # fmt: skip
+    more = ", ..." if len(pieces) > _NAMED else ""
+    warn(
+        f"Visual odometry has no {what} by which to tell its scale in {len(pieces)} of its pieces ({named}{more}): "
+        "that of the others is assumed, and may be wrong there."
+    )
     return replace(odometry, covariance=covariance)
 
 
