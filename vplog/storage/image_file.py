@@ -6,6 +6,7 @@ instead, and OpenCV is given only PNGs that libpng does not warn of.
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 import zlib as stored_zlib
@@ -36,17 +37,27 @@ _JPEG_SCAN, _JPEG_SEQUENTIAL = 0xDA, (0xC0, 0xC1)
 """Marker that a scan starts with, and those of frames whose samples are coded once: ITU T.81, table B.1."""
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Markers that a frame starts with: ITU T.81, table B.1."""
+_JPEG_ALONE = {0x00, 0x01, *range(0xD0, 0xDA)}
+"""Markers without a length: ITU T.81, B.1.1.3. None belongs between the start of the file and the first scan."""
 _JPEG_MARKER = struct.Struct(">BBHxHH")
 """A marker and the length behind it; where a frame starts its precision, height and width: ITU T.81, figure B.3."""
 _TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
-_TIFF_SIDES, _TIFF_SHORT = (256, 257), 3
-"""Tags of width and height, and the type of 16 bits: TIFF 6.0, section 2 and 3."""
+_TIFF_SHORT = 3
+"""Type of the numbers of 16 bits: TIFF 6.0, section 2."""
+_TIFF_WIDTHS, _TIFF_HEIGHTS, _TIFF_BITS = (256, 322), (257, 323), 258
+"""Tags of the size of the image and of the tiles that it is decoded in, and of the bits of a sample: TIFF 6.0, sections
+3 and 15."""
+_DECODED_SAMPLES = 4 * 5
+"""Samples in memory for each pixel that is decoded to grey and to colour, at most: four of a pixel, five times. The
+largest that was measured is 3.5 times (a PNG with alpha), and 4.7 times of 16-bit grey, whose levels are counted."""
 _SCAN_START, _MOST_SCANS = b"\xff\xda", 500
 """Start of a scan, which is nowhere within one; a progressive JPEG has ten, and each takes a pass over all blocks."""
 _SIMPLEJPEG_ERRORS = (ValueError, KeyError)
 """Exceptions of simplejpeg; a KeyError where the header names a sampling of colours that it does not know."""
 _PNM_HEAD = 4096
 """Bytes in which a PNM file must have named its size; comments may stand before it."""
+_PNM_SIZE = re.compile(rb"P[2356]\s+(?:#[^\r\n]*[\r\n]\s*)*(\d{1,9})\s+(?:#[^\r\n]*[\r\n]\s*)*(\d{1,9})\s")
+"""Width and height of a PNM file. A comment ends where OpenCV ends it: at a carriage return, too."""
 _PNG_SAMPLES = {0: (1, (1, 2, 4, 8, 16)), 2: (3, (8, 16)), 3: (1, (1, 2, 4, 8)), 4: (2, (8, 16)), 6: (4, (8, 16))}
 """Samples of a px and bits that each may have, by colour type: PNG 1.2, 4.1.1."""
 _PNG_PALETTE = 3
@@ -61,9 +72,13 @@ class BadImageError(ValueError):
     """Bytes that are no image, or no whole one; the message is the reason."""
 
 
-def decode_image(data: bytes | memoryview, unchanged: bool = False) -> Any:
-    """(H, W) grey of 8 bits, or of 16 where the file has as many. `unchanged`: (H, W) or (H, W, C) as OpenCV orders
-    colours. Raises BadImageError where the header's size is implausible or the pixels are not whole."""
+def decode_image(data: bytes | memoryview, unchanged: bool = False, least_px: int = MAX_PIXELS) -> Any:
+    """Return the pixels of an image file: (H, W) grey of 8 bits, or of 16 if the file has as many.
+
+    `unchanged`: (H, W) or (H, W, C) as OpenCV orders colours.
+    `least_px`: a JPEG is decoded at a reduced size that still has so many pixels: M/8 of its size, with 0 < M <= 4.
+    Raises BadImageError if the size in the header is implausible or the pixels are not whole.
+    """
     if data[:2] != JPEG:
         data = bytes(data)
     size = image_size(data)
@@ -73,7 +88,7 @@ def decode_image(data: bytes | memoryview, unchanged: bool = False) -> Any:
     if not 0 < size[0] * size[1] <= limit:
         raise BadImageError(f"{size[0]} x {size[1]} px are more than the {limit} that are read of {len(data)} bytes")
     if data[:2] == JPEG:
-        return _decode_jpeg(data, unchanged)
+        return _decode_jpeg(data, size, unchanged, least_px)
     if data[:8] == PNG:
         data = _checked_png(bytes(data))
     flags = cv2.IMREAD_UNCHANGED if unchanged else cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
@@ -103,8 +118,25 @@ def image_size(data: bytes | memoryview) -> tuple[int, int] | None:
         return abs(width), abs(height)  # rows from the top count negative
     if data[:4] in _TIFF_ORDERS:
         return _tiff_size(data)
-    found = re.match(rb"P[2356]\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s", data[:_PNM_HEAD])
+    found = _PNM_SIZE.match(data[:_PNM_HEAD])
     return (int(found[1]), int(found[2])) if found else None
+
+
+def decoding_bytes(data: bytes | memoryview, least_px: int = MAX_PIXELS) -> int:
+    """Return the largest memory in bytes that decoding an image file to grey and to colour takes, by its header.
+    Return 0 if it is no image. `least_px` as in `decode_image`."""
+    if (size := image_size(data)) is None:
+        return 0
+    decoded, sample, coefficients = size[0] * size[1], 1, 0
+    if data[:2] == JPEG:  # libjpeg keeps 16 bits of every coefficient of a JPEG of several scans
+        decoded, coefficients = min(decoded, max(4 * least_px, decoded // 64)), 2 * 4 * decoded
+    elif data[:8] == PNG:
+        sample = 1 + data[24] // 16
+    elif bytes(data[:4]) in _TIFF_ORDERS:
+        sample = -(-max(_tiff_tags(bytes(data)).get(_TIFF_BITS, 1), 8) // 8)
+    elif data[:1] == b"P":
+        sample = 2
+    return decoded * _DECODED_SAMPLES * sample + coefficients
 
 
 def is_lossy(data: bytes | memoryview) -> bool:
@@ -112,7 +144,7 @@ def is_lossy(data: bytes | memoryview) -> bool:
     return data[:2] == JPEG or (data[:4] == b"RIFF" and b"VP8L" not in bytes(data))
 
 
-def _decode_jpeg(data: bytes | memoryview, unchanged: bool) -> Any:
+def _decode_jpeg(data: bytes | memoryview, size: tuple[int, int], unchanged: bool, least_px: int) -> Any:
     marker, at = next((one for one in _jpeg_segments(data) if one[0] in _JPEG_FRAMES), (0, len(data) - 5))
     if marker not in _JPEG_SEQUENTIAL and bytes(data).count(_SCAN_START) > _MOST_SCANS:
         raise BadImageError(f"its JPEG has more than {_MOST_SCANS} scans")
@@ -120,15 +152,19 @@ def _decode_jpeg(data: bytes | memoryview, unchanged: bool) -> Any:
         raise BadImageError(f"its JPEG has {bits} bits a sample; write 8, or 16 as PNG")
     has_end = _has_end(data, at)
     data = data if has_end else bytes(data) + _JPEG_END
-    strict = not has_end  # a warning then means that samples are missing
+    share = math.sqrt(min(least_px / (size[0] * size[1]), 1.0))
+    how: dict[str, Any] = {
+        "strict": not has_end,  # a warning then means that samples are missing
+        "min_width": math.ceil(size[0] * share), "min_height": math.ceil(size[1] * share), "min_factor": 2,
+    }  # fmt: skip
     try:
-        if unchanged and simplejpeg.decode_jpeg_header(data, strict=strict)[2] != "Gray":
-            return simplejpeg.decode_jpeg(data, colorspace="BGR", strict=strict)
-        return simplejpeg.decode_jpeg(data, colorspace="GRAY", strict=strict)[:, :, 0]
+        if unchanged and simplejpeg.decode_jpeg_header(data, strict=not has_end)[2] != "Gray":
+            return simplejpeg.decode_jpeg(data, colorspace="BGR", **how)
+        return simplejpeg.decode_jpeg(data, colorspace="GRAY", **how)[:, :, 0]
     except _SIMPLEJPEG_ERRORS as error:
         reason = error
     try:  # four inks, which programs for print write inverted: their product is the colour
-        inks = simplejpeg.decode_jpeg(data, colorspace="CMYK", strict=strict)
+        inks = simplejpeg.decode_jpeg(data, colorspace="CMYK", **how)
     except _SIMPLEJPEG_ERRORS:
         raise BadImageError(f"its JPEG is damaged ({str(reason).rstrip('.')})") from None
     colours = cv2.multiply(inks[:, :, :3], cv2.merge([inks[:, :, 3]] * 3), scale=1 / 255)
@@ -218,17 +254,30 @@ def _webp_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _tiff_size(data: bytes) -> tuple[int, int] | None:
-    """By the first directory."""
-    order, sides = _TIFF_ORDERS[data[:4]], {}
-    if len(data) < 8:
+    """Return the size of the image, or of its tiles if these are larger."""
+    tags = _tiff_tags(data)
+    if not {_TIFF_WIDTHS[0], _TIFF_HEIGHTS[0]} <= tags.keys():
         return None
+    width, height = (max(tags.get(tag, 0) for tag in sides) for sides in (_TIFF_WIDTHS, _TIFF_HEIGHTS))
+    return width, height
+
+
+def _tiff_tags(data: bytes) -> dict[int, int]:
+    """Return the first number of each tag of the first directory, the largest of a tag that occurs several times."""
+    order, tags = _TIFF_ORDERS[data[:4]], dict[int, int]()
+    if len(data) < 8:
+        return tags
     (start,) = struct.unpack_from(order + "I", data, 4)
     count = int.from_bytes(data[start : start + 2], "little" if order == "<" else "big")
     for at in range(start + 2, min(start + 2 + 12 * count, len(data) - 11), 12):
-        tag, kind = struct.unpack_from(order + "HH", data, at)
-        (side,) = struct.unpack_from(order + ("H" if kind == _TIFF_SHORT else "I"), data, at + 8)
-        sides[tag] = max(side, sides.get(tag, 0))
-    return (sides[_TIFF_SIDES[0]], sides[_TIFF_SIDES[1]]) if sides.keys() >= set(_TIFF_SIDES) else None
+        tag, kind, numbers = struct.unpack_from(order + "HHI", data, at)
+        value = at + 8
+        if kind == _TIFF_SHORT and numbers > 2:  # then they stand elsewhere
+            (value,) = struct.unpack_from(order + "I", data, value)
+        if value + 4 <= len(data):
+            (number,) = struct.unpack_from(order + ("H" if kind == _TIFF_SHORT else "I"), data, value)
+            tags[tag] = max(number, tags.get(tag, 0))
+    return tags
 
 
 def _jpeg_segments(data: bytes | memoryview) -> Iterator[tuple[int, int]]:
@@ -236,7 +285,7 @@ def _jpeg_segments(data: bytes | memoryview) -> Iterator[tuple[int, int]]:
     position, last = 2, len(data) - _JPEG_MARKER.size
     while position <= last:
         begin, marker, length, _, _ = _JPEG_MARKER.unpack_from(data, position)
-        if begin != 0xFF:
+        if begin != 0xFF or marker in _JPEG_ALONE:
             return
         if marker == 0xFF:  # fill byte: ITU T.81, B.1.1.2
             position += 1
