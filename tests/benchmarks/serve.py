@@ -77,7 +77,7 @@ def hostile(folder: Path) -> Iterator[Figure]:
         "an MCAP file with six of them": _mcap(png, 6),
         "a PNG with a forged size of 64 x 64 px": png[:16] + _ihdr(64, 64) + png[33:],
         "a PNG with a forged size of 16,000 x 16,000 px": _large_png(64, 64, _ihdr(16_000, 16_000)),
-        "a PNG of 3,000 x 3,000 px": _large_png(3_000, 3_000),
+        "a PNG of 6,000 x 6,000 px": _large_png(6_000, 6_000),
     }
     for name, body in bodies.items():
         with _server(store.root) as (server, at):
@@ -152,7 +152,7 @@ def _large_png(width: int, height: int, header: bytes = b"") -> bytes:
 def _mcap(png: bytes, count: int) -> bytes:
     """A recording with this image so many times."""
     stream = io.BytesIO()
-    writer = mcap.writer.Writer(stream)
+    writer = mcap.writer.Writer(stream, compression=mcap.writer.CompressionType.NONE)
     writer.start()
     schema = writer.register_schema("sensor_msgs/msg/CompressedImage", "ros2msg", b"")
     channel = writer.register_channel("/camera/image/compressed", "cdr", schema)

@@ -11,9 +11,10 @@ from vplog.batch.plan import absolute_log
 from vplog.errors import TruthError, VplogError
 from vplog.maps.storage import map_store
 from vplog.results import run_record
-from vplog.storage.remote_path import located
+from vplog.run.provenance import UNNAMED, stored_log
+from vplog.storage.remote_path import is_elsewhere, located
 from vplog.storage.urls import shown
-from vplog.verbs.evaluate_run import TruthOptions, evaluate, figures_of
+from vplog.verbs.evaluate_run import AGAIN, TruthOptions, evaluate, figures_of
 
 _MEANS = ("ate_m", "recall")
 """Figures of which groups have the mean."""
@@ -32,7 +33,8 @@ def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None =
         drives = [{"drive": drive, **nothing, "error": why} for drive, why in sorted(store.damaged.items())]
         for drive, about in known.items():
             own = truth if named is None else named.get(about["log"]) or named.get(drive) or ""
-            own = about.get("truth", "auto") if own == "auto" else own
+            is_recorded = own == "auto" and "truth" in about
+            own = str(about["truth"]) if is_recorded else own
             row = {"drive": drive, "tags": about.get("tags", {}), "vplog": None, "truth": shown(own)}
             try:
                 folder = store.run(drive, [*map_store.RUN_TABLES, "result.mcap"])
@@ -40,7 +42,10 @@ def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None =
                 row["vplog"] = record.get("vplog")
                 if not own:
                     raise TruthError(f"{truth} names no truth of it.")
-                found = evaluate(folder, own, None, options, about["log"])
+                if is_recorded and is_elsewhere(own, str(root)):
+                    raise TruthError(f"Its truth {shown(own)} {UNNAMED}. Give it in a manifest: --truth FILE.csv")
+                known_log = stored_log(about["log"], str(root), "Its log", AGAIN) if own in ("gps", "auto") else None
+                found = evaluate(folder, own, None, options, known_log)
             except VplogError as error:
                 found = {"error": str(error)}
             noted = {name: found.get(name) for name in ("truth_is", "interpolated", "warnings")}

@@ -40,7 +40,8 @@ FIGURES = tuple(_FIGURES)
 """Names of the figures of a run against the truth."""
 _BESIDE = {"odometry_file", "calibration_file", "masks"}
 _OWN_FIXES = "The satellite fixes are in this run's trajectory: that it is near them says little of its error."
-_PUT_BACK = "Put it back there, or give a truth file: --truth FILE.tum."
+AGAIN = "Say where it is: --log LOG. Or give a truth file: --truth FILE.tum."
+"""How to give the log of a run again."""
 
 
 @dataclass(frozen=True)
@@ -69,23 +70,27 @@ class RunEvaluation:
 
 
 def evaluate(
-    folder: Path, truth: str, topics: logs.TopicChoice | None = None, options: TruthOptions | None = None, log: str = ""
+    folder: Path,
+    truth: str,
+    topics: logs.TopicChoice | None = None,
+    options: TruthOptions | None = None,
+    log: Path | None = None,
 ) -> dict[str, Any]:
     """ATE, RPE and drift of odometry and result, and which closures are right. `truth` is a TUM file, `gps`, or `auto`:
-    the ground truth that comes with the log, else its GPS. `log` is its path or URL where run.json's is not.
+    the ground truth that comes with the log, else its GPS. `log` takes the place of the log that run.json names.
 
     Of a joint run each drive by itself, each map as one trajectory, and the closures between drives.
 
     Raises TruthError or ResultError with one line.
     """
-    record = run_record.read_finished_run(folder) | ({"log": log} if log else {})
+    record = run_record.read_finished_run(folder)
     options = (options or TruthOptions()).of(record)
     if "maps" in record:
         return _joint(folder, record, truth, options)
-    known = log_truth(record, topics, options) if truth == "auto" else None
+    known = log_truth(folder, record, topics, options, log) if truth == "auto" else None
     if isinstance(known, Trajectory) or truth not in ("gps", "auto"):
         return evaluate_poses(folder, record, truth, options, known if isinstance(known, Trajectory) else None).record
-    return {"truth": truth, **_against_gps(folder, record, topics, options, known)}
+    return {"truth": truth, **_against_gps(folder, record, topics, options, log, known)}
 
 
 def figures_of(found: dict[str, Any]) -> dict[str, Any]:
@@ -118,13 +123,16 @@ def recorded_topics(record: dict[str, Any], topics: logs.TopicChoice | None) -> 
     return logs.TopicChoice.model_validate(known | given)
 
 
-def log_truth(record: dict[str, Any], topics: logs.TopicChoice | None, options: TruthOptions) -> Trajectory | Gps:
-    """The ground truth that comes with the log of a run, else its fixes. Raises TruthError where it has neither."""
-    log = reopened(record, None, recorded_topics(record, topics), _PUT_BACK)
-    found = log.truth()
-    found = log.gps() if found is None else _shifted(found, options) if isinstance(found, Trajectory) else found
+def log_truth(
+    folder: Path, record: dict[str, Any], topics: logs.TopicChoice | None, options: TruthOptions, log: Path | None
+) -> Trajectory | Gps:
+    """The ground truth that comes with the log of a run, or with `log` in its place, else its fixes. Raises TruthError
+    where it has neither."""
+    opened = reopened(folder, record, log, recorded_topics(record, topics), AGAIN)
+    found = opened.truth()
+    found = opened.gps() if found is None else _shifted(found, options) if isinstance(found, Trajectory) else found
     if found is None:
-        raise TruthError(f"{log.name} comes with no ground truth and no GPS fixes. Give a file: --truth FILE.tum")
+        raise TruthError(f"{opened.name} comes with no ground truth and no GPS fixes. Give a file: --truth FILE.tum")
     return found
 
 
@@ -292,7 +300,8 @@ def _against_gps(
     record: dict[str, Any],
     topics: logs.TopicChoice | None,
     options: TruthOptions,
-    fixes: Gps | None = None,
+    log: Path | None,
+    fixes: Gps | None,
 ) -> dict[str, Any]:
     if options != TruthOptions(align=options.align):
         raise TruthError(
@@ -302,7 +311,8 @@ def _against_gps(
     if options.align == "origin":
         raise TruthError("--truth gps takes no --align origin: fixes have no orientation. Choose se3 or sim3.")
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
-    fixes = reopened(record, None, recorded_topics(record, topics), _PUT_BACK).gps() if fixes is None else fixes
+    if fixes is None:
+        fixes = reopened(folder, record, log, recorded_topics(record, topics), AGAIN).gps()
     if fixes is None or not len(fixes.stamp_ns):
         raise TruthError(f"{record.get('log')} has no GPS fixes. Give a truth file: --truth FILE.tum")
     if (mount := unit_camera(record)) is not None:  # the antenna is taken to be at the camera, whose path has one unit
