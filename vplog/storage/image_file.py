@@ -64,6 +64,8 @@ _PNG_PALETTE = 3
 """The colour type whose px are numbers of colours in PLTE."""
 _ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
 """First column and row of each pass of an interlaced image, and its steps in x and y: PNG 1.2, 8.2."""
+_PIECE_BYTES = 2**24
+"""Bytes of a PNG's pixels that are unpacked at once."""
 _LAST_FILTER = 4
 """Paeth; every row begins with its filter: PNG 1.2, 6."""
 
@@ -193,9 +195,9 @@ def _png_size(data: bytes) -> tuple[int, int] | None:
     return struct.unpack_from(">II", data, 16) if kind == b"IEND" else None
 
 
-def _checked_png(data: bytes) -> bytes:
-    """The PNG with its pixels unpacked, in one IDAT of stored blocks, and with nothing beside them but its palette: not
-    the gamma and primaries. Raises BadImageError where libpng would find fault with it."""
+def _checked_png(data: bytes) -> bytearray:
+    """Return the PNG with its pixels unpacked, as stored blocks, and with nothing beside them but its palette: not the
+    gamma and primaries. Raises BadImageError if libpng would find fault with it. The pixels are in memory once."""
     view = memoryview(data)
     found: dict[bytes, list[memoryview]] = {b"IHDR": [], b"PLTE": [], b"IDAT": []}
     for kind, start, stop in _png_chunks(data):
@@ -210,35 +212,41 @@ def _checked_png(data: bytes) -> bytes:
     passes = _ADAM7 if interlaced else ((0, 0, 1, 1),)
     sizes = [(-(-max(width - x, 0) // dx), -(-max(height - y, 0) // dy)) for x, y, dx, dy in passes]
     rows = [(tall, 1 + -(-wide * samples * bits // 8)) for wide, tall in sizes if wide and tall]
-    parts = [PNG, view[8:33]]
+    checked = bytearray(PNG + data[8:33])
     if colour == _PNG_PALETTE:
         colours = b"".join(found[b"PLTE"])[: 3 << bits]
         if not colours or len(colours) % 3:
             raise BadImageError("its PNG has no whole palette")
-        parts.append(_png_chunk(b"PLTE", colours))
-    parts.append(_png_chunk(b"IDAT", stored_zlib.compress(_inflated(b"".join(found[b"IDAT"]), rows), 0)))
-    return b"".join([*parts, _png_chunk(b"IEND", b"")])
+        checked += _png_chunk(b"PLTE", colours)
+    packer = stored_zlib.compressobj(0)
+    for piece in _inflated(b"".join(found[b"IDAT"]), rows):
+        checked += _png_chunk(b"IDAT", packer.compress(piece))
+    checked += _png_chunk(b"IDAT", packer.flush()) + _png_chunk(b"IEND", b"")
+    return checked
 
 
 def _png_chunk(kind: bytes, data: bytes) -> bytes:
     return b"".join([struct.pack(">I", len(data)), kind, data, struct.pack(">I", zlib.crc32(data, zlib.crc32(kind)))])
 
 
-def _inflated(packed: bytes, rows: list[tuple[int, int]]) -> bytes:
-    """The rows of a zlib stream: for each pass how many, and how many bytes each; what more it holds is left out.
-    Raises BadImageError where it is not whole or a row has no filter that PNG knows."""
-    size, at = sum(count * length for count, length in rows), 0
-    try:
-        data = zlib.decompressobj().decompress(packed, size)
-    except zlib.error:  # pyrefly: ignore[not-a-type]
-        data = b""
-    for count, length in rows if len(data) == size else ():
-        if max(data[at : at + count * length : length]) > _LAST_FILTER:
-            break
-        at += count * length
-    if at != size:
-        raise BadImageError("the pixels of its PNG do not unpack to its size")
-    return data
+def _inflated(packed: bytes, rows: list[tuple[int, int]]) -> Iterator[bytes]:
+    """Unpack the rows of a zlib stream, piece by piece. `rows`: for each pass how many, and how many bytes each. What
+    more the stream holds is left out. Raises BadImageError if it is not whole or a row has no filter that PNG knows."""
+    unpacker, stops = zlib.decompressobj(), np.cumsum([count * length for count, length in rows]).tolist()
+    at, size = 0, stops[-1]
+    while at < size:
+        try:
+            piece = unpacker.decompress(packed, min(size - at, _PIECE_BYTES))
+        except zlib.error:  # pyrefly: ignore[not-a-type]
+            piece = b""
+        filters = [
+            piece[max(stop - count * length - at, (stop - at) % length) : max(stop - at, 0) : length]
+            for stop, (count, length) in zip(stops, rows, strict=True)
+        ]
+        if not piece or max(b"".join(filters), default=0) > _LAST_FILTER:
+            raise BadImageError("the pixels of its PNG do not unpack to its size")
+        packed, at = unpacker.unconsumed_tail, at + len(piece)
+        yield piece
 
 
 def _webp_size(data: bytes) -> tuple[int, int] | None:
