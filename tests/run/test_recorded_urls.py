@@ -16,7 +16,7 @@ from vplog.run.provenance import library_at, stored_log
 from vplog.storage import remote_path
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
     from pathlib import Path
 
     from conftest import Said
@@ -28,7 +28,7 @@ REFUSED = "on a server that the command does not name"
 
 
 @pytest.fixture
-def contacted(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+def contacted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Servers and buckets that were asked for something: none answers."""
     found = list[str]()
 

@@ -14,10 +14,11 @@ from vplog.results import run_record
 from vplog.run.provenance import UNNAMED, stored_log
 from vplog.storage.remote_path import is_elsewhere, located
 from vplog.storage.urls import shown
-from vplog.verbs.evaluate_run import AGAIN, TruthOptions, evaluate, figures_of
+from vplog.verbs.evaluate_run import TruthOptions, evaluate, figures_of
 
 _MEANS = ("ate_m", "recall")
 """Figures of which groups have the mean."""
+_AGAIN = "Give a truth file in a manifest: --truth FILE.csv. Or evaluate the drive by itself, with --log LOG."
 
 
 def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None = None) -> dict[str, Any]:
@@ -44,8 +45,10 @@ def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None =
                     raise TruthError(f"{truth} names no truth of it.")
                 if is_recorded and is_elsewhere(own, str(root)):
                     raise TruthError(f"Its truth {shown(own)} {UNNAMED}. Give it in a manifest: --truth FILE.csv")
-                known_log = stored_log(about["log"], str(root), "Its log", AGAIN) if own in ("gps", "auto") else None
-                found = evaluate(folder, own, None, options, known_log)
+                log = None
+                if own in ("gps", "auto"):
+                    log = stored_log(about["log"], str(root), "The log of the run", _AGAIN)
+                found = evaluate(folder, own, None, options, log)
             except VplogError as error:
                 found = {"error": str(error)}
             noted = {name: found.get(name) for name in ("truth_is", "interpolated", "warnings")}

@@ -91,12 +91,11 @@ def decode_image(data: bytes | memoryview, unchanged: bool = False, least_px: in
         raise BadImageError(f"{size[0]} x {size[1]} px are more than the {limit} that are read of {len(data)} bytes")
     if data[:2] == JPEG:
         return _decode_jpeg(data, size, unchanged, least_px)
-    if data[:8] == PNG:
-        data = _checked_png(bytes(data))
+    encoded = _checked_png(bytes(data)) if data[:8] == PNG else data
     flags = cv2.IMREAD_UNCHANGED if unchanged else cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
     try:
         # IGNORE_ORIENTATION: calibration and odometry belong to the sensor's own rows.
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+        image = cv2.imdecode(np.frombuffer(encoded, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         image = None
     if image is None:

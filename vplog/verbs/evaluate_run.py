@@ -40,8 +40,7 @@ FIGURES = tuple(_FIGURES)
 """Names of the figures of a run against the truth."""
 _BESIDE = {"odometry_file", "calibration_file", "masks"}
 _OWN_FIXES = "The satellite fixes are in this run's trajectory: that it is near them says little of its error."
-AGAIN = "Say where it is: --log LOG. Or give a truth file: --truth FILE.tum."
-"""How to give the log of a run again."""
+_AGAIN = "Say where it is: --log LOG. Or give a truth file: --truth FILE.tum."
 
 
 @dataclass(frozen=True)
@@ -124,11 +123,15 @@ def recorded_topics(record: dict[str, Any], topics: logs.TopicChoice | None) -> 
 
 
 def log_truth(
-    folder: Path, record: dict[str, Any], topics: logs.TopicChoice | None, options: TruthOptions, log: Path | None
+    folder: Path,
+    record: dict[str, Any],
+    topics: logs.TopicChoice | None,
+    options: TruthOptions,
+    log: Path | None = None,
 ) -> Trajectory | Gps:
     """The ground truth that comes with the log of a run, or with `log` in its place, else its fixes. Raises TruthError
     where it has neither."""
-    opened = reopened(folder, record, log, recorded_topics(record, topics), AGAIN)
+    opened = reopened(folder, record, log, recorded_topics(record, topics), _AGAIN)
     found = opened.truth()
     found = opened.gps() if found is None else _shifted(found, options) if isinstance(found, Trajectory) else found
     if found is None:
@@ -312,7 +315,7 @@ def _against_gps(
         raise TruthError("--truth gps takes no --align origin: fixes have no orientation. Choose se3 or sim3.")
     after, odometry = tables.read_trajectory(folder / "trajectory.parquet")
     if fixes is None:
-        fixes = reopened(folder, record, log, recorded_topics(record, topics), AGAIN).gps()
+        fixes = reopened(folder, record, log, recorded_topics(record, topics), _AGAIN).gps()
     if fixes is None or not len(fixes.stamp_ns):
         raise TruthError(f"{record.get('log')} has no GPS fixes. Give a truth file: --truth FILE.tum")
     if (mount := unit_camera(record)) is not None:  # the antenna is taken to be at the camera, whose path has one unit
