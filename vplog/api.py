@@ -226,8 +226,11 @@ class RunFolder:
         from vplog import logs
         from vplog.run.provenance import reopened
 
-        parts, again = _topics(self.record.get("topics") if topics is None else topics), "Name it: log=LOG."
-        opened = reopened(self.record, None, parts, again) if log is None else logs.open_drive(_paths(log), parts)
+        parts = _topics(self.record.get("topics") if topics is None else topics)
+        if log is not None:
+            opened = logs.open_drive(_paths(log), parts)
+        else:
+            opened = reopened(self.folder, self.record, None, parts, "Name it: log=LOG.")
         for frame in opened.frames(stamps):
             yield frame.stamp_ns, lambda frame=frame: frame.decode().image
 
@@ -272,6 +275,7 @@ def evaluate(
     align: str | None = None,
     truth_offset_s: float | None = None,
     topics: Topics | None = None,
+    log: Place | None = None,
 ) -> dict[str, Any]:
     """ATE, RPE and drift of a run before and after, and which of its closures are right; or of a map `drives`, a record
     of figures for each, and `groups`, their means by tag and version.
@@ -281,6 +285,7 @@ def evaluate(
     distance_m, heading_deg: bounds of one place; 6 m and 45 degrees unless given.
     align: alignment of the ATE, `se3`, `sim3` or `origin`; unless given `se3`, or `sim3` of a run without metres.
     truth_offset_s: added to the truth's stamps.
+    log: the log of the run, if it is not where run.json says, or is on a server.
     """
     from vplog.storage.remote_path import local_copy, located
     from vplog.verbs.evaluate_run import TruthOptions
@@ -294,9 +299,12 @@ def evaluate(
 
         if (chosen := _topics(topics)) is not None and chosen.model_dump(exclude_defaults=True):
             raise SettingsError("The drives of a map have topics of their own. Leave out the topics, or name a drive.")
+        if log is not None:
+            raise SettingsError("The drives of a map have logs of their own. Leave out the log, or name a drive.")
         return evaluate_map(place, os.fspath(truth), TruthOptions(**options))
     with local_copy(place) as folder:
-        return evaluate_run(folder, os.fspath(truth), _topics(topics), TruthOptions(**options))
+        chosen = None if log is None else located(log)
+        return evaluate_run(folder, os.fspath(truth), _topics(topics), TruthOptions(**options), chosen)
 
 
 def compare(

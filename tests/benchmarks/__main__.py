@@ -31,7 +31,7 @@ from tests.benchmarks.night import night
 from tests.benchmarks.reading import LARGE_GB, SMALL_GB, reading
 from tests.benchmarks.scale import scale
 from tests.benchmarks.search import free_memory_gb, growth, search
-from tests.benchmarks.serve import serve
+from tests.benchmarks.serve import hostile, serve
 from vplog.pipeline import load_pipeline, pipeline_folder
 from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
@@ -53,7 +53,7 @@ DISCOVERY_BAR = 1000.0
 SEARCH_BARS = (4.0, 40.0)
 """Times faster than a scan of binary codes, and of vectors of floats."""
 SIZES = (10_000, 100_000, 1_000_000, 10_000_000)
-LONG = {"large", "batch", "localize", "condense", "compaction", "ask", "serve", "city", "night"}
+LONG = {"large", "batch", "localize", "condense", "compaction", "ask", "serve", "hostile", "city", "night"}
 """What is measured where it is named."""
 LARGEST_NEEDS_GB = 12.0
 """Memory that must be free for the largest map: the places, the index, and what the system needs beside."""
@@ -86,6 +86,7 @@ def _arguments() -> argparse.Namespace:
         "growth",
         "scale",
         "serve",
+        "hostile",
         "graphs",
         "reading",
         "large",
@@ -170,6 +171,9 @@ def _long(arguments: argparse.Namespace) -> Iterator[Figure]:
     if "serve" in arguments.what:
         with tempfile.TemporaryDirectory() as made:
             yield from serve(arguments.places, arguments.folder or Path(made))
+    if "hostile" in arguments.what:
+        with tempfile.TemporaryDirectory() as made:
+            yield from hostile(Path(made))
     if "compaction" in arguments.what:
         yield from compaction()
     if "city" in arguments.what:

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import pytest
+import simplejpeg
 from PIL import Image
 
 from vplog import logs
-from vplog.storage.image_file import BadImageError, decode_image
+from vplog.storage.image_file import BadImageError, decode_image, decoding_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -239,3 +240,62 @@ def test_a_jpeg_of_thousands_of_scans_is_refused() -> None:
     scan = data.rindex(b"\xff\xda")
     with pytest.raises(BadImageError, match="more than 500 scans"):
         decode_image(data[:scan] + data[scan:-2] * 1000 + data[-2:])
+
+
+LARGE = cv2.resize(RNG.integers(0, 256, (12, 16, 3)).astype(np.uint8), (1601, 1203))
+
+
+@pytest.mark.parametrize("progressive", [0, 1])
+def test_a_jpeg_is_reduced_as_far_as_so_many_pixels_allow(progressive: int) -> None:
+    data = encoded(".jpg", LARGE, cv2.IMWRITE_JPEG_PROGRESSIVE, progressive)
+    whole = decode_image(data)
+    for least_px, eighths in ((10**7, 8), (10**6, 8), (400_000, 4), (260_000, 3), (10_000, 1), (1, 1)):
+        found = decode_image(data, least_px=least_px)
+        assert found.shape == (-(-1203 * eighths // 8), -(-1601 * eighths // 8))
+        assert decode_image(data, True, least_px).shape == (*found.shape, 3)
+        expected = cv2.resize(whole, found.shape[::-1], interpolation=cv2.INTER_AREA)
+        assert np.abs(found.astype(int) - expected).mean() < 2
+
+
+def test_the_memory_that_decoding_takes_is_known_by_the_header() -> None:
+    px = COLOUR.shape[0] * COLOUR.shape[1]
+    samples = {"png16": 2, "pgm": 2}
+    for name, data in FILES.items():
+        expected = 20 * px * samples.get(name, 1)
+        assert expected <= decoding_bytes(data) <= 1.4 * expected, name
+    rgba16 = encoded(".png", np.zeros((30, 40, 4), np.uint16))
+    assert decoding_bytes(rgba16) == 40 * 1200
+    assert decoding_bytes(encoded(".tiff", np.zeros((30, 40, 3), np.float64))) == 160 * 1200
+    assert decoding_bytes(b"no image") == 0
+    large = encoded(".jpg", LARGE)
+    assert decoding_bytes(large, 10_000) < decoding_bytes(large) / 2
+
+
+@pytest.mark.parametrize("marker", [0x00, 0x01, 0xD0, 0xD7])
+def test_a_jpeg_does_not_hide_its_size_behind_markers_without_a_length(marker: int) -> None:
+    """libjpeg passes over such a marker alone, and would find the frame in what seems to be its segment."""
+    large, small = encoded(".jpg", LARGE), FILES["jpeg"]
+    at, size = large.index(b"\xff\xc0"), 19
+    frame, hidden = large[at : at + size], small[small.index(b"\xff\xc0") :][:size]
+    comment = b"\xff\xfe" + struct.pack(">H", 2 + size)
+    seeming = bytes([0xFF, marker]) + struct.pack(">H", 2 + size + len(comment)) + frame + comment
+    forged = large[:at] + seeming + hidden + large[at + size :]
+    assert simplejpeg.decode_jpeg_header(forged, strict=False)[:2] == LARGE.shape[:2]
+    assert decoding_bytes(forged) in (0, decoding_bytes(large))
+
+
+def test_a_tiff_does_not_hide_its_size_in_its_tiles() -> None:
+    data = bytearray(by_pillow("TIFF", COLOUR))
+    before, start = decoding_bytes(bytes(data)), int.from_bytes(data[4:8], "little")
+    for number in range(int.from_bytes(data[start : start + 2], "little")):
+        at = start + 2 + 12 * number
+        if int.from_bytes(data[at : at + 2], "little") in (282, 278):  # a tag that is not needed
+            struct.pack_into("<HHII", data, at, 322, 4, 1, 100_000)
+            break
+    else:
+        pytest.fail("no tag to replace")
+    assert decoding_bytes(bytes(data)) == before * 100_000 // COLOUR.shape[1]
+
+
+def test_a_pnm_does_not_hide_its_size_in_a_comment() -> None:
+    assert decoding_bytes(b"P5 # a\r16000 16000\n1 1 255\n" + bytes(99)) == decoding_bytes(b"P5 16000 16000 255\n")

@@ -20,7 +20,7 @@ from vplog import logs
 from vplog.errors import LibraryError, LogError, ResultError, SettingsError
 from vplog.run.provenance import library_at, library_of
 from vplog.storage import remote_path
-from vplog.storage.remote_path import RemotePath, local_copy, local_output, located
+from vplog.storage.remote_path import RemotePath, local_copy, local_output, located, stands_for
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -227,7 +227,8 @@ def test_a_copy_is_known_by_what_it_is_of(bucket: str, tmp_path: Path) -> None:
     with local_copy(located(f"{bucket}/library")) as folder:
         assert library_of(folder) == f"{bucket}/library"
         assert library_of(tmp_path) == str(tmp_path)
-    with library_at(tmp_path / "run", {"library": {"from": f"{bucket}/library"}}) as library:
+    run, about = tmp_path / "run", {"library": {"from": f"{bucket}/library"}}
+    with stands_for(run, located(f"{bucket}/run")), library_at(run, about) as library:
         assert (library / "library.json").read_text() == "{}"
     with library_at(tmp_path / "run", {"library": {"from": str(tmp_path)}}) as library:
         assert library == tmp_path

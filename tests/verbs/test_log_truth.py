@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def test_the_truth_of_a_data_set_is_shifted_as_a_file_is(tmp_path: Path) -> None:
     stamps = kitti(tmp_path)
-    found = log_truth({"log": str(tmp_path)}, None, TruthOptions(truth_offset_s=1.5))
+    found = log_truth(tmp_path, {"log": str(tmp_path)}, None, TruthOptions(truth_offset_s=1.5))
     assert isinstance(found, Trajectory)
     np.testing.assert_array_equal(found.stamp_ns, stamps + 1_500_000_000)
     np.testing.assert_allclose(found.world_from_body, poses(), atol=1e-6)
@@ -28,11 +28,11 @@ def test_the_truth_of_a_data_set_is_shifted_as_a_file_is(tmp_path: Path) -> None
 
 def test_of_a_bag_it_is_the_topic_of_that_name_or_the_fixes(tmp_path: Path) -> None:
     messages = ros_messages(Drive(), 2)
-    fixes = log_truth({"log": str(write_ros2(tmp_path / "fixes", messages))}, None, TruthOptions())
+    fixes = log_truth(tmp_path, {"log": str(write_ros2(tmp_path / "fixes", messages))}, None, TruthOptions())
     assert isinstance(fixes, Gps)
     for one in messages:
         one.topic = "/ground_truth/odom" if one.topic == "/odom" else one.topic
-    found = log_truth({"log": str(write_ros2(tmp_path / "truth", messages))}, None, TruthOptions())
+    found = log_truth(tmp_path, {"log": str(write_ros2(tmp_path / "truth", messages))}, None, TruthOptions())
     assert isinstance(found, Trajectory)
     np.testing.assert_allclose(found.world_from_body[:, :3, 3], Drive().position, atol=1e-9)
 
@@ -41,9 +41,9 @@ def test_a_log_without_either_is_one_line(tmp_path: Path) -> None:
     messages = [one for one in ros_messages(Drive(), 2) if one.type != "sensor_msgs/msg/NavSatFix"]
     path = write_ros2(tmp_path / "drive", messages)
     with pytest.raises(TruthError, match="comes with no ground truth"):
-        log_truth({"log": str(path)}, None, TruthOptions())
+        log_truth(tmp_path, {"log": str(path)}, None, TruthOptions())
     with pytest.raises(LogError, match="no longer exists"):
-        log_truth({"log": str(tmp_path / "gone")}, None, TruthOptions())
+        log_truth(tmp_path, {"log": str(tmp_path / "gone")}, None, TruthOptions())
 
 
 def test_the_truth_of_a_log_is_read_with_the_topics_of_the_run() -> None:

@@ -23,7 +23,8 @@ from vplog.maps.joining.joint_record import (
 from vplog.maps.storage import map_store
 from vplog.maps.storage.map_store import Store
 from vplog.results import run_record
-from vplog.storage.remote_path import located
+from vplog.run.provenance import UNNAMED, stored_log
+from vplog.storage.remote_path import is_elsewhere, located
 from vplog.storage.urls import shown
 from vplog.verbs.evaluate_run import SharedTruth, TruthOptions, evaluate_drive, figures_of, judge_joins
 
@@ -33,6 +34,7 @@ _OTHER_TRUTH = (
 )
 _MEANS = ("ate_m", "recall")
 """Figures of which groups have the mean."""
+_AGAIN = "Give a truth file in a manifest: --truth FILE.csv. Or evaluate the drive by itself, with --log LOG."
 
 
 def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None = None) -> dict[str, Any]:
@@ -58,7 +60,8 @@ def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None =
         drives = [{"drive": drive, **nothing, "error": why} for drive, why in sorted(store.damaged.items())]
         for drive, about in known.items():
             own = truth if named is None else named.get(about["log"]) or named.get(drive) or ""
-            own = about.get("truth", "auto") if own == "auto" else own
+            is_recorded = own == "auto" and "truth" in about
+            own = str(about["truth"]) if is_recorded else own
             row = {"drive": drive, **nothing, "tags": about.get("tags", {}), "truth": shown(own)}
             row["between"] = between[drive]
             try:
@@ -67,9 +70,13 @@ def evaluate_map(root: Path, truth: str = "auto", options: TruthOptions | None =
                 row["vplog"] = record.get("vplog")
                 if not own:
                     raise TruthError(f"{truth} names no truth of it.")
+                if is_recorded and is_elsewhere(own, str(root)):
+                    raise TruthError(f"Its truth {shown(own)} {UNNAMED}. Give it in a manifest: --truth FILE.csv")
+                log = None
+                if own in ("gps", "auto"):
+                    log = stored_log(about["log"], str(root), "The log of the run", _AGAIN)
                 placed = joint_folder(store, joint, drive)
-                record |= {"log": about["log"]}
-                found, truths[drive] = evaluate_drive(folder, record, own, None, options, placed)
+                found, truths[drive] = evaluate_drive(folder, record, own, None, options, log, placed)
             except VplogError as error:
                 found = {"error": str(error)}
             noted = {name: found.get(name) for name in ("truth_is", "interpolated", "warnings")}

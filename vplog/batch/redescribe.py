@@ -58,9 +58,8 @@ def redescribe_map(
                 raise LogError(
                     f"The map has places of it, and no log. Add its log to the map first: vplog batch LOG -o {root}"
                 )
-            path = stored_log(
-                log, "Its log", f"Put it back, and give the same command again, or add it: vplog batch LOG -o {target}"
-            )
+            again = f"Put it back, and give the same command again, or add it: vplog batch LOG -o {target}"
+            path = stored_log(log, root, "Its log", again)
         except LogError as error:
             missing[drive] = DriveState(drive, log, "failed", error=str(error))
         else:

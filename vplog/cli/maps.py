@@ -14,6 +14,7 @@ from vplog.cli.parser import call, flag, option, place
 from vplog.cli.printing import print_result
 from vplog.cli.progress import Progress, one_stage
 from vplog.errors import ResultError, SettingsError, plural
+from vplog.execution.cores import limited
 from vplog.execution.execution import Execution
 
 Verb = Callable[[argparse.Namespace], None]
@@ -207,7 +208,8 @@ def serve_map(arguments: argparse.Namespace) -> None:
 
     limits = call(Limits, arguments)
     try:
-        serve(newest, arguments.host, arguments.port, limits, arguments.calibration, ready)
+        with limited(arguments.threads):
+            serve(newest, arguments.host, arguments.port, limits, arguments.calibration, ready)
     except OSError as error:
         where, why = f"{arguments.host}:{arguments.port}", os.strerror(error.errno) if error.errno else str(error)
         raise SettingsError(f"Cannot listen on {where}: {why}. Choose another --port or --host.") from None
@@ -251,7 +253,7 @@ def add_maps(
     _add_query(verb("query", query_map, "find where a log's views are in a map", topics, threads))
     sub = verb("index", index_map, "build the index that queries search", threads)
     parser.cache_options(sub, "what is read of a map by URL is kept")
-    _add_serve(verb("serve", serve_map, "answer queries and localisations over HTTP", threads))
+    _add_serve(verb("serve", serve_map, "answer queries and localisations over HTTP"))
     _add_export(verb("export", export_map, "the places of a map or of runs, in one file", of_map=False))
     sub = verb("merge", merge_maps, "copy drives of maps into another map", of_map=False)
     option(sub, "maps", place, "MAP|FILE.parquet", "maps, or places that `map export` wrote", nargs="+")
@@ -303,6 +305,8 @@ def _add_query(sub: argparse.ArgumentParser) -> None:
 def _add_serve(sub: argparse.ArgumentParser) -> None:
     option(sub, "--host", str, "ADDRESS", "address to listen on (default: 127.0.0.1)", default="127.0.0.1")
     option(sub, "--port", parser.at_least(0), "N", "port; 0: any free one (default: 8080)", default=8080)
+    text = "queries that are worked on at once, beside one localisation (default: 2)"
+    option(sub, "--threads", parser.at_least_one, "N", text, default=2)
     text = "requests that are open at once; more are refused with 503 (default: 64)"
     option(sub, "--waiting", parser.at_least_one, "N", text, default=64)
     option(sub, "--megabytes", parser.positive, "MB", "longest body of a request (default: 16)", default=16.0)

@@ -194,6 +194,7 @@ def add_results(
     option(sub, "place", place, "RUN|MAP")
     text = f"{_TRUTH} (default: auto); of a map also a manifest with a column truth"
     option(sub, "--truth", str, "FILE.tum|gps|auto", text, default="auto")
+    option(sub, "--log", place, "LOG", "the run's log, where it has moved since, for the truth that comes with it")
     text = "exit status 1 where a drive fails this, as 'ate_m>1' or 'recall<0.5'; repeatable"
     option(sub, "--fail-on", str, "LIMIT", text, action="append", default=[])
     _add_truth_options(sub)
@@ -207,7 +208,7 @@ def add_results(
     option(sub, "run", place, "RUN")
     option(sub, "--truth", str, "FILE.tum|gps|auto", _TRUTH)
     _add_truth_options(sub)
-    option(sub, "--log", place, "LOG", "log of the run, for pictures that result.mcap lacks")
+    option(sub, "--log", place, "LOG", "the run's log, for its truth, and for pictures that result.mcap lacks")
     option(sub, "-o --output", parser.output_file, "FILE.html", "page (default: RUN/report.html)")
     sub = add("diff", diff, topics)
     sub.set_defaults(refuse=sub.error)
@@ -224,7 +225,7 @@ def add_results(
     sub.add_argument("--format", required=True, choices=_FORMATS, help="format to write")
     text = "file to write, a folder for colmap and nerfstudio; - writes a file to stdout"
     option(sub, "-o --output", parser.output_or_stdout, "FILE|FOLDER|-", text, required=True)
-    option(sub, "--log", place, "LOG", "log of the run, for the pictures of colmap and nerfstudio, where it has moved")
+    option(sub, "--log", place, "LOG", "the run's log, where it has moved since")
     option(sub, "--truth", str, "FILE.tum|auto", "truth that rrd shows beside the solution")
     sub = add("open", open_run)
     option(sub, "run", place, "RUN")

@@ -55,7 +55,8 @@ def run_drive(
     from its log again. Raises VplogError where the log is gone."""
     _, keyframes = camera_pictures(folder, camera)
     topics = logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json")
-    log = reopened(record, None, topics.of_camera(camera_topics(record)[camera]) if camera else topics)
+    topics = topics.of_camera(camera_topics(record)[camera]) if camera else topics
+    log = reopened(folder, record, None, topics, f"Run it again with its cache: vplog run LOG -o {folder}")
     with ExitStack() as stack:
         features: Any = stored_features(folder / CACHE, camera)
         if features is None or not np.array_equal(features.stamp_ns, keyframes.stamp_ns):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,23 +18,32 @@ from vplog.settings import Settings
 from vplog.stages import Log
 from vplog.storage.input_hashes import bytes_of, files_of, stat_signature
 from vplog.storage.json_records import key_of
-from vplog.storage.remote_path import address, local_copy, located, original, reason
+from vplog.storage.remote_path import address, is_elsewhere, local_copy, located, original, reason
 from vplog.version import __version__
 
 OWN_LIBRARY = "the drive's own keyframes"
 """`library.from` of a run to which no library was given."""
 
+UNNAMED = "is on a server that the command does not name, and vplog contacts no other"
+"""Why what a record names is not opened."""
 _NO_QUERY = " URLs are kept without their query, which may hold a token."
 
 
-def stored_log(text: str, name: str, again: str) -> Path:
-    """The log at a path or URL of a record. Raises LogError, which begins with `name` and ends with how to give it
-    `again`, where it is gone or cannot be opened, as a signed link without its signature."""
+def stored_log(text: str, named: str | Path, name: str, again: str) -> Path:
+    """Return the log at a path or URL of a record. `named` is what the user named of it: the folder or map that has the
+    record, or the log itself.
+
+    Raises LogError, which begins with `name` and ends with how to give the log `again`, if it is gone, if it cannot be
+    opened, as a signed link without its signature, or if it is a URL on another server than `named`.
+    """
     path = located(text)
     try:
-        if path.exists():
+        if is_elsewhere(text, named):
+            why = UNNAMED
+        elif path.exists():
             return path
-        why = "no longer exists"
+        else:
+            why = "no longer exists"
     except OSError as error:
         why = f"cannot be opened ({reason(error)})"
     no_query = _NO_QUERY if text.startswith("http") else ""
@@ -42,17 +51,18 @@ def stored_log(text: str, name: str, again: str) -> Path:
 
 
 def reopened(
+    folder: Path,
     record: dict[str, Any],
     log: Path | None,
     topics: logs.TopicChoice | None,
     again: str = "Say where it is: --log LOG.",
 ) -> Log:
-    """The log of a run by its run.json, or the one given in its place. Raises LogError, with `again` as the remedy, or
-    ResultError where none is."""
+    """Return the log of the run in `folder` by its run.json, or the log given in its place. Raises LogError, with
+    `again` as the remedy, or ResultError if run.json names none."""
     if log is None and not isinstance(record.get("log"), str):
         raise ResultError("The run's run.json lacks log. Run `vplog run` again.")
     parts = record.get("parts") or [record.get("log")]
-    known = [log] if log is not None else [stored_log(str(part), "The log of the run", again) for part in parts]
+    known = [log] if log is not None else [stored_log(str(one), folder, "The log of the run", again) for one in parts]
     if log is not None and not log.exists():
         raise LogError(f"There is no log at {log}. {again}")
     return logs.open_drive(known, topics)
@@ -75,15 +85,28 @@ def logs_of(drives: Sequence[Path]) -> dict[str, Any]:
 
 @contextmanager
 def library_at(folder: Path, record: dict[str, Any]) -> Iterator[Path]:
-    """The library of a run by its run.json: in its folder, or where it is from. Raises LogError, LibraryError."""
+    """The library of a run by its run.json: in its folder if it has the run's hash, else where it is from. Raises
+    LogError, LibraryError."""
     library, about = folder / "library", record.get("library")
-    origin = about.get("from") if isinstance(about, dict) else None
-    if isinstance(origin, str) and origin != OWN_LIBRARY:  # one in the folder is that of a run before
+    origin, digest = (about.get("from"), about.get("hash")) if isinstance(about, dict) else (None, None)
+    there = (library / "library.json").is_file()
+    if isinstance(origin, str) and origin != OWN_LIBRARY and not (there and _library_hash(library) == digest):
+        if is_elsewhere(origin, folder):
+            raise LibraryError(f"The library of the run {origin} {UNNAMED}. Copy the library to {library}.")
         library = located(origin)
-    elif not (library / "library.json").is_file():
+    elif not there:
         raise LibraryError(f"{folder} has lost its library. Run `vplog run` again.")
     with local_copy(library) as here:
         yield here
+
+
+def _library_hash(folder: Path) -> str | None:
+    """Return the hash of a library; None if its record is damaged. One of a run before may be in a run folder."""
+    from vplog.places.library_files import read_library_record  # OpenCV loads here
+
+    with suppress(LibraryError):
+        return read_library_record(folder)["hash"]
+    return None
 
 
 def head(

@@ -192,8 +192,13 @@ def check_file(path: Path) -> None:
 
 
 def check_size(path: Path, file: pq.ParquetFile, columns: Collection[str] | None = None) -> None:
-    """Raises ValueError where the rows of a file, or some of its columns, would take more than it may hold: but for
-    texts, which count as numbers of a dictionary."""
+    """Raises ValueError where the rows of a file, or some of its columns, would take more than it may hold."""
+    _check(unpacked_bytes(file, columns), path)
+
+
+def unpacked_bytes(file: pq.ParquetFile, columns: Collection[str] | None = None) -> int:
+    """Return the memory in bytes that the rows of a file, or some of its columns, take by its footer. Texts count as
+    numbers of a dictionary."""
     about, leaves = file.metadata, list[tuple[int, bool, pq.ColumnSchema]]()
     chosen = {field.name: field.type for field in file.schema_arrow if columns is None or field.name in columns}
     width = sum(map(_row_bytes, chosen.values()))
@@ -215,7 +220,7 @@ def check_size(path: Path, file: pq.ParquetFile, columns: Collection[str] | None
             longest = chunk.total_uncompressed_size if leaf.physical_type == "BYTE_ARRAY" else leaf.length
             values += chunk.num_values * (4 if numbered else width_of or longest)
         needed += max(group.num_rows * width, values, stored)
-    _check(needed, path)
+    return needed
 
 
 def read_table(path: Path, file: pq.ParquetFile, columns: Collection[str] | None = None) -> pa.Table:

@@ -55,6 +55,20 @@ def located(text: str | Path | RemotePath) -> Path:
     return cast("Path", RemotePath(_checked(str(text), scheme)))
 
 
+def is_elsewhere(recorded: str, named: str | Path) -> bool:
+    """Return True if a record names a URL whose server, or bucket, is not that of the path or URL `named`.
+
+    A record may come from anyone. What it names is opened only if the user named the server in this command.
+    """
+    servers = [re.match("[a-z][a-z0-9+.-]*://[^/?#]*", text, re.IGNORECASE) for text in (recorded, _origin(named))]
+    recorded_on, named_on = (found and found[0].lower() for found in servers)
+    return recorded_on is not None and recorded_on != named_on
+
+
+def _origin(path: str | Path) -> str:
+    return path if isinstance(path, str) else str(original(path))
+
+
 def address(path: Path) -> str:
     """Text that opens a path in another process: a URL with its query, which is not to be stored or shown."""
     return path.url if isinstance(path, RemotePath) else str(path)

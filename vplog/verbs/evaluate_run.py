@@ -40,7 +40,7 @@ FIGURES = tuple(_FIGURES)
 """Names of the figures of a run against the truth."""
 _BESIDE = {"odometry_file", "calibration_file", "masks"}
 _OWN_FIXES = "The satellite fixes are in this run's trajectory: that it is near them says little of its error."
-_PUT_BACK = "Put it back there, or give a truth file: --truth FILE.tum."
+_AGAIN = "Say where it is: --log LOG. Or give a truth file: --truth FILE.tum."
 
 
 @dataclass(frozen=True)
@@ -85,36 +85,40 @@ class RunEvaluation:
 
 
 def evaluate(
-    folder: Path, truth: str, topics: logs.TopicChoice | None = None, options: TruthOptions | None = None, log: str = ""
+    folder: Path,
+    truth: str,
+    topics: logs.TopicChoice | None = None,
+    options: TruthOptions | None = None,
+    log: Path | None = None,
 ) -> dict[str, Any]:
     """ATE, RPE and drift of odometry and result, and which closures are right. `truth` is a TUM file, `gps`, or `auto`:
-    the ground truth that comes with the log, else its GPS. `log` is its path or URL where run.json's is not.
+    the ground truth that comes with the log, else its GPS. `log` takes the place of the log that run.json names.
 
     Of a joint run each drive by itself, each map as one trajectory, and the closures between drives.
 
     Raises TruthError or ResultError with one line.
     """
-    record = run_record.read_finished_run(folder) | ({"log": log} if log else {})
+    record = run_record.read_finished_run(folder)
     options = (options or TruthOptions()).of(record)
     if "maps" in record:
         return _joint(folder, record, truth, options)
-    return evaluate_drive(folder, record, truth, topics, options)[0]
+    return evaluate_drive(folder, record, truth, topics, options, log)[0]
 
 
 def evaluate_drive(
     folder: Path, record: dict[str, Any], truth: str, topics: logs.TopicChoice | None, options: TruthOptions,
-    joint: Path | None = None,
+    log: Path | None = None, joint: Path | None = None,
 ) -> tuple[dict[str, Any], SharedTruth]:  # fmt: skip
-    """Compare the run of one drive with a truth, and return the record of `evaluate`. `joint` is the folder with the
-    trajectory of the drive in the frame of a joint graph, which is then compared instead of the run's own. Raises as
-    `evaluate`."""
+    """Compare the run of one drive with a truth, and return the record of `evaluate`. `log` as in `evaluate`. `joint`
+    is the folder with the trajectory of the drive in the frame of a joint graph, which is then compared instead of the
+    run's own. Raises as `evaluate`."""
     options = options.of(record)
-    known = log_truth(record, topics, options) if truth == "auto" else None
+    known = log_truth(folder, record, topics, options, log) if truth == "auto" else None
     if isinstance(known, Trajectory) or truth not in ("gps", "auto"):
         poses = known if isinstance(known, Trajectory) else None
         found = evaluate_poses(folder, record, truth, options, poses, joint)
         return found.record, found.shared
-    account, matched = _against_gps(folder, record, topics, options, known, joint)
+    account, matched = _against_gps(folder, record, topics, options, log, known, joint)
     return {"truth": truth, **account}, SharedTruth("earth", matched)
 
 
@@ -148,13 +152,20 @@ def recorded_topics(record: dict[str, Any], topics: logs.TopicChoice | None) -> 
     return logs.TopicChoice.model_validate(known | given)
 
 
-def log_truth(record: dict[str, Any], topics: logs.TopicChoice | None, options: TruthOptions) -> Trajectory | Gps:
-    """The ground truth that comes with the log of a run, else its fixes. Raises TruthError where it has neither."""
-    log = reopened(record, None, recorded_topics(record, topics), _PUT_BACK)
-    found = log.truth()
-    found = log.gps() if found is None else _shifted(found, options) if isinstance(found, Trajectory) else found
+def log_truth(
+    folder: Path,
+    record: dict[str, Any],
+    topics: logs.TopicChoice | None,
+    options: TruthOptions,
+    log: Path | None = None,
+) -> Trajectory | Gps:
+    """The ground truth that comes with the log of a run, or with `log` in its place, else its fixes. Raises TruthError
+    where it has neither."""
+    opened = reopened(folder, record, log, recorded_topics(record, topics), _AGAIN)
+    found = opened.truth()
+    found = opened.gps() if found is None else _shifted(found, options) if isinstance(found, Trajectory) else found
     if found is None:
-        raise TruthError(f"{log.name} comes with no ground truth and no GPS fixes. Give a file: --truth FILE.tum")
+        raise TruthError(f"{opened.name} comes with no ground truth and no GPS fixes. Give a file: --truth FILE.tum")
     return found
 
 
@@ -336,6 +347,7 @@ def _against_gps(
     record: dict[str, Any],
     topics: logs.TopicChoice | None,
     options: TruthOptions,
+    log: Path | None,
     fixes: Gps | None,
     joint: Path | None,
 ) -> tuple[dict[str, Any], trajectory.Matched]:
@@ -348,7 +360,8 @@ def _against_gps(
     if options.align == "origin":
         raise TruthError("--truth gps takes no --align origin: fixes have no orientation. Choose se3 or sim3.")
     after, odometry = tables.read_trajectory((joint or folder) / "trajectory.parquet")
-    fixes = reopened(record, None, recorded_topics(record, topics), _PUT_BACK).gps() if fixes is None else fixes
+    if fixes is None:
+        fixes = reopened(folder, record, log, recorded_topics(record, topics), _AGAIN).gps()
     if fixes is None or not len(fixes.stamp_ns):
         raise TruthError(f"{record.get('log')} has no GPS fixes. Give a truth file: --truth FILE.tum")
     if (mount := unit_camera(record)) is not None:  # the antenna is taken to be at the camera, whose path has one unit

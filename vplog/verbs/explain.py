@@ -58,7 +58,7 @@ def explain(
     shown = None
     if not words_only:
         topics = logs.TopicChoice.read(record.get("topics") or {}, f"{folder}/run.json")
-        opened = _Opened(folder, record, pipeline, log, reopened(record, log, topics))
+        opened = _Opened(folder, record, pipeline, log, reopened(folder, record, log, topics))
         view = _view(number, row, explanation, opened)
         file = picture or folder / f"closure-{number}.png"
         draw(file, view)
@@ -129,7 +129,7 @@ def _picture(end: str, row: dict[str, Any], opened: _Opened) -> tuple[Bytes, Fea
         if not 0 < number < len(names) or names[number] not in log.further_cameras():
             raise ResultError(f"{log.name} has no camera {number} of the run: {otherwise}")
         topics = logs.TopicChoice.read(opened.record.get("topics") or {}, f"{opened.folder}/run.json")
-        log = reopened(opened.record, opened.path, topics.of_camera(str(names[number])))
+        log = reopened(opened.folder, opened.record, opened.path, topics.of_camera(str(names[number])))
         stamps = log.stamps()
         stamp_ns = stamps[[np.abs(stamps - stamp_ns).argmin()]]
     [(image, features)] = frames_at(log, stamp_ns, opened.pipeline, otherwise)

@@ -38,8 +38,8 @@ def export(
 ) -> dict[str, Any]:
     """Write the run in `folder` as one of `FORMATS` or `FOLDERS`; what was written. Raises VplogError.
 
-    The pictures of a folder are those of the run's log, or of `log` where that has moved. `truth` is a TUM file or
-    `auto`, which an rrd shows beside the solution.
+    The pictures of a folder are those of the run's log, or of `log` in its place. `truth` is a TUM file or `auto`, the
+    truth that comes with the log, which an rrd shows beside the solution.
     """
     record = read_single_run(folder)
     tracks = gather_tracks(folder, record)
@@ -68,7 +68,7 @@ def export(
             geo.write_geoparquet(path, tracks.after, _earth(folder, kind, tracks), header)
         case "rrd":
             closures = tables.read_closures(folder / "closures.parquet")
-            judged = judge(folder, record, truth, None, TruthOptions()) if truth is not None else None
+            judged = judge(folder, record, truth, None, TruthOptions(), log) if truth is not None else None
             if judged is not None and judged.path is None:
                 raise ResultError("The log's truth is its fixes alone, which rrd does not show. Give --truth FILE.tum.")
             write_rrd(path, tracks, closures, folder / "result.mcap", judged)

@@ -91,12 +91,12 @@ def _cameras(folder: Path, record: dict[str, Any], topics: logs.TopicChoice, log
     """The cameras of a run: the first by the poses of the keyframes, the others that are calibrated by the trajectory
     at their stamps."""
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
-    drive, names = reopened(record, log, topics), record.get("cameras") or []
+    drive, names = reopened(folder, record, log, topics), record.get("cameras") or []
     first, several = recorded_camera(record, 0), len(names) > 1
     poses, rows = world_from_body @ first.body_from_camera, np.arange(len(keyframes.stamp_ns))
     found = [_PosedCamera(0, drive, first, _folder(first.name) if several else "", rows, keyframes.stamp_ns, poses)]
     for number, topic in enumerate(names[1:], 1):
-        other = reopened(record, log, topics.of_camera(topic))
+        other = reopened(folder, record, log, topics.of_camera(topic))
         camera = recorded_camera(record, number)
         if camera.matrix is None:
             warn(f"Camera {camera.name} is not calibrated, so its pictures have no place and are left out.")

@@ -41,8 +41,8 @@ def report(
 ) -> dict[str, Any]:
     """Write report.html of the run in `folder`, to `path` where given; what was written.
 
-    `truth` is a TUM file, `gps` or `auto`, and `options` how it is used, as in `evaluate`; `log` the drive, read again
-    where result.mcap has no pictures of closures.
+    `truth` is a TUM file, `gps` or `auto`, and `options` how it is used, as in `evaluate`. `log` takes the place of the
+    log that run.json names. It is read for a truth that comes with it, and if result.mcap has no pictures of closures.
     Raises VplogError with one line.
     """
     record = run_record.read_single_run(folder)
@@ -51,7 +51,7 @@ def report(
     options = options or TruthOptions()
     if truth is None and options != TruthOptions():
         raise TruthError("--distance-m, --heading-deg, --align and --truth-offset-s need a truth: give --truth.")
-    judged = judge(folder, record, truth, topics, options) if truth is not None else None
+    judged = judge(folder, record, truth, topics, options, log) if truth is not None else None
     pictures = None
     if log is not None and not mcap_read.read_pictures(folder / "result.mcap").views:
         pictures = pictures_from(log, folder, record, execution)
@@ -60,12 +60,17 @@ def report(
 
 
 def judge(
-    folder: Path, record: dict[str, Any], truth: str, topics: logs.TopicChoice | None, options: TruthOptions
+    folder: Path,
+    record: dict[str, Any],
+    truth: str,
+    topics: logs.TopicChoice | None,
+    options: TruthOptions,
+    log: Path | None = None,
 ) -> TruthComparison:
     """The run against a TUM file or the log's own GPS. Raises TruthError or ResultError."""
-    known = log_truth(record, topics, options) if truth == "auto" else None
+    known = log_truth(folder, record, topics, options, log) if truth == "auto" else None
     if truth == "gps" or isinstance(known, Gps):
-        found = evaluate(folder, truth, topics, options)
+        found = evaluate(folder, truth, topics, options, log)
         return TruthComparison(truth, found, found["warnings"])
     found = evaluate_poses(folder, record, truth, options, known)
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")

@@ -15,9 +15,9 @@ from vplog.results import run_record
 from vplog.results.run_record import CACHE, REQUEST, recorded
 from vplog.results.staging import recover
 from vplog.run.cache.stage_cache import inputs_of, key_of
-from vplog.run.provenance import OWN_LIBRARY, stat_of, stored_log
+from vplog.run.provenance import OWN_LIBRARY, UNNAMED, stat_of, stored_log
 from vplog.storage.folders import check_regular
-from vplog.storage.remote_path import located
+from vplog.storage.remote_path import is_elsewhere, located
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def resume_request(out: Path, given: Sequence[Path] = ()) -> ResumeRequest:
     paths = sorted(given, key=lambda path: _place(known, path))  # a URL that is given has its query
     if not given:
         again = f"Give it again: vplog run --resume LOG -o {out}"
-        paths = [stored_log(text, f"The log of the run in {out}", again) for text in known]
+        paths = [stored_log(text, out, f"The log of the run in {out}", again) for text in known]
     if sorted(str(path.resolve()) for path in paths) != sorted(known):
         raise SettingsError(
             f"The run in {out} is of {' '.join(known)}, not of {given[0]}. Leave out the log, or choose another -o."
@@ -60,6 +60,11 @@ def resume_request(out: Path, given: Sequence[Path] = ()) -> ResumeRequest:
     where = str(file)
     pipeline = Pipeline.read(recorded(account, file, dict, "settings"), where)
     library = recorded(account, file, str, "library", "from")
+    if is_elsewhere(library, out):
+        raise SettingsError(
+            f"The library of the run in {out} {library} {UNNAMED}. Start the run again, its finished stages are kept: "
+            f"vplog run LOG -o {out} --library {library}"
+        )
     return ResumeRequest(
         paths,
         "logs" in account,

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
+import socket
+import struct
 import threading
 import time
+import zlib
 from contextlib import contextmanager
 from http.client import HTTPConnection
 from typing import TYPE_CHECKING, Any
@@ -16,8 +20,11 @@ import pytest
 
 import vplog
 from tests.maps.runs import map_of_run, put_rows
+from tests.storage.test_image_file import chunk
+from vplog.data import Frame
 from vplog.errors import ResultError, SettingsError
 from vplog.execution.execution import Execution
+from vplog.logs.messages import pixels
 from vplog.maps import geo_bounds
 from vplog.maps.localization.places import opened as opened_places
 from vplog.maps.service import http, open_state
@@ -35,8 +42,8 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def served(root: Path, **limits: Any) -> Iterator[tuple[NewestState, Callable[..., tuple[int, dict[str, Any]]]]]:
-    """The open state, and what asks the service; its server ends with the process."""
+def listening(root: Path, **limits: Any) -> Iterator[tuple[NewestState, str]]:
+    """The open state, and host and port of its server, which ends with the process."""
     newest, where = NewestState(root, None, Execution()), list[str]()
     ready = threading.Event()
 
@@ -48,16 +55,23 @@ def served(root: Path, **limits: Any) -> Iterator[tuple[NewestState, Callable[..
         target=http.serve, args=(newest, "127.0.0.1", 0, http.Limits(**limits), None, told), daemon=True
     ).start()
     assert ready.wait(30)
+    yield newest, where[0]
 
-    def ask(path: str, body: bytes | None = None, idle: list[HTTPConnection] | None = None) -> tuple[int, Any]:
-        connection = HTTPConnection(where[0], timeout=60)
-        if idle is not None:
-            idle.append(connection)  # which stays open
-        connection.request("GET" if body is None else "POST", path, body)
-        answer = connection.getresponse()
-        return answer.status, json.loads(answer.read())
 
-    yield newest, ask
+@contextmanager
+def served(root: Path, **limits: Any) -> Iterator[tuple[NewestState, Callable[..., tuple[int, dict[str, Any]]]]]:
+    """The open state, and what asks the service."""
+    with listening(root, **limits) as (newest, at):
+
+        def ask(path: str, body: bytes | None = None, idle: list[HTTPConnection] | None = None) -> tuple[int, Any]:
+            connection = HTTPConnection(at, timeout=60)
+            if idle is not None:
+                idle.append(connection)  # which stays open
+            connection.request("GET" if body is None else "POST", path, body)
+            answer = connection.getresponse()
+            return answer.status, json.loads(answer.read())
+
+        yield newest, ask
 
 
 @pytest.fixture(scope="module")
@@ -160,8 +174,141 @@ def test_requests_are_bounded_and_told_why(root: Path, finished: Path) -> None:
         assert (status, told["detail"]) == (400, "The body is neither an image nor a descriptors.parquet.")
         assert ask("/query?near=1,2", b"x")[0] == 422
         image = cv2.imencode(".png", np.zeros((48, 64), np.uint8))[1].tobytes()
-        assert ask("/query?drive=nowhere", image)[1]["detail"].startswith(f"{root} has no drive 'nowhere'.")
-        assert ask("/localize?fx=100", image)[0] == 400
+        assert ask("/query?drive=nowhere", image)[1]["detail"].startswith(f"{root.name} has no drive 'nowhere'.")
+        for intrinsics in ("fx=100", *(f"fx={fx}&fy=100&cx=32&cy=24" for fx in ("0", "-1", "nan", "inf"))):
+            assert ask(f"/localize?{intrinsics}", image)[0] == 400
+        assert ask("/redoc")[0] == ask("/docs")[0] == 404
+
+
+def large_png(width: int, height: int) -> bytes:
+    """An RGBA image of zeros, without being in memory."""
+    packer = zlib.compressobj()
+    pixels = b"".join([packer.compress(bytes(1 + 4 * width)) for _ in range(height)] + [packer.flush()])
+    head = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+
+
+def test_images_that_are_large_in_memory_are_refused_by_their_header(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded = list[int]()
+    monkeypatch.setattr(pixels, "decode_image", lambda data, *_: decoded.append(len(data)))
+    with served(root) as (_, ask):
+        for path in ("/query", "/localize?fx=100&fy=100&cx=32&cy=24"):
+            status, told = ask(path, large_png(16_000, 16_000))
+            assert (status, decoded) == (413, [])
+            assert "5120 MB" in told["detail"]
+            assert "768 MB" in told["detail"]
+
+
+def test_requests_wait_for_the_memory_that_others_decode_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of these images takes 0.8 MB, and only two of them may be decoded at once."""
+    at_once, most, lock = [0], [0], threading.Lock()
+
+    def counted(*_: object) -> dict[str, Any]:
+        with lock:
+            at_once[0] += 1
+            most[0] = max(at_once)
+        time.sleep(0.05)
+        with lock:
+            at_once[0] -= 1
+        return {"answers": []}
+
+    monkeypatch.setattr(http, "_answered", counted)
+    image, statuses = large_png(200, 200), list[int]()
+    with served(root, threads=8, decoded_mb=2.0) as (_, ask):
+        threads = [threading.Thread(target=lambda: statuses.append(ask("/query", image)[0])) for _ in range(12)]
+        for one in threads:
+            one.start()
+        for one in threads:
+            one.join()
+    assert statuses == [200] * 12
+    assert most == [2]
+
+
+def test_views_that_are_large_in_memory_are_refused_by_their_footer(root: Path, finished: Path) -> None:
+    body = (finished / "descriptors.parquet").read_bytes()
+    with served(root, decoded_mb=0.01) as (_, ask):
+        assert ask("/query", body)[0] == 413
+
+
+def test_a_large_jpeg_is_found_at_reduced_size(root: Path, drive: Demo, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = vplog.open_log(drive.log)
+    frame = next(iter(opened.frames(opened.stamps()[:1]))).decode()
+    height, width = frame.image.shape
+    times = math.ceil(math.sqrt(16 * 2**21 / (height * width)))
+    large = cv2.resize(frame.image, (times * width, times * height), interpolation=cv2.INTER_CUBIC)
+    jpeg = cv2.imencode(".jpg", large)[1].tobytes()
+    frames = list[Frame]()
+
+    def taken(_: object, frame: Frame, __: object) -> Any:
+        frames.append(frame)
+        raise ResultError("It is taken.")
+
+    monkeypatch.setattr(http, "localize_frame", taken)
+    monkeypatch.setattr(NewestState, "localized_in", lambda _: None)
+    with served(root) as (_, ask):
+        assert ask("/query?top=1", jpeg)[1]["answers"][0]["keyframe"] == 0
+        ask("/localize?fx=2&fy=2&cx=0&cy=0", jpeg)
+    [frame] = frames
+    assert frame.image.shape == (times * height // 4, times * width // 4)
+    assert frame.camera.matrix is not None
+    assert frame.camera.matrix[0].tolist() == [0.5, 0.0, -0.375]  # the middle of a pixel is its origin
+
+
+def test_answers_name_no_folder_of_the_server(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copied, body = map_of_run(tmp_path / "map", finished), (finished / "descriptors.parquet").read_bytes()
+    image = cv2.imencode(".png", np.zeros((48, 64), np.uint8))[1].tobytes()
+    (copied / "runs" / folder_name("ten") / "descriptors.parquet").write_bytes(b"damaged")
+    with served(copied, refresh_s=3600) as (newest, ask):
+        said = [
+            ask("/map"), ask("/query?drive=nowhere", body), ask("/query?top=1", body), ask("/query", image[:-20]),
+            ask("/query", body[:-20]), ask("/localize", image), ask("/query", b"PAR1" + bytes(99)),
+        ]  # fmt: skip
+        (copied / "map.json").write_text("{")
+        newest.refresh()
+        said.append(ask("/map"))
+        for why in (f"There is no {copied}/runs/a.", "It is at s3://bucket/map/runs/a, not in /home/user/a."):
+            monkeypatch.setattr(http, "_answered", lambda *_, why=why: (_ for _ in ()).throw(ResultError(why)))
+            said.append(ask("/query", body))
+    assert [status for status, _ in said] == [200, 400, 200, 400, 400, 200, 400, 200, 400, 400]
+    for _, answer in said:
+        for secret in (str(tmp_path), "/tmp", "request-", "/home", "bucket"):  # noqa: S108
+            assert secret not in json.dumps(answer)
+
+
+def test_a_client_that_hangs_up_leaves_no_traceback(root: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with listening(root) as (_, at):
+        host, port = at.split(":")
+        for _ in range(3):
+            with socket.create_connection((host, int(port))) as client:
+                client.sendall(b"POST /query HTTP/1.1\r\nHost: x\r\nContent-Length: 1000\r\n\r\nPAR1")
+                time.sleep(0.1)
+        time.sleep(0.3)
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_refresh_that_fails_is_reported_and_tried_again(
+    root: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    copied = map_of_run(tmp_path / "map", finished)
+    with served(copied, refresh_s=0.1) as (newest, ask):
+        before = newest.now
+        with monkeypatch.context() as patch:
+            patch.setattr(NewestState, "_marked", lambda _: 1 / 0)
+            wait_for(lambda: newest.problem)
+            assert "division by zero" in ask("/map")[1]["warnings"][-1]
+        assert "ZeroDivisionError" in capfd.readouterr().err
+        (copied / "joint.json").write_text("{}")
+        wait_for(lambda: newest.now is not before)
+        assert ask("/map")[1]["warnings"] == []
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    ended = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < ended
+        time.sleep(0.05)
 
 
 def test_what_comes_while_the_queue_is_full_is_refused(

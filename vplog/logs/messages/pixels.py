@@ -14,7 +14,7 @@ import numpy as np
 from vplog.data import Bytes, Float32s
 from vplog.logs.formats.container import RawData
 from vplog.logs.messages.records import BadMessageError, ImageMessage
-from vplog.storage.image_file import BadImageError, decode_image, image_size
+from vplog.storage.image_file import MAX_PIXELS, BadImageError, decode_image, image_size
 
 _DEPTH_HEADER = 12
 """Bytes before the PNG of compressedDepth: int32 format, float32 a and b (compressed_depth_image_transport)."""
@@ -118,9 +118,10 @@ def spread(count: int) -> int:
     return max(-(-count // _SAMPLED), 1)
 
 
-def grey(message: ImageMessage, levels: Levels | None = None) -> Bytes:
-    """(H, W) uint8; of 16 bits by the `levels` of the topic, or by its own. Raises BadMessageError."""
-    return _converted(message, levels, *_pixels(message), "GRAY")
+def grey(message: ImageMessage, levels: Levels | None = None, least_px: int = MAX_PIXELS) -> Bytes:
+    """(H, W) uint8; of 16 bits by the `levels` of the topic, or by its own. `least_px` as in `decode_image`. Raises
+    BadMessageError."""
+    return _converted(message, levels, *_pixels(message, least_px=least_px), "GRAY")
 
 
 def values(message: ImageMessage) -> Any:
@@ -129,9 +130,9 @@ def values(message: ImageMessage) -> Any:
     return pixels if pixels.ndim == 2 else _converted(message, None, pixels, conversion, "GRAY")
 
 
-def rgb(message: ImageMessage, levels: Levels | None = None) -> Bytes:
+def rgb(message: ImageMessage, levels: Levels | None = None, least_px: int = MAX_PIXELS) -> Bytes:
     """(H, W, 3) uint8 red, green, blue; three times the grey where it has no colour. As `grey`."""
-    return message.rgb() if message.rgb else _converted(message, levels, *_pixels(message, colour=True), "RGB")
+    return message.rgb() if message.rgb else _converted(message, levels, *_pixels(message, True, least_px), "RGB")
 
 
 def _converted(message: ImageMessage, levels: Levels | None, pixels: Any, conversion: str, to: str) -> Bytes:
@@ -147,13 +148,13 @@ def _converted(message: ImageMessage, levels: Levels | None, pixels: Any, conver
         raise BadMessageError(f"{message.encoding[:40]!r} with {pixels.shape[1]} x {pixels.shape[0]} px") from None
 
 
-def _pixels(message: ImageMessage, colour: bool = False) -> tuple[Any, str]:
+def _pixels(message: ImageMessage, colour: bool = False, least_px: int = MAX_PIXELS) -> tuple[Any, str]:
     """(H, W) or (H, W, C) pixels of as many bits as they come in, and OpenCV's conversion of them; those of image files
     are grey already without `colour`."""
     if not message.compressed:
         return _raw(message)
     mosaic = _LAYOUTS.get(message.encoding.split(";", maxsplit=1)[0]) if "bayer" in message.encoding else None
-    pixels = _imdecode(message.data, unchanged=colour or mosaic is not None)
+    pixels = _imdecode(message.data, colour or mosaic is not None, least_px)
     if pixels.ndim > 2:
         return pixels, _COLOURS[pixels.shape[2]]
     return pixels, mosaic[2] if mosaic else "GRAY2{}"  # some transports compress the mosaic
@@ -217,9 +218,9 @@ def _raw(message: ImageMessage) -> tuple[Any, str]:
     return (pixels if channels == 1 else pixels.reshape(height, width, channels)), conversion
 
 
-def _imdecode(data: RawData, unchanged: bool = False) -> Any:
+def _imdecode(data: RawData, unchanged: bool = False, least_px: int = MAX_PIXELS) -> Any:
     """The pixels of an image file, as `decode_image` gives them. Raises BadMessageError."""
     try:
-        return decode_image(data, unchanged)
+        return decode_image(data, unchanged, least_px)
     except BadImageError as error:
         raise BadMessageError(str(error)) from None

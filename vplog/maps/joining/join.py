@@ -160,7 +160,7 @@ def read_drives(store: Store, urls: Mapping[str, str]) -> Drives:
     stored, states = read_states(store), dict[str, JoinState]()
 
     def read(drive: str) -> Member:
-        return member_of(store, {**known[drive], "log": urls.get(drive, known[drive]["log"])})
+        return member_of(store, known[drive], urls.get(drive))
 
     for drive, about in known.items():
         state = stored.get(drive)

@@ -51,6 +51,8 @@ class Member:
     features: Path
     """Stored features, for later drives."""
     log: str
+    named: str
+    """The map, or the URL of the log, as the user named it: a log on another server is not opened."""
     inputs: dict[str, str]
     """sha256 of the log's files, by name."""
     topics: logs.TopicChoice
@@ -85,8 +87,9 @@ class Member:
         return CameraPictures(row, replace(keyframes, drive=self.drive))
 
 
-def member_of(store: Store, about: dict[str, Any]) -> Member:
-    """A drive by its drive.json. Raises VplogError where its run folder is of another version or damaged."""
+def member_of(store: Store, about: dict[str, Any], url: str | None = None) -> Member:
+    """Return a drive by its drive.json; `url` is the path or URL of its log if the user gave that in this command.
+    Raises VplogError if its run folder is of another version or damaged."""
     drive = about["drive"]
     file, record = store.file(drive, "keyframes.parquet"), store.file(drive, "run.json")
     settings = tables.read_table_metadata(file).settings
@@ -106,7 +109,8 @@ def member_of(store: Store, about: dict[str, Any]) -> Member:
     }
     return Member(
         drive, file, store.root / ".cache" / folder_name(drive),
-        store.root / "joins" / folder_name(drive) / "features.parquet", about["log"], about["inputs"],
+        store.root / "joins" / folder_name(drive) / "features.parquet", url or about["log"], url or str(store),
+        about["inputs"],
         logs.TopicChoice.read(topics if isinstance(topics, dict) else {}, str(record)), pipeline,
         key_of(made_from), cameras, calibrations=account.get("calibrations"),
     )  # fmt: skip
@@ -114,7 +118,7 @@ def member_of(store: Store, about: dict[str, Any]) -> Member:
 
 def opened_log(member: Member) -> Log:
     """The log of a drive. Raises LogError where it is not there any more, or has changed."""
-    path = stored_log(member.log, f"The log of {member.drive}", "Give it again: vplog batch LOG -o MAP")
+    path = stored_log(member.log, member.named, f"The log of {member.drive}", "Give it again: vplog batch LOG -o MAP")
     try:
         log, found = logs.open_drive([path], member.topics), hash_inputs(path)
     except OSError as error:

@@ -125,14 +125,19 @@ class NewestState:
         self._localized: tuple[OpenState, Places] | None = None
 
     def refresh(self) -> bool:
-        """Open the newest state if it is another one; whether it is. A state that cannot be read is tried again."""
+        """Open the newest state if it is another one; whether it is. A state that cannot be read is tried again.
+
+        Sets `problem` if it fails, and raises what is neither a VplogError nor an OSError."""
         before = self._mark
         try:
             if (mark := self._marked()) != before:
                 self.now, self._mark = self._opened(Execution(self._execution.threads)), mark
             self.problem = ""
-        except (VplogError, OSError) as error:
-            self.problem = f"The newest state of the map cannot be read, and the one before it answers: {error}"
+        except Exception as error:
+            why = str(error) or type(error).__name__
+            self.problem = f"The newest state of the map cannot be read, and the one before it answers: {why}"
+            if not isinstance(error, VplogError | OSError):
+                raise
         return self._mark != before
 
     def localized_in(self) -> Places:
