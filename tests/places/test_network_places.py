@@ -247,7 +247,7 @@ def test_without_onnx_runtime_the_extra_is_named(tmp_path: Path, monkeypatch: py
     path = tmp_path / "other.onnx"
     path.write_bytes(b"nothing")
     path.with_suffix(".yaml").write_text(YAML)
-    with pytest.raises(SettingsError, match=r"vplog\[onnx\]"):
+    with pytest.raises(SettingsError, match="pip install onnxruntime"):
         read_method(f"onnx:{path}", Pipeline()).learn([reference(0)], Execution())
 
 
