@@ -296,9 +296,9 @@ def _world_line(row: dict[str, Any]) -> str:
     parameters, methods = row["parameters"], row["methods"]
     errors = ", ".join(f"{name} {one['error_m']:.3g}" for name, one in methods.items())
     return (
-        f"seed {row['seed']}: {parameters['kind']} ({parameters['layout']}), {parameters['stratum']}, drift {parameters['drift']:.1%}, "
-        f"{row['true']} true and {row['false']} false ({row['falseness']}), gps {parameters['gps']}, mis-told: "
-        f"{', '.join(row['mistold'])}\n"
+        f"seed {row['seed']}: {parameters['kind']} ({parameters['layout']}), {parameters['stratum']}, "
+        f"drift {parameters['drift']:.1%}, {row['true']} true and {row['false']} false "
+        f"({row['falseness']}), gps {parameters['gps']}, mis-told: {', '.join(row['mistold'])}\n"
         f"    lost {methods[OURS]['true_lost']}, false kept {methods[OURS]['false_kept']}; "
         f"error in m: {errors}"
     )
@@ -366,8 +366,9 @@ _CLOSURES = (
 
 def _title(parameters: Parameters) -> str:
     return (
-        f"world {parameters.seed}: {parameters.kind} ({parameters.layout}), {parameters.stratum}, drift {parameters.drift:.1%}, "
-        f"false closures {parameters.falseness}, gps {parameters.gps}\nmis-told: {', '.join(parameters.mistold)}"
+        f"world {parameters.seed}: {parameters.kind} ({parameters.layout}), {parameters.stratum}, "
+        f"drift {parameters.drift:.1%}, false closures {parameters.falseness}, gps {parameters.gps}\n"
+        f"mis-told: {', '.join(parameters.mistold)}"
     )
 
 

@@ -78,7 +78,7 @@ def draw_pairs(parameters: Parameters, made: Drive, random: np.random.Generator)
 
 
 def _true_runs(parameters: Parameters, made: Drive, count: int, random: np.random.Generator) -> list[Ints]:
-    """Select up to `count` true pairs, in runs (K, 2): first those that join sessions and those of stalled keyframes."""
+    """Select up to `count` true pairs, in runs (K, 2): those that join sessions and stalled ones first."""
     pairs = true_pairs(parameters, made)
     runs = _runs(pairs, parameters, random)
     joints = [joining(made, pairs, later) for later in range(1, int(made.session[-1]) + 1)]

@@ -170,7 +170,9 @@ def make(parameters: Parameters) -> World:
     truth = made.truth
     odom, expected, covariance = _odometry(parameters, made, random("odometry"))
     stamps = 1_700_000_000_000_000_000 + (made.metres / SPEED[parameters.kind] * 1e9).astype(np.int64)
-    stamps = stamps + 1_000_000 * np.arange(len(stamps)) + PAUSE_NS * made.session  # no two alike, whatever stands still
+    stamps = (
+        stamps + 1_000_000 * np.arange(len(stamps)) + PAUSE_NS * made.session
+    )  # no two alike, whatever stands still
     pairs = draw_pairs(parameters, made, random("pairs"))
     measured, marginal, closure_covariance, scale, by_depth = measure(parameters, truth, pairs, random("closures"))
     information = _inverse(marginal * parameters.closure_factor**2)
