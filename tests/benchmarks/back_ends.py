@@ -16,6 +16,7 @@ from pydantic import TypeAdapter
 
 from vplog.errors import VplogError
 from vplog.geometry import se3
+from vplog.graph.build import subgraph
 from vplog.graph.consistency import chi2_quantile, is_loop
 from vplog.graph.gps_factors import GpsSettings
 from vplog.graph.solve import GncSettings, OptimiserSettings, decided
@@ -136,14 +137,7 @@ def true_closures(world: World) -> Answer:
     graph = world.graph()
     edges = graph.odometry.copy()
     edges[~edges] = world.is_true
-    graph = replace(
-        graph,
-        a=graph.a[edges],
-        b=graph.b[edges],
-        a_from_b=graph.a_from_b[edges],
-        information=graph.information[edges],
-        kind=[kind for kind, chosen in zip(graph.kind, edges, strict=True) if chosen],
-    )
+    graph = subgraph(graph, np.arange(len(world.truth)), np.flatnonzero(edges))
     factors, values = _factors(world, graph, world.truth, covariance=world.fix_claimed)
     return Answer(_poses(_least_squares(factors, values)), world.is_true)
 

@@ -293,14 +293,12 @@ def _line(name: str, one: dict[str, Any]) -> str:
 
 
 def _world_line(row: dict[str, Any]) -> str:
-    parameters, methods = row["parameters"], row["methods"]
+    methods = row["methods"]
     errors = ", ".join(f"{name} {one['error_m']:.3g}" for name, one in methods.items())
     return (
-        f"seed {row['seed']}: {parameters['kind']} ({parameters['layout']}), {parameters['stratum']}, "
-        f"drift {parameters['drift']:.1%}, {row['true']} true and {row['false']} false "
-        f"({row['falseness']}), gps {parameters['gps']}, mis-told: {', '.join(row['mistold'])}\n"
-        f"    lost {methods[OURS]['true_lost']}, false kept {methods[OURS]['false_kept']}; "
-        f"error in m: {errors}"
+        f"{_title(Parameters(**row['parameters']))}\n"
+        f"    lost {methods[OURS]['true_lost']} of {row['true']}, false kept {methods[OURS]['false_kept']} of "
+        f"{row['false']}; error in m: {errors}"
     )
 
 
@@ -366,7 +364,7 @@ _CLOSURES = (
 
 def _title(parameters: Parameters) -> str:
     return (
-        f"world {parameters.seed}: {parameters.kind} ({parameters.layout}), {parameters.stratum}, "
+        f"seed {parameters.seed}: {parameters.kind} ({parameters.layout}), {parameters.stratum}, "
         f"drift {parameters.drift:.1%}, false closures {parameters.falseness}, gps {parameters.gps}\n"
         f"mis-told: {', '.join(parameters.mistold)}"
     )

@@ -184,7 +184,6 @@ def _displaced(
     best, chosen = np.zeros((0, 2), np.int64), np.eye(4)
     for D in sides:
         pairs = revisits(parameters, made, D, 2.0)
-        pairs = pairs[pairs[:, 1] % parameters.spacing == 0]
         pairs = pairs[_is_false(parameters, truth, pairs, D, 1.0 if shift is not None else ELSEWHERE)]
         if len(pairs) > len(best):
             best, chosen = pairs, D

@@ -296,10 +296,9 @@ def way(truth: Floats) -> Floats:
 
 
 def true_pairs(parameters: Parameters, made: Drive) -> Ints:
-    """(K, 2) match and query of every pair of keyframes that a true closure may join, at the spacing of the world; in a
-    `late` world only of the end and the beginning."""
+    """(K, 2) match and query of every pair of keyframes that a true closure may join; in a `late` world only of pairs
+    of the end and the beginning."""
     pairs = revisits(parameters, made, np.eye(4))
-    pairs = pairs[pairs[:, 1] % parameters.spacing == 0]
     if parameters.stratum == "late":
         pairs = pairs[pairs[:, 1] - pairs[:, 0] > LATE_SHARE * len(made.truth)]
     return pairs
@@ -311,7 +310,8 @@ def joining(made: Drive, pairs: Ints, later: int) -> Ints:
 
 
 def revisits(parameters: Parameters, made: Drive, D: Floats, wider: float = 1.0) -> Ints:
-    """(K, 2) of each query its nearest earlier keyframe that sees the same place, or would were the world displaced."""
+    """(K, 2) of each query, at the spacing of the world, its nearest earlier keyframe that sees the same place, or
+    would if the world were displaced."""
     truth, metres = made.truth, made.metres
     moved = D @ truth
     radius, rows = place_radius(parameters, truth) * wider, np.arange(len(truth))
@@ -322,7 +322,7 @@ def revisits(parameters: Parameters, made: Drive, D: Floats, wider: float = 1.0)
     apart = (metres - metres[:, None] > APART * radius) & (rows - rows[:, None] > 10)
     gap[~apart | (cosine < np.cos(np.radians(40.0)))] = np.inf
     best = gap.argmin(0)
-    query = np.flatnonzero(gap[best, rows] < radius**2)
+    query = np.flatnonzero((gap[best, rows] < radius**2) & (rows % parameters.spacing == 0))
     return np.stack([best[query], query], axis=1)
 
 
