@@ -1,7 +1,7 @@
 """Back ends that a world is solved by: vplog as users get it, others beside it, and one that knows what is true.
 
-All but the oracle see the world's log alone. Where a world has GPS, all but `optimize` use its fixes and answer in the
-world's frame; the others answer in any frame.
+Only the oracle, `true_closures` and, to place sessions, `odometry` know more than the log. In a world with GPS, all but
+`optimize` use its fixes and answer in the world's frame; without GPS, any frame will do.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pydantic import TypeAdapter
 
 from vplog.errors import VplogError
 from vplog.geometry import se3
+from vplog.graph.build import subgraph
 from vplog.graph.consistency import chi2_quantile, is_loop
 from vplog.graph.gps_factors import GpsSettings
 from vplog.graph.solve import GncSettings, OptimiserSettings, decided
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 PROBABILITY = 0.99
 """A true closure passes the bounds of GNC with this probability: the default of GTSAM's GncOptimizer."""
 LOOSE = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3])
-"""rad and m: fixes on a straight road leave a turn about it open."""
+"""rad and m: fixes on a straight road leave a turn about it open, and a session may be anywhere."""
 ITERATIONS = 100
 NEWTON_STEPS = 2
 """Of the oracle's shared errors, in which its cost is all but quadratic."""
@@ -88,7 +89,7 @@ def vplog_method(kind: str) -> Callable[[World], Answer]:
     """A method of `vplog optimize --method` as published, without vplog's look at the odometry afterwards."""
 
     def solve(world: World) -> Answer:
-        graph = world.graph()
+        graph = replace(world.graph(), world_from_body=_placed(world))
         solution = TypeAdapter(OptimiserSettings).validate_python({"kind": kind})(graph)
         kept = np.asarray(solution.weight[is_loop(graph)] > 0.5, bool)
         if world.gps is None:
@@ -104,27 +105,29 @@ def vplog_method(kind: str) -> Callable[[World], Answer]:
 
 
 def odometry(world: World) -> Answer:
-    """The odometry as it is, moved onto the fixes as one where there are any."""
-    poses = world.keyframes.odom_from_body
+    """The odometry as it is, moved onto the fixes as one where there are any. Each session is placed on the earlier
+    ones by one of the true closures."""
+    poses = _placed(world, world.is_true)
     return Answer(poses if world.gps is None else _onto_fixes(world, poses), np.zeros(len(world.closures), bool))
 
 
 def plain(world: World) -> Answer:
     """Levenberg-Marquardt on everything, from the odometry."""
-    factors, values = _factors(world, world.graph(), world.keyframes.odom_from_body)
+    factors, values = _factors(world, world.graph(), _placed(world))
     return Answer(_poses(_least_squares(factors, values)), np.ones(len(world.closures), bool))
 
 
 def gnc(world: World) -> Answer:
     """GTSAM's GncLMOptimizer with its own bound, the odometry known to be inliers."""
     graph = world.graph()
-    factors, values = _factors(world, graph, world.keyframes.odom_from_body)
+    factors, values = _factors(world, graph, _placed(world))
+    priors = 1 + len(world.breaks)
     settings = gtsam.GncLMParams()
-    settings.setKnownInliers([0, *(1 + np.flatnonzero(~is_loop(graph))).tolist()])
+    settings.setKnownInliers([*range(priors), *(priors + np.flatnonzero(~is_loop(graph))).tolist()])
     optimiser = gtsam.GncLMOptimizer(factors, values, settings)
     optimiser.setInlierCostThresholdsAtProbability(PROBABILITY)
     poses = _poses(optimiser.optimize())
-    weight = np.asarray(optimiser.getWeights())[1 : 1 + len(graph.a)]
+    weight = np.asarray(optimiser.getWeights())[priors : priors + len(graph.a)]
     return Answer(poses, np.asarray(weight[is_loop(graph)] > 0.5, bool))
 
 
@@ -132,15 +135,9 @@ def true_closures(world: World) -> Answer:
     """Levenberg-Marquardt from the truth on the true closures and sound fixes with the noise as claimed: what is lost
     by not knowing the noise."""
     graph = world.graph()
-    edges = np.concatenate([np.ones(len(world.truth) - 1, bool), world.is_true])
-    graph = replace(
-        graph,
-        a=graph.a[edges],
-        b=graph.b[edges],
-        a_from_b=graph.a_from_b[edges],
-        information=graph.information[edges],
-        kind=[kind for kind, chosen in zip(graph.kind, edges, strict=True) if chosen],
-    )
+    edges = graph.odometry.copy()
+    edges[~edges] = world.is_true
+    graph = subgraph(graph, np.arange(len(world.truth)), np.flatnonzero(edges))
     factors, values = _factors(world, graph, world.truth, covariance=world.fix_claimed)
     return Answer(_poses(_least_squares(factors, values)), world.is_true)
 
@@ -187,7 +184,7 @@ def _newton_step(cost: Callable[[Floats], float], at: Floats) -> Floats:
 def _factors(
     world: World, graph: PoseGraph, start: Floats, kernel: Any = None, covariance: Floats | None = None
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """A prior, the edges and the fixes of a world, and where to start.
+    """A prior of each session, the edges and the fixes of a world, and where to start.
 
     With a `covariance` (F, 3, 3) of the fixes only the sound ones, and `start` is in the world's frame.
     """
@@ -195,9 +192,10 @@ def _factors(
     if covariance is None:
         covariance = world.fix_claimed
         start = start if world.gps is None else _onto_fixes(world, start)
-    loose = LOOSE if world.gps is not None else np.full(6, 1e-6)
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    factors.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(start[0]), gtsam.noiseModel.Diagonal.Sigmas(loose)))
+    for row in [0, *(world.breaks + 1).tolist()]:
+        sigma = LOOSE if row or world.gps is not None else np.full(6, 1e-6)
+        factors.add(gtsam.PriorFactorPose3(row, gtsam.Pose3(start[row]), gtsam.noiseModel.Diagonal.Sigmas(sigma)))
     for a, b, measured, information in zip(graph.a, graph.b, graph.a_from_b, graph.information, strict=True):
         noise = gtsam.noiseModel.Gaussian.Information(information)
         factors.add(gtsam.BetweenFactorPose3(int(a), int(b), gtsam.Pose3(measured), noise))
@@ -223,6 +221,22 @@ def _least_squares(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) ->
 
 def _poses(values: gtsam.Values) -> Floats:
     return np.array([values.atPose3(row).matrix() for row in range(values.size())])
+
+
+def _placed(world: World, chosen: Bools | None = None) -> Floats:
+    """Poses (N, 4, 4) of the odometry, with each session moved to where a closure to earlier sessions has it: of the
+    `chosen` closures (default: all) the one whose place is closest to those of the others."""
+    poses, session = world.keyframes.odom_from_body.copy(), world.session
+    match, query = world.closures.match, world.closures.query
+    for later in range(1, len(world.breaks) + 1):
+        joins = (session[query] == later) & (session[match] < later) & (chosen if chosen is not None else True)
+        if not joins.any():
+            continue
+        moved = poses[match[joins]] @ world.closures.match_from_query[joins] @ se3.inverse(poses[query[joins]])
+        place = se3.transform(moved, poses[session == later, :3, 3].mean(0)[None])[:, 0]
+        distance = np.linalg.norm(place[:, None] - place, axis=2).sum(1)
+        poses[session == later] = moved[distance.argmin()] @ poses[session == later]
+    return poses
 
 
 def _onto_fixes(world: World, poses: Floats) -> Floats:

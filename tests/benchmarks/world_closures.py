@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tests.benchmarks.world_drives import place_radius, revisits
+from tests.benchmarks.world_drives import JOINTS, joining, place_radius, revisits, true_pairs
 from vplog.data import Closures, Verdict
 from vplog.geometry import se3
 
 if TYPE_CHECKING:
+    from tests.benchmarks.world_drives import Drive
     from tests.benchmarks.world_parameters import Parameters
     from vplog.data import Bools, Floats, Ints
 
@@ -22,6 +23,10 @@ PLACES = 20
 ELSEWHERE = 6.0
 """Tolerances between two places that look alike, where no next aisle says: three radii. The shift that most of a drive
 agrees with would be the least one allowed otherwise."""
+SEEN_FOR = 2
+"""Keyframes within which neighbouring closures see the same landmarks, and so share a part of their error."""
+STALL_SHARE = 0.5
+"""Largest share of the true closures that is reserved for stalled keyframes. There are as many if enough exist."""
 MOST_FALSE = 400
 """Closures, so that worlds stay fast."""
 
@@ -41,17 +46,21 @@ class Pairs:
     """(L,)."""
 
 
-def draw_pairs(parameters: Parameters, truth: Floats, shift: Floats | None, random: np.random.Generator) -> Pairs:
-    """The closures in order of query, then match."""
-    share, runs = parameters.false_share, _runs(revisits(parameters, truth, np.eye(4)), parameters.run, random)
-    true = _some(runs, round(parameters.closures * (1.0 - share)))
+def draw_pairs(parameters: Parameters, made: Drive, random: np.random.Generator) -> Pairs:
+    """Draw the closures of a drive, in order of query, then match."""
+    share = parameters.false_share
+    true = _true_runs(parameters, made, round(parameters.closures * (1.0 - share)), random)
     # as many as their share of all is, where the drive comes back less often than was wanted, too
     count = parameters.closures if parameters.no_true else round(_count(true) * share / (1.0 - share))
-    false = _false_runs(parameters, truth, shift, min(count, MOST_FALSE), random)
+    if parameters.spacing > 1:
+        count = min(count, len(made.truth) // parameters.spacing)
+    false = _false_runs(parameters, made, min(count, MOST_FALSE), random)
     if parameters.false_kind == "family" and not parameters.no_true:
         true = _some(true, max(int(_count([run for run, _ in false]) / random.uniform(1.05, 1.5)), 3))
     claims: dict[tuple[int, int], tuple[int, Floats, bool]] = {}
     runs = [*((run, np.eye(4), True) for run in true), *((run, D, False) for run, D in false)]
+    if parameters.spacing > SEEN_FOR:
+        runs = [(run[k : k + 1], D, is_true) for run, D, is_true in runs for k in range(len(run))]
     for number, (run, D, is_true) in enumerate(runs):
         for a, b in run.tolist():
             claims.setdefault((b, a), (number, D, is_true))
@@ -68,11 +77,36 @@ def draw_pairs(parameters: Parameters, truth: Floats, shift: Floats | None, rand
     )
 
 
-def _runs(pairs: Ints, most: int, random: np.random.Generator) -> list[Ints]:
-    """The pairs in runs of neighbouring keyframes at both ends, cut to at most so many, in random order."""
+def _true_runs(parameters: Parameters, made: Drive, count: int, random: np.random.Generator) -> list[Ints]:
+    """Select up to `count` true pairs, in runs (K, 2): those that join sessions and stalled ones first."""
+    pairs = true_pairs(parameters, made)
+    runs = _runs(pairs, parameters, random)
+    joints = [joining(made, pairs, later) for later in range(1, int(made.session[-1]) + 1)]
+    first = [joint[[k]] for joint in joints if len(joint) for k in np.linspace(0, len(joint) - 1, JOINTS, dtype=int)]
+    if parameters.stratum == "stalled":
+        stalled = np.flatnonzero(made.is_wrong) + 1
+        first += _some([run for run in runs if np.isin(run, stalled).any()], int(STALL_SHARE * count))
+    return _some(_distinct([*first, *runs]), count)
+
+
+def _distinct(runs: list[Ints]) -> list[Ints]:
+    """The runs without the pairs that an earlier run has."""
+    seen: set[tuple[int, int]] = set()
+    distinct = []
+    for run in runs:
+        is_new = [pair not in seen for pair in map(tuple, run.tolist())]
+        seen.update(map(tuple, run.tolist()))
+        if any(is_new):
+            distinct.append(run[is_new])
+    return distinct
+
+
+def _runs(pairs: Ints, parameters: Parameters, random: np.random.Generator) -> list[Ints]:
+    """The pairs in runs that are neighbours at both ends, cut to at most `parameters.run`, in random order."""
     if not len(pairs):
         return []
-    jumps = (np.diff(pairs[:, 1]) > 2) | (np.abs(np.diff(pairs[:, 0])) > 4)
+    spacing, most = parameters.spacing, parameters.run
+    jumps = (np.diff(pairs[:, 1]) > SEEN_FOR * spacing) | (np.abs(np.diff(pairs[:, 0])) > 2 * SEEN_FOR * spacing)
     runs = []
     for run in np.split(pairs, np.flatnonzero(jumps) + 1):
         start = 0
@@ -99,25 +133,26 @@ def _count(runs: list[Ints]) -> int:
 
 
 def _false_runs(
-    parameters: Parameters, truth: Floats, shift: Floats | None, count: int, random: np.random.Generator
+    parameters: Parameters, made: Drive, count: int, random: np.random.Generator
 ) -> list[tuple[Ints, Floats]]:
     """Runs of pairs (K, 2), each with the displacement D (4, 4) that it claims, `count` pairs in all or fewer."""
     if parameters.false_kind == "none" or count <= 0:
         return []
     if parameters.false_kind in ("aliased", "family"):
-        return _displaced(parameters, truth, shift, count, random)
+        return _displaced(parameters, made, count, random)
     found: list[tuple[Ints, Floats]] = []
-    left = count
+    left, truth, spacing = count, made.truth, parameters.spacing
     for _ in range(50 * count):
         if left <= 0:
             break
         a, b = np.sort(random.integers(0, len(truth), 2)).tolist()
         most = int(random.integers(4, 21)) if parameters.false_kind == "grouped" else 1
-        size = min(most, left, b - a - 10, len(truth) - b)
+        b -= b % spacing
+        size = min(most, left, (b - a - 10) // spacing, (len(truth) - 1 - b) // spacing + 1)
         if size < 1:
             continue
         D = _claimed_displacement(parameters, truth, a, b, random)
-        run = np.stack([a + np.arange(size), b + np.arange(size)], axis=1)
+        run = np.array([a, b]) + spacing * np.arange(size)[:, None]
         run = run[_is_false(parameters, truth, run, D) & _looks_near(parameters, truth, run, D)]
         if len(run):
             found.append((run, D))
@@ -134,9 +169,10 @@ def _claimed_displacement(parameters: Parameters, truth: Floats, a: int, b: int,
 
 
 def _displaced(
-    parameters: Parameters, truth: Floats, shift: Floats | None, count: int, random: np.random.Generator
+    parameters: Parameters, made: Drive, count: int, random: np.random.Generator
 ) -> list[tuple[Ints, Floats]]:
     """Pairs that one D explains, the same for all: the next aisle, or the place of two that are most alike."""
+    truth, shift = made.truth, made.aisle_shift
     if shift is not None:
         sides = [se3.pose(np.eye(3), side * shift) for side in (1.0, -1.0)]
     else:
@@ -147,11 +183,11 @@ def _displaced(
                 sides.append(_claimed_displacement(parameters, truth, a, b, random))
     best, chosen = np.zeros((0, 2), np.int64), np.eye(4)
     for D in sides:
-        pairs = revisits(parameters, truth, D, 2.0)
+        pairs = revisits(parameters, made, D, 2.0)
         pairs = pairs[_is_false(parameters, truth, pairs, D, 1.0 if shift is not None else ELSEWHERE)]
         if len(pairs) > len(best):
             best, chosen = pairs, D
-    return [(run, chosen) for run in _some(_runs(best, parameters.run, random), count)]
+    return [(run, chosen) for run in _some(_runs(best, parameters, random), count)]
 
 
 def _is_false(parameters: Parameters, truth: Floats, pairs: Ints, D: Floats, times: float = 1.0) -> Bools:

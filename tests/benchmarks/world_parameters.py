@@ -1,4 +1,4 @@
-"""What a random world for back ends is made of, drawn from its seed: every parameter from a generator of its own."""
+"""Parameters of random worlds for back ends. Each parameter is drawn from a generator of its own, by seed and name."""
 
 from __future__ import annotations
 
@@ -8,6 +8,23 @@ from zlib import crc32
 
 import numpy as np
 
+STRATA = ("plain", "spaced", "late", "sessions", "isolated", "stalled", "frozen")
+"""How a world differs from runs of neighbouring closures in one drive with working odometry (`plain`).
+
+- `spaced`: the front end looks for closures only at every k-th keyframe, k from 1 to 30.
+- `late`: the robot drives one lap, and at the end the first part of the lap again. All true closures join the end to
+  the beginning, so they share one displacement: the drift of the lap.
+- `sessions`: two to four sessions, which only closures join.
+- `isolated`: a closure at most every 31 to 80 keyframes.
+- `stalled`: the robot stands still for a while, but its odometry reports the commanded motion.
+- `frozen`: the robot moves for a while, but its odometry reports none.
+"""
+PLAIN_SHARE = 0.5
+"""Share of the worlds that are plain. The other strata are equally frequent."""
+SPACINGS = {"spaced": (1, 30), "late": (1, 10), "sessions": (1, 10), "isolated": (31, 80)}
+"""Smallest and largest number of keyframes between two that the front end looks for closures at. Elsewhere it is 1."""
+QUERIES = 12
+"""Keyframes that the front end looks for closures at, at least, unless a drive of 600 keyframes has fewer."""
 KINDS = ("road", "aisles", "room", "drone")
 CLAIMS = ("right", "wrong", "constant", "missing")
 FALSE = ("random", "grouped", "aliased", "family")
@@ -30,6 +47,8 @@ class Parameters:
     seed: int
     kind: str
     layout: str
+    stratum: str
+    """One of STRATA."""
     spatial: bool
     """False: a plane but for small heights, rolls and pitches, all of them free in the graph."""
     keyframes: int
@@ -53,6 +72,8 @@ class Parameters:
     """The covariance logged is that of the pose since the start; otherwise of each increment."""
     closures: int
     """Wanted; a drive that comes back less has fewer."""
+    spacing: int
+    """The query of each closure is a multiple of this number of keyframes."""
     run: int
     """Most closures of neighbouring keyframes in a run."""
     sigma: float
@@ -111,8 +132,8 @@ class Parameters:
         return asdict(self)
 
 
-def draw(seed: int) -> Parameters:
-    """The parameters of a world, each from a generator of its own."""
+def draw(seed: int, stratum: str | None = None) -> Parameters:
+    """Draw the parameters of a world, of the given stratum if there is one."""
 
     def of(name: str) -> np.random.Generator:
         return np.random.default_rng([seed, crc32(name.encode())])
@@ -131,9 +152,15 @@ def draw(seed: int) -> Parameters:
 
     kind = choice("kind", KINDS)
     claim = choice("claim", CLAIMS)
-    no_true = happens("no_true", 0.06)
+    others = (1.0 - PLAIN_SHARE) / (len(STRATA) - 1)
+    stratum = stratum or choice("stratum", STRATA, [PLAIN_SHARE, *[others] * (len(STRATA) - 1)])
+    no_true = happens("no_true", 0.06) and stratum != "sessions"  # nothing would join them
     false_kind = choice("false_kind", FALSE)
-    false_share = 1.0 if no_true else uniform("false_share", 0.05, 0.6)
+    most_false = 0.6
+    if false_kind in ("aliased", "family") and stratum not in ("plain", "spaced"):
+        # true closures share displacements, too, or are few: if false ones were the majority, nobody could tell
+        false_kind, most_false = "aliased", 0.4
+    false_share = 1.0 if no_true else uniform("false_share", 0.05, most_false)
     if false_kind == "family" and not no_true:
         false_share = uniform("family_share", 0.5, 0.6)
     if happens("all_true", 0.25) and not no_true:
@@ -141,12 +168,17 @@ def draw(seed: int) -> Parameters:
     if no_true and false_kind == "family":
         false_kind = "aliased"  # one family is all there is
     outside = kind in ("road", "drone")
+    layouts = {"road": ("loop", "blocks"), "drone": ("circuit", "sweep")}.get(kind, (kind,))
+    closest, furthest = SPACINGS.get(stratum, (1, 1))
+    spacing = int(log_uniform("spacing", closest, furthest + 1)) if furthest > 1 else 1
+    least = min(QUERIES * spacing, 600) if stratum != "sessions" else 200  # each session is a drive
     return Parameters(
         seed=seed,
         kind=kind,
-        layout=choice("layout", {"road": ("loop", "blocks"), "drone": ("circuit", "sweep")}.get(kind, (kind,))),
+        layout=layouts[0] if stratum == "late" else choice("layout", layouts),
+        stratum=stratum,
         spatial=kind in ("room", "drone") or (kind == "road" and happens("spatial", 0.5)),
-        keyframes=int(of("keyframes").integers(100, 601)),
+        keyframes=max(int(of("keyframes").integers(100, 601)), least),
         drift=log_uniform("drift", 0.002, 0.06),
         white_share=uniform("white_share", 0.0, 1.0),
         bias_length=log_uniform("bias_length", 0.05, 0.5),
@@ -158,12 +190,14 @@ def draw(seed: int) -> Parameters:
         claim_turn_factor=log_uniform("claim_turn_factor", 0.1, 10.0) if claim == "wrong" else 1.0,
         accumulated=claim in ("right", "wrong") and happens("accumulated", 0.25),
         closures=int(log_uniform("closures", 30, 300)),
+        spacing=spacing,
         run=int(of("run").integers(2, 16)),
         sigma=log_uniform("sigma", *SIGMA_M[kind]),
         sigma_turn=float(np.radians(log_uniform("sigma_turn", 0.1, 2.0))),
         common_share=uniform("common_share", 0.0, 0.8),
         closure_factor=log_uniform("closure_factor", 0.2, 5.0) if happens("closure_mistold", 0.5) else 1.0,
-        scales=choice("scales", SCALES[kind]),
+        # wrong odometry gives no metres
+        scales=SCALES[kind][0] if stratum in ("stalled", "frozen") else choice("scales", SCALES[kind]),
         depth_error=choice("depth_sign", (-1, 1)) * uniform("depth_error", 0.03, 0.15)
         if happens("depth", 0.3)
         else 0.0,

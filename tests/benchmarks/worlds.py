@@ -14,7 +14,7 @@ from zlib import crc32
 import numpy as np
 
 from tests.benchmarks.world_closures import draw_pairs, ledger, measure
-from tests.benchmarks.world_drives import drive, way
+from tests.benchmarks.world_drives import Drive, drive, way
 from tests.benchmarks.world_parameters import Parameters, draw
 from vplog.data import EdgeKind, Gps, Keyframes, Odometry, PoseGraph
 from vplog.geometry import se3
@@ -32,6 +32,8 @@ REACH_M = 100.0
 """Drift is stated over this length, or over the way where that is shorter (the KITTI benchmark's shortest)."""
 LEAST_SHARE = 0.02
 """Least error of an oracle as a share of the odometry's."""
+PAUSE_NS = 60_000_000_000
+"""Between two sessions."""
 ORIGIN = (48.1, 11.5, 500.0)
 """Latitude and longitude in degrees and altitude in m of the world's frame, which is east-north-up there."""
 
@@ -48,8 +50,13 @@ class World:
     closures: Closures
     is_true: Bools
     """(L,)."""
+    breaks: Ints
+    """Rows of `odometry_covariance` that join two sessions. The odometry does not measure these."""
+    is_wrong: Bools
+    """(N-1,) True for the odometry edges in which the robot is stalled or the odometry is frozen."""
     odometry_covariance: Floats
-    """(N-1, 6, 6) of each edge, true: white noise of the same growth as its wandering bias. The scale is beside."""
+    """(N-1, 6, 6) of each edge, true: white noise of the same growth as its wandering bias, and as the errors of a
+    stretch of wrong edges. The scale is beside."""
     odometry_claimed: Floats | None
     """(N-1, 6, 6) as the log has it, None where it has none."""
     closure_covariance: Floats
@@ -75,28 +82,33 @@ class World:
             claimed, _, _ = edge_covariance(self.odometry, self.keyframes.stamp_ns, NoiseSettings())
         return self._graph(claimed, self.closures.information, np.arange(len(self.closures)))
 
+    @property
+    def session(self) -> Ints:
+        """(N,) number of the session that each keyframe belongs to."""
+        return np.searchsorted(self.breaks, np.arange(len(self.truth)))
+
     def true_graph(self, odometry_long: float = 0.0, depth_long: float = 0.0) -> PoseGraph:
         """The odometry and the true closures alone, with the true noise, and metres that are too long by these shares
         made right, noise and all."""
         graph = self._graph(self.odometry_covariance, _inverse(self.closure_covariance), np.flatnonzero(self.is_true))
         by_odometry = np.array([scale == "odometry" for scale in self.closures.scale], bool)[self.is_true]
         length = np.full(len(graph.a), 1.0 + odometry_long)
-        length[len(self.truth) - 1 :] = np.where(by_odometry, 1.0 + odometry_long, 1.0)
-        length[len(self.truth) - 1 :] *= np.where(self.by_depth[self.is_true], 1.0 + depth_long, 1.0)
+        length[~graph.odometry] = np.where(by_odometry, 1.0 + odometry_long, 1.0)
+        length[~graph.odometry] *= np.where(self.by_depth[self.is_true], 1.0 + depth_long, 1.0)
         graph.a_from_b[:, :3, 3] /= length[:, None]
         graph.information[:, 3:] *= length[:, None, None]
         graph.information[:, :, 3:] *= length[:, None, None]
         return graph
 
     def _graph(self, odometry: Floats, closures: Floats, rows: Ints) -> PoseGraph:
-        poses, n = self.keyframes.odom_from_body, len(self.truth)
+        poses, edges = self.keyframes.odom_from_body, np.delete(np.arange(len(self.truth) - 1), self.breaks)
         return PoseGraph(
             poses,
-            np.concatenate([np.arange(n - 1), self.closures.match[rows]]).astype(np.int32),
-            np.concatenate([np.arange(1, n), self.closures.query[rows]]).astype(np.int32),
-            np.concatenate([se3.between(poses[:-1], poses[1:]), self.closures.match_from_query[rows]]),
-            np.concatenate([_inverse(odometry), closures[rows]]),
-            [EdgeKind.ODOMETRY] * (n - 1) + [EdgeKind.LOOP] * len(rows),
+            np.concatenate([edges, self.closures.match[rows]]).astype(np.int32),
+            np.concatenate([edges + 1, self.closures.query[rows]]).astype(np.int32),
+            np.concatenate([se3.between(poses[edges], poses[edges + 1]), self.closures.match_from_query[rows]]),
+            np.concatenate([_inverse(odometry[edges]), closures[rows]]),
+            [EdgeKind.ODOMETRY] * len(edges) + [EdgeKind.LOOP] * len(rows),
         )
 
     def world_from_enu(self) -> Floats:
@@ -143,9 +155,9 @@ def over_oracle(error_m: float, oracle_m: float, odometry_m: float) -> float:
     return error_m / max(oracle_m, LEAST_SHARE * odometry_m, 1e-9)
 
 
-def world(seed: int) -> World:
-    """The world of a seed, always the same."""
-    return make(draw(seed))
+def world(seed: int, stratum: str | None = None) -> World:
+    """The world of a seed (of the given stratum if there is one), always the same."""
+    return make(draw(seed, stratum))
 
 
 def make(parameters: Parameters) -> World:
@@ -154,22 +166,26 @@ def make(parameters: Parameters) -> World:
     def random(what: str) -> np.random.Generator:
         return np.random.default_rng([parameters.seed, crc32(what.encode()), 1])
 
-    truth, next_aisle = drive(parameters, random("drive"))
-    odom, covariance = _odometry(parameters, truth, random("odometry"))
-    metres = way(truth)
-    stamps = 1_700_000_000_000_000_000 + (metres / SPEED[parameters.kind] * 1e9).astype(np.int64)
-    stamps = stamps + 1_000_000 * np.arange(len(stamps))  # no two alike, whatever stands still
-    pairs = draw_pairs(parameters, truth, next_aisle, random("pairs"))
+    made = drive(parameters, random("drive"))
+    truth = made.truth
+    odom, expected, covariance = _odometry(parameters, made, random("odometry"))
+    stamps = 1_700_000_000_000_000_000 + (made.metres / SPEED[parameters.kind] * 1e9).astype(np.int64)
+    stamps = (
+        stamps + 1_000_000 * np.arange(len(stamps)) + PAUSE_NS * made.session
+    )  # no two alike, whatever stands still
+    pairs = draw_pairs(parameters, made, random("pairs"))
     measured, marginal, closure_covariance, scale, by_depth = measure(parameters, truth, pairs, random("closures"))
     information = _inverse(marginal * parameters.closure_factor**2)
-    claimed = _claimed(parameters, covariance, random("claim"))
+    claimed = _claimed(parameters, expected, random("claim"))
     return World(
         parameters,
         truth,
-        Odometry(stamps, odom, _logged(parameters, odom, claimed)),
+        Odometry(stamps, odom, _logged(parameters, odom, claimed), breaks=made.breaks + 1),
         Keyframes(f"world {parameters.seed}", stamps, odom),
         ledger(pairs, measured, information, scale),
         pairs.is_true,
+        made.breaks,
+        made.is_wrong,
         covariance,
         claimed,
         closure_covariance,
@@ -181,9 +197,10 @@ def make(parameters: Parameters) -> World:
 # --- odometry ------------------------------------------------------------------------------------------------------
 
 
-def _odometry(parameters: Parameters, truth: Floats, random: np.random.Generator) -> tuple[Floats, Floats]:
-    """Odometry (N, 4, 4) from the identity on, and the true covariance (N-1, 6, 6) of its edges without the scale."""
-    step, metres = se3.between(truth[:-1], truth[1:]), np.diff(way(truth))
+def _odometry(parameters: Parameters, made: Drive, random: np.random.Generator) -> tuple[Floats, Floats, Floats]:
+    """Odometry (N, 4, 4) from the identity on, and two covariances (N-1, 6, 6) of its edges without the scale: what it
+    would be if no edge was wrong, and the true one."""
+    step, metres = made.step, np.diff(made.metres)
     length = float(metres.sum())
     reach, half = min(REACH_M, length), parameters.bias_length * min(5.0 * REACH_M, length)
     # sigma per axis over the reach, in rad and m; a third of the variance is each axis's
@@ -199,12 +216,25 @@ def _odometry(parameters: Parameters, truth: Floats, random: np.random.Generator
     measured = np.array(step)
     measured[:, :3, 3] *= 1.0 + parameters.scale_error
     measured = measured @ se3.exp(error)
-    poses = np.tile(np.eye(4), (len(truth), 1, 1))
+    measured[(step == np.eye(4)).all((1, 2))] = np.eye(4)  # frozen, or the pose is held until the next session
+    poses = np.tile(np.eye(4), (len(made.truth), 1, 1))
     for k in range(len(step)):
         poses[k + 1] = poses[k] @ measured[k]
     # what wanders over `half` metres grows as white noise does that is 2 half times its square, once it had the way
     variance = white**2 + bias**2 * min(2.0 * half, length)
-    return poses, np.einsum("k,ij->kij", np.maximum(metres, 1e-6), np.diag(variance))
+    covariance = np.einsum("k,ij->kij", np.maximum(metres, 1e-6), np.diag(variance))
+    return poses, covariance, covariance + _of_wrong_edges(made)
+
+
+def _of_wrong_edges(made: Drive) -> Floats:
+    """(N-1, 6, 6) covariance of the errors of wrong edges. A stretch of n edges has the mean square of its errors on
+    each axis, times n, because the errors add up."""
+    error = se3.log(se3.between(se3.between(made.truth[:-1], made.truth[1:]), made.step))
+    variance = np.zeros(error.shape)
+    rows = np.flatnonzero(made.is_wrong)
+    for stretch in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
+        variance[stretch] = (error[stretch] ** 2).sum(0)
+    return np.einsum("ki,ij->kij", variance, np.eye(6))
 
 
 def _wandering(random: np.random.Generator, metres: Floats, length: float, size: int) -> Floats:

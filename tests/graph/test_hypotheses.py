@@ -122,7 +122,7 @@ def test_a_family_of_false_closures_that_agree_with_each_other_is_left_out(seed:
 def test_a_family_that_a_loose_odometry_agrees_with_is_left_out() -> None:
     """Odometry as loose as the drift model has it bends to 32 false closures at one place and 22 true ones elsewhere;
     as good as it is, it explains the true ones alone far better."""
-    drawn = make(replace(draw(1795506639), gps="none"))
+    drawn = make(replace(draw(1795506639, "plain"), gps="none"))
     graph = drawn.graph()
     kept = decided(graph, GncSettings()).solution.weight[is_loop(graph)] > 0.5
     assert (~drawn.is_true).sum() > drawn.is_true.sum() > 20
@@ -292,13 +292,13 @@ def test_odometry_is_no_noisier_than_what_it_measures() -> None:
 
 def test_false_closures_of_a_level_robot_are_no_likelier_true_for_being_level() -> None:
     """55 closures, all an aisle off: that none of them tilts the robot is no sign that they are true."""
-    aisles = world(1795649869)
+    aisles = world(1795649869, "plain")
     assert not back_ends.vplog_run(aisles).kept.any()
 
 
 def test_sets_are_compared_at_the_same_sigmas() -> None:
     """47 true and 32 false closures: by the sigmas that each implies, a set without 19 of the true ones is likelier."""
-    room = world(1795648788)
+    room = world(1795648788, "plain")
     np.testing.assert_array_equal(back_ends.vplog_run(room).kept, room.is_true)
 
 
@@ -317,7 +317,7 @@ def test_what_contradicting_sets_have_in_common_is_true(less_likely: float, disp
 
 def test_a_larger_family_of_false_closures_is_told_from_the_true_set_by_improving_both() -> None:
     """21 closures an aisle off in two families, and 16 true ones: sets with some of either are likelier at first."""
-    aisles = world(1729006799)
+    aisles = world(1729006799, "plain")
     answer = back_ends.vplog_run(aisles)
     assert answer.kept[aisles.is_true].all()
     assert answer.kept[~aisles.is_true].sum() <= 2

@@ -163,7 +163,7 @@ def test_fixes_that_jump_are_not_believed() -> None:
 
 def test_a_jump_that_lasts_is_left_out_whole() -> None:
     """24 of 291 fixes are 17 m off, and odometry is bad enough to be bent to half of them."""
-    drawn = world(9700048)
+    drawn = world(9700048, "plain")
     gps = GpsSettings(use=True)
     solved = solve(drawn.odometry, drawn.keyframes, drawn.closures, drawn.gps, Pipeline(gps=gps))
     assert solved.refined.fixes is not None
@@ -421,5 +421,5 @@ def test_fixes_without_altitude_do_not_lay_a_climbing_road_flat() -> None:
 @pytest.mark.parametrize("seed", [856073560, 856073489])
 def test_fixes_whose_noise_does_not_settle_outvote_no_closures(seed: int) -> None:
     """Jumping ones, and correlated ones that claim a third of their sigma."""
-    drawn = world(seed)
+    drawn = world(seed, "plain")
     np.testing.assert_array_equal(back_ends.vplog_run(drawn).kept, drawn.is_true)
