@@ -19,19 +19,26 @@ from vplog.graph.marginals import SharedScale, pose_covariances
 WORLDS = 200
 
 
-@pytest.mark.parametrize("shared", [(), (0.02, 0.05)])
+@pytest.mark.parametrize("shared", [(), (0.02, 0.05), (0.02, 0.05, 0.03)])
 def test_mean_nees_over_many_worlds_is_within_its_interval(shared: tuple[float, ...]) -> None:
     """One keyframe of each, so that they are independent: their sum is chi-square distributed with 6 degrees each.
 
-    Also where all metres of the odometry are wrong alike, and those of the closures, with these sigmas.
+    The metric scales of the odometry and of the closures have these standard deviations, as the odometry's turns do.
     """
     random, total = np.random.default_rng(0), 0.0
     for seed in range(WORLDS):
         drive = ring(14, 4, seed=seed)
         a_from_b, odometry = drive.graph.a_from_b.copy(), drive.graph.odometry
-        scales = [SharedScale(edges, sigma) for edges, sigma in zip((odometry, ~odometry), shared, strict=False)]
-        for edges, sigma in scales:
-            a_from_b[edges, :3, 3] *= 1.0 + sigma * random.normal()
+        kinds = (odometry, False), (~odometry, False), (odometry, True)
+        scales = [
+            SharedScale(edges, sigma, of_rotation) for (edges, of_rotation), sigma in zip(kinds, shared, strict=False)
+        ]
+        for edges, sigma, of_rotation in scales:
+            factor = 1.0 + sigma * random.normal()
+            if of_rotation:
+                a_from_b[edges, :3, :3] = se3.so3_exp(factor * se3.so3_log(a_from_b[edges, :3, :3]))
+            else:
+                a_from_b[edges, :3, 3] *= factor
         graph = replace(drive.graph, a_from_b=a_from_b)
         objective = Objective(Factors.of(graph), np.ones(len(graph.a)))
         poses = minimised(objective, graph.world_from_body, 20, 1e-9).world_from_body

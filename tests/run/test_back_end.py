@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from tests.graph.drive import ODOMETRY_SIGMA, ledger, position_error, ring
-from vplog.data import Gps, Keyframes, Odometry, Verdict
+from vplog.data import Gps, Keyframes, Odometry, Trajectory, Verdict
+from vplog.evaluate.body_truth import BodyTruth
+from vplog.evaluate.closures import score_poses
 from vplog.geometry import geodesy, se3
 from vplog.graph.consistency import is_loop
 from vplog.loops.verify import no_closures
 from vplog.pipeline import Pipeline, load_pipeline
-from vplog.run.back_end import solve
+from vplog.run.back_end import keyframe_covariances, solve
 
 if TYPE_CHECKING:
     from tests.graph.drive import Drive
@@ -82,3 +85,24 @@ def test_fixes_relate_the_pieces_of_a_drive(fixed: bool) -> None:
     found = solve(given, Keyframes("drive", stamps[::2], odometry[::2]), no_closures(), fixes, pipeline)
     assert found.pieces == 2 - fixed
     assert fixed != any("breaks of the odometry have no closure" in one for one in found.warnings)
+
+
+def test_covariances_hold_for_a_gyroscope_with_a_wrong_scale() -> None:
+    """Check the mean NEES of simulated drives whose odometry has errors of scale in its turns and its lengths."""
+    random, found = np.random.default_rng(5), list[float]()
+    for seed in range(6):
+        drive = ring(120, 0, seed=seed)
+        steps = se3.log(se3.between(drive.odometry.odom_from_body[:-1], drive.odometry.odom_from_body[1:]))
+        steps *= np.repeat(1.0 + np.array([0.03, 0.02]) * random.normal(size=2), 3)
+        odom_from_body = np.array([*accumulate(se3.exp(steps), np.matmul, initial=np.eye(4))])
+        covariance = np.tile(np.diag(ODOMETRY_SIGMA**2), (len(odom_from_body), 1, 1))
+        odometry = replace(drive.odometry, odom_from_body=odom_from_body, covariance=covariance, increments=True)
+        keyframes = replace(drive.keyframes, odom_from_body=odom_from_body)
+        result = solve(odometry, keyframes, no_closures(), None, Pipeline())
+        own = keyframe_covariances(result)
+        assert own is not None
+        truth = BodyTruth(Trajectory(keyframes.stamp_ns, drive.true))
+        nees = score_poses(keyframes, result.refined.solution.world_from_body, own, truth).nees
+        assert nees is not None
+        found.append(nees)
+    assert 0.5 < np.mean(found) < 2.0, found

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -11,25 +10,26 @@ import numpy as np
 from vplog.data import Bools, Floats, Ints
 from vplog.errors import GraphError
 from vplog.geometry import se3
-from vplog.graph.build import AXES, parts
+from vplog.graph.build import AXES, informed, parts
 from vplog.graph.least_squares import Objective
-from vplog.graph.normal_equations import normal_equations
 from vplog.graph.sparse.cholesky import Cholesky
 from vplog.graph.sparse.selected_inversion import inverse_blocks, joint_inverse
 
 if TYPE_CHECKING:
     from vplog.graph.factors import Factors
 
-_STEP = 1e-4
-"""Step of a scale for differences: far above rounding, and errors of edges are linear in it."""
-
 
 class SharedScale(NamedTuple):
-    """An error of the metres of some edges that they share: a factor of 1 with this standard deviation."""
+    """Unknown factor, about 1, by which the translations or the rotations of some edges are all wrong together.
+
+    Sources are the radius of a wheel, a wheel base, a gyroscope, a stereo baseline or a focal length.
+    """
 
     edges: Bools
     """(E,)."""
     sigma: float
+    """Standard deviation."""
+    of_rotation: bool = False
 
 
 def edge_covariances(objective: Objective, poses: Floats, edges: Ints) -> Floats:
@@ -51,8 +51,8 @@ def pose_covariances(objective: Objective, poses: Floats, scales: Sequence[Share
     """Covariance (N, d, d) of world_from_body of every pose, in its own frame, after the least squares at `poses`.
 
     Relative to the first pose, whose own is 0, or with positions to where these are measured; d = 6, or 3 in the plane.
-    What the errors of `scales` add no number of edges averages out. To first order; NaN where edges of positive weight
-    do not lead to pose 0. Raises GraphError where the poses are not determined.
+    The errors of `scales` are added, which no number of edges averages out. To first order; NaN where edges of positive
+    weight do not lead to pose 0. Raises GraphError where the poses are not determined.
     """
     graph, on = objective.factors.graph, np.flatnonzero(objective.weight > 0)
     a, b = graph.a[on], graph.b[on]
@@ -62,8 +62,8 @@ def pose_covariances(objective: Objective, poses: Floats, scales: Sequence[Share
     result = np.full((len(poses), *aa.shape[1:]), np.nan)
     result[ends] = np.concatenate([aa, bb])
     if scales:
-        moved = information.solve(_by_scales(objective, poses, scales))
-        result += moved @ np.swapaxes(moved, 1, 2)
+        shift = information.solve(_by_scales(objective, poses, scales))
+        result += shift @ np.swapaxes(shift, 1, 2)
     part = parts(len(poses), a, b)
     result[part != part[0]] = np.nan
     if objective.positions is None:
@@ -72,17 +72,20 @@ def pose_covariances(objective: Objective, poses: Floats, scales: Sequence[Share
 
 
 def _by_scales(objective: Objective, poses: Floats, scales: Sequence[SharedScale]) -> Floats:
-    """(N, d, S) by how much one sigma of each scale changes the gradient at `poses`."""
-    graph = objective.factors.graph
-    columns = []
-    for edges, sigma in scales:
-        gradients = []
-        for factor in (1.0 - _STEP, 1.0 + _STEP):
-            a_from_b = graph.a_from_b.copy()
-            a_from_b[edges, :3, 3] *= factor
-            gradients.append(normal_equations(replace(graph, a_from_b=a_from_b), objective.weight, poses)[1])
-        columns.append((gradients[1] - gradients[0]) * (sigma / (2.0 * _STEP)))
-    return np.stack(columns, axis=2)
+    """Compute by how much one sigma of each scale changes the gradient at `poses`, (N, d, S)."""
+    graph, axes = objective.factors.graph, AXES[objective.factors.graph.dimension]
+    turn, moved = graph.a_from_b[:, :3, :3], graph.a_from_b[:, :3, 3:]
+    motion = np.concatenate([se3.so3_log(turn), (np.swapaxes(turn, 1, 2) @ moved)[:, :, 0]], axis=1)
+    error = np.zeros((*motion.shape, len(scales)))  # of each edge, in the frame of b
+    for column, (edges, sigma, of_rotation) in enumerate(scales):
+        part = slice(0, 3) if of_rotation else slice(3, 6)
+        error[edges, part, column] = sigma * motion[edges, part]
+    pull = objective.weight[:, None, None] * informed(graph) @ error[:, axes]
+    Ad = se3.adjoint(se3.between(poses[graph.b], poses[graph.a]))[:, axes][:, :, axes]
+    gradient = np.zeros((len(poses), len(axes), len(scales)))
+    np.add.at(gradient, graph.b, pull)
+    np.subtract.at(gradient, graph.a, np.swapaxes(Ad, 1, 2) @ pull)
+    return gradient
 
 
 def positions_redundancy(objective: Objective, poses: Floats) -> float:

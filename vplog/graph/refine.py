@@ -112,7 +112,7 @@ class Refined:
     world_from_enu: Floats | None
     """(4, 4) from the plane of the first fix, None without GPS."""
     unknown: list[SharedScale] = field(default_factory=list)
-    """Remaining scale errors of the odometry, and of the closures whose metres are their own."""
+    """Remaining errors of scale: metric scale of odometry and closures, and rotations."""
 
 
 def about_odometry(refined: Refined) -> dict[str, float]:

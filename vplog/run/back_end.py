@@ -32,7 +32,7 @@ from vplog.graph.factors import Factors
 from vplog.graph.gps_factors import GpsSettings, cost_of_fixes, fixes_on, noisier, with_fixes
 from vplog.graph.hypotheses import bounded
 from vplog.graph.least_squares import Objective
-from vplog.graph.marginals import pose_covariances
+from vplog.graph.marginals import SharedScale, pose_covariances
 from vplog.graph.noise import NoiseSettings, broken_edges, edge_covariance
 from vplog.graph.pieces import pieces_placed
 from vplog.graph.refine import Refined, RefineSettings, Scale, refine, rescaled
@@ -98,6 +98,8 @@ def solve(
     log_odds[~graph.odometry] = log_odds_false(closures)[rows]
     decision = decided(present, settings.solve, cost, log_odds)
     refined = refine(bounded(graph), decision.solution, of_odometry, settings.refine, fixes, decision.sigmas, scale)
+    turns = SharedScale(graph.odometry | odometry.of_images, settings.noise.turn_per_radian, of_rotation=True)
+    refined = replace(refined, unknown=[*refined.unknown, turns])
     warnings = noise_warnings + build_warnings + (fixes.warnings if fixes else [])
     warnings += about_jump(decision, np.arange(len(keyframes.stamp_ns)))
     apart, pieces = _apart(broken, graph, refined)
