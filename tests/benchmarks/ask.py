@@ -18,11 +18,12 @@ from tests.benchmarks.measure import Figure
 from vplog.data import EdgeKind, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.build import AXES
-from vplog.graph.consistency import OdometryChain, odometry_chain
-from vplog.graph.evidence import Accidents
+from vplog.graph.consistency import OdometryChain, odometry_chain, runs
+from vplog.graph.factors import Factors
+from vplog.graph.posterior import Posterior
 from vplog.graph.questions import questions
 from vplog.graph.solve import GncSettings, LmSettings, decided
-from vplog.graph.variance_components import claimed_times
+from vplog.graph.variance_components import Sigmas, claimed_times
 from vplog.results import tables
 from vplog.results.g2o import read_g2o
 
@@ -116,7 +117,7 @@ def misplaced(graph: PoseGraph, seed: int) -> tuple[PoseGraph, Bools]:
     """The graph with a third of the places taken for one that lies some metres on or back, as facades and aisles are:
     all closures of a place agree, and the odometry would stand it. Which edges (E,) are."""
     random, chain = np.random.default_rng(seed), OdometryChain.of(graph)
-    places = list(Accidents(graph).among(np.flatnonzero(~graph.odometry)))
+    places = _places(graph)
     a_from_b, false = graph.a_from_b.copy(), np.zeros(len(graph.a), bool)
     forward = se3.between(chain.poses[:-1], chain.poses[1:])[:, :3, 3]
     for at in random.choice(len(places), -(-len(places) // 3), replace=False).tolist():
@@ -230,10 +231,16 @@ def _runs(
     """The runs of closures in the order in which they are asked about."""
     if way == "ask":
         return [one.edges for one in questions(graph, weight, np.zeros(len(weight)), answer != 0)]
-    loops = np.flatnonzero(~graph.odometry)
-    runs = [run for run in Accidents(graph).among(loops) if not answer[run].any()]
-    runs = [runs[at] for at in random.permutation(len(runs))]
-    return runs if way == "random" else sorted(runs, key=lambda run: float(case.score[run].mean()))
+    unknown = [run for run in _places(graph) if not answer[run].any()]
+    unknown = [unknown[at] for at in random.permutation(len(unknown))]
+    return unknown if way == "random" else sorted(unknown, key=lambda run: float(case.score[run].mean()))
+
+
+def _places(graph: PoseGraph) -> list[Ints]:
+    """Runs of closures that claim one displacement."""
+    episodes = Posterior.of(Factors.of(graph), Sigmas()).episodes
+    families = [episodes.edges[episodes.families == number] for number in range(episodes.families.max() + 1)]
+    return [run for family in families for run in runs(graph, family)]
 
 
 def _solved(graph: PoseGraph, answer: Ints) -> tuple[PoseGraph, Floats]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -11,8 +12,13 @@ from scipy.special import chdtri
 
 from vplog.data import Bools, EdgeKind, Floats, Int32s, Ints, PoseGraph
 from vplog.geometry import se3
-from vplog.graph.build import AXES, informed
+from vplog.graph.build import AXES, informed, parts
 from vplog.graph.normal_equations import edge_costs
+
+_BESIDE = 3
+"""Keyframes between neighbours of a run, at both ends: they see the same things."""
+_LONGEST_RUN = 20
+"""Largest number of closures of a run; beyond it the view has changed."""
 
 
 def residual_sigma(graph: PoseGraph, world_from_body: Floats, edges: Ints | None = None) -> Floats:
@@ -65,8 +71,6 @@ class OdometryChain:
     """(N,) number of the unbroken piece of odometry that a pose is on."""
     total: Floats
     """(N, d, d) covariance summed from the first pose on, about the first pose; d = 6, or 3 in the plane."""
-    step: Floats
-    """(N, d) variance of the odometry edge that leads to each pose, in its frame; 0 where none does."""
     axes: list[int]
 
     @classmethod
@@ -83,8 +87,7 @@ class OdometryChain:
         # about the first pose, so that the sums stay small where the odometry's frame is far away, as UTM is
         moved = se3.adjoint(se3.between(poses[:1], poses))[:, axes][:, :, axes]
         total = np.cumsum(moved @ step @ np.swapaxes(moved, 1, 2), axis=0)
-        variance = np.asarray(np.diagonal(step, axis1=1, axis2=2), np.float64)
-        return cls(poses, np.cumsum(leads < 0).astype(np.int64), total, variance, axes)
+        return cls(poses, np.cumsum(leads < 0).astype(np.int64), total, axes)
 
     def distance(self, loops: Ints, graph: PoseGraph) -> Floats:
         """(K,) sigma of the edges `loops` to the odometry, the noise of both together; NaN where it does not lead."""
@@ -92,11 +95,6 @@ class OdometryChain:
         covariance = self.covariance(a, b) + np.linalg.inv(informed(graph, loops))
         chi2 = se3.mahalanobis2(residual_twists(graph, self.poses, loops)[:, self.axes], covariance)
         return np.where(self.part[a] == self.part[b], np.sqrt(np.maximum(chi2, 0.0)), np.nan)
-
-    def accumulated_noise(self, unit: Floats) -> Floats:
-        """(N,) noise accumulated from the first pose on, in multiples of variances (d,), mean over the axes, without
-        lever arms. Between two pieces of odometry it jumps by 1e12."""
-        return np.cumsum((self.step / unit).mean(1) + np.where(np.diff(self.part, prepend=1) > 0, 1e12, 0.0))
 
     def covariance(self, a: Int32s, b: Int32s) -> Floats:
         """(L, d, d) of a_from_b by odometry, in the frame of b, to first order."""
@@ -134,6 +132,24 @@ def _chain(poses: Floats, step: Floats, leads: Ints) -> None:
                     for k in range(3):
                         total += poses[node - 1, i, k] * step[node, k, j]
                     poses[node, i, j] = total
+
+
+def runs(graph: PoseGraph, loops: Ints) -> Iterator[Ints]:
+    """Yield the edges `loops` (K,) in runs: closures between neighbouring keyframes at both ends, in order."""
+    first, second = np.minimum(graph.a[loops], graph.b[loops]), np.maximum(graph.a[loops], graph.b[loops])
+    order = np.lexsort((second, first))
+    at, to = first[order].astype(np.int64), second[order].astype(np.int64)
+    begin = np.searchsorted(at, at - _BESIDE)
+    near = [
+        start + np.flatnonzero(np.abs(to[start : this + 1] - to[this]) <= _BESIDE)
+        for this, start in enumerate(begin.tolist())
+    ]
+    this = np.repeat(np.arange(len(loops)), [len(others) for others in near])
+    label = parts(len(loops), np.concatenate([*near, this[:0]]), this)
+    by_run = np.lexsort((to, label))
+    for run in np.split(by_run, np.cumsum(np.bincount(label))[:-1]):
+        for start in range(0, len(run), _LONGEST_RUN):
+            yield loops[order[run[start : start + _LONGEST_RUN]]]
 
 
 def far_from_odometry(graph: PoseGraph, probability: float, chain: OdometryChain | None = None) -> Bools:

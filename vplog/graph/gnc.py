@@ -1,43 +1,44 @@
 """Graduated non-convexity: inconsistent closures are down-weighted, odometry keeps its weight.
 
-Yang, Antonante, Tzoumas, Carlone: Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020, with three
-additions: the initial inliers are the closures that agree with the odometry (`odometry_mixture`); each closure, and
-each group of neighbouring ones, is tested against the prediction of the rest (`outlier_test`); and the solutions from
-several starts are compared (`hypotheses`).
+Yang, Antonante, Tzoumas, Carlone: Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020. `search` takes its
+result as one proposal of the decision.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from dataclasses import replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from vplog.data import Bools, Floats, Ints, PoseGraph, Solution
 from vplog.graph.build import checked
-from vplog.graph.consistency import (
-    OdometryChain,
-    chi2_quantile,
-    degrees_of_freedom,
-    far_from_odometry,
-    is_loop,
-    residual_sigma,
-)
-from vplog.graph.evidence import log_room
+from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, is_loop, residual_sigma
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.graph.least_squares import descend
-from vplog.graph.lm import solve_weighted
-from vplog.graph.odometry_mixture import modes
-from vplog.graph.outlier_test import OutlierTest
+from vplog.graph.lm import half_chi2, solve_weighted
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import truncated_weights
+from vplog.graph.search import Cost, best_hypothesis, bounded
 from vplog.graph.sparse.workers import Workers
+from vplog.graph.variance_components import Sigmas, claimed_times
 from vplog.settings import Settings
 
 _BRANCHES = 200
 """Branches of the search for the largest set of closures between two pieces of odometry: an exact search of some
 hundred closures, a hundredth of whose pairs disagree by chance, does not end."""
+
+
+class Decision(NamedTuple):
+    """Selection of the true closures."""
+
+    graph: PoseGraph
+    """With the sigmas that are claimed, no closure's far below those of the others."""
+    solution: Solution
+    sigmas: Sigmas
+    """By what the claimed sigmas were multiplied."""
 
 
 class GncSettings(Settings):
@@ -47,9 +48,6 @@ class GncSettings(Settings):
     """Name of the method."""
     inlier_probability: float = Field(default=0.99, gt=0, lt=1)
     """A true closure is kept with this probability: its chi-square of 6 degrees stays below that quantile (16.8)."""
-    gate_probability: float = Field(default=0.999999, gt=0, lt=1)
-    """A closure further from the odometry alone than this quantile (6.2 sigma) is out from the start:
-    wide, as the odometry's noise is the least known number here."""
     growth: float = Field(default=2.0, gt=1)
     """Factor by which the loss comes closer to the truncated one at each stage; the paper has 1.4, 2 found the
     same closures on drives of 850 keyframes in half the time."""
@@ -65,39 +63,42 @@ class GncSettings(Settings):
     """The last solve has converged when a step gains less than this share of the error."""
 
     def __call__(self, graph: PoseGraph) -> Solution:
-        """Solve. Weights are 1 for odometry, 0 or 1 for loops. Raises GraphError where the graph cannot be solved."""
-        graph, _ = checked(graph)
-        factors = Factors.of(graph)
-        loops = np.flatnonzero(is_loop(graph))
-        weight = np.ones(len(graph.a))
-        if len(loops) == 0:
-            start = initial_poses(factors, weight)
-            return solve_weighted(factors, weight, start, self.max_iterations, self.tolerance, "")
-        chain = OdometryChain.of(graph)
-        far = far_from_odometry(graph, self.gate_probability, chain)[loops]
-        likely = modes(graph, loops, chain)[0][1] & ~far
-        weight, poses = self.tested(factors, *self.annealed(factors, likely))
-        accepted = int(weight[loops].sum())
-        found = f"{accepted} of {len(loops)} closures were kept. "
-        return solve_weighted(factors, weight, poses, self.max_iterations, self.tolerance, found)
+        """Solve. Weights are 1 for odometry, 0 or 1 for loops. Raises GraphError if the graph cannot be solved."""
+        return self.decided(graph).solution
 
-    def annealed(self, factors: Factors, likely: Bools) -> tuple[Floats, Floats]:
-        """Weights (E,), 0 or 1, and poses from the `likely` closures (K,), by the noise that the graph has."""
+    def decided(self, graph: PoseGraph, cost: Cost | None = None, log_odds: Floats | None = None) -> Decision:
+        """Decide which closures are true, and solve the graph with them; arguments as those of `best_hypothesis`."""
+        graph, _ = checked(graph)
+        factors, loops = Factors.of(graph), is_loop(graph)
+        if not loops.any():
+            weight = np.ones(len(graph.a))
+            start = initial_poses(factors, weight)
+            solution = solve_weighted(factors, weight, start, self.max_iterations, self.tolerance, "")
+            return Decision(graph, solution, Sigmas())
+        best = best_hypothesis(graph, self.annealed, cost, log_odds)
+        if best.sigmas.at_bound:  # the noise may be larger still, and true closures are lost beyond the bound
+            again = best_hypothesis(claimed_times(graph, best.sigmas), self.annealed, cost, log_odds)
+            best = replace(again, sigmas=best.sigmas.times(again.sigmas))
+        graph = bounded(graph)
+        count, inliers = int(loops.sum()), int(best.weight[loops].sum())
+        if inliers == 0:
+            why = f"Odometry was kept: the {count} closures are likelier to be all false than any of them to be true."
+            before, after = (half_chi2(graph, best.weight, poses) for poses in (graph.world_from_body, best.poses))
+            return Decision(graph, Solution(best.poses, best.weight, before, after, 0, True, why), Sigmas())
+        found = f"{inliers} of {count} closures were kept. "
+        solution = solve_weighted(
+            Factors.of(graph), best.weight, best.poses, self.max_iterations, self.tolerance, found
+        )
+        return Decision(graph, solution, best.sigmas)
+
+    def annealed(self, factors: Factors) -> tuple[Floats, Floats]:
+        """Return weights (E,), 0 or 1, and poses (N, 4, 4) by graduated non-convexity with the noise of the graph."""
         graph = factors.graph
         loops = np.flatnonzero(is_loop(graph))
         weight = np.ones(len(graph.a))
-        weight[loops] = likely & self._consistent(graph, loops, OdometryChain.of(graph))
+        weight[loops] = self._consistent(graph, loops, OdometryChain.of(graph))
         bound = chi2_quantile(self.inlier_probability, degrees_of_freedom(graph))
         return self._anneal(factors, weight, initial_poses(factors, weight, bound), bound)
-
-    def tested(self, factors: Factors, weight: Floats, poses: Floats, strict: bool = False) -> tuple[Floats, Floats]:
-        """Weights (E,) and poses once no closure costs the others too much, and all that they predict are inliers."""
-        graph, chain = factors.graph, OdometryChain.of(factors.graph)
-        room = log_room(graph, chain.poses)
-        loops = np.flatnonzero(is_loop(graph))
-        test = OutlierTest(factors, loops, self.inlier_probability, room, self.max_iterations, chain, strict)
-        state = test(weight, poses)
-        return state.weight, state.poses
 
     def _consistent(self, graph: PoseGraph, loops: Ints, chain: OdometryChain) -> Bools:
         """False for closures (K,) between two pieces of odometry that are not of the largest consistent set."""

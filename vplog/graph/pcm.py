@@ -17,7 +17,6 @@ from vplog.graph.build import checked
 from vplog.graph.clique import largest_clique
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, far_from_odometry, is_loop
 from vplog.graph.displacements import Displacements
-from vplog.graph.evidence import forward
 from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.graph.lm import solve_weighted
@@ -85,8 +84,8 @@ def consistency(graph: PoseGraph, loops: Ints, bound: float, chain: OdometryChai
     nothing about each other, which counts as agreement.
     """
     chain = chain or OdometryChain.of(graph)
-    a, b, measured, noise = forward(graph, loops)
-    claims, piece = Displacements(chain, a, b, measured, noise), np.stack([chain.part[a], chain.part[b]], axis=1)
+    claims = Displacements(graph, loops, chain)
+    piece = np.stack([chain.part[claims.a], chain.part[claims.b]], axis=1)
     result = np.ones((len(loops), len(loops)), bool)
     one, two = np.triu_indices(len(loops), 1)
     alike = (piece[one] == piece[two]).all(1)

@@ -15,10 +15,11 @@ import numpy as np
 
 from vplog.data import Bools, Floats, Ints, PoseGraph
 from vplog.geometry import se3
-from vplog.graph.consistency import residual_sigma
-from vplog.graph.evidence import Accidents, agreeing
+from vplog.graph.consistency import residual_sigma, runs
+from vplog.graph.episodes import Episodes
 from vplog.graph.factors import Factors
-from vplog.graph.hypotheses import AtSigmas, attempted
+from vplog.graph.posterior import Posterior
+from vplog.graph.search import attempted
 from vplog.graph.variance_components import Sigmas
 
 _MOST = 16
@@ -57,16 +58,16 @@ def questions(graph: PoseGraph, weight: Floats, log_odds: Floats, decided: Bools
     (E,) are of being false by what else is known of a closure, 0 where nothing is; on those `decided` (E,) nothing is
     asked. Raises GraphError where the poses are not determined.
     """
-    at = AtSigmas.of(Factors.of(graph), Sigmas())
-    now = at.hypothesis(weight, graph.world_from_body)
+    posterior = Posterior.of(Factors.of(graph), Sigmas())
+    now = posterior.hypothesis(weight, graph.world_from_body)
     best: dict[int, Question] = {}
-    for closures, turned in _sets(at.accidents, weight, decided):
+    for closures, turned in _sets(graph, posterior.episodes, weight, decided):
         other = np.array(weight)
         other[turned] = 1.0 - weight[turned]
-        start = now.poses if other[~graph.odometry].any() else at.accidents.chain.poses
-        for then in attempted(lambda other=other, start=start: [at.hypothesis(other, start)]):
+        start = now.poses if other[~graph.odometry].any() else posterior.episodes.claims.chain.poses
+        for then in attempted(lambda other=other, start=start: posterior.hypothesis(other, start)):
             used = weight[turned[0]] > 0
-            odds = _POWER * (then.log_evidence - now.log_evidence)
+            odds = _POWER * (then.log_density - now.log_density)
             odds += float(log_odds[turned].mean()) * (1.0 if used else -1.0)
             p_wrong = max(1.0 / (1.0 + math.exp(min(-odds, 700.0))), _LEAST_P_FALSE if used else 0.0)
             one = Question(closures, p_wrong, _moved_m(now.poses, then.poses))
@@ -75,30 +76,31 @@ def questions(graph: PoseGraph, weight: Floats, log_odds: Floats, decided: Bools
     return sorted(best.values(), key=lambda one: (-one.expected_m, int(one.edges[0])))
 
 
-def _sets(accidents: Accidents, weight: Floats, decided: Bools) -> Iterator[tuple[Ints, Ints]]:
+def _sets(graph: PoseGraph, episodes: Episodes, weight: Floats, decided: Bools) -> Iterator[tuple[Ints, Ints]]:
     """Closures to ask about, and those that are turned with them.
 
     Each run by itself; and where runs that claim one displacement have no decision among them, all by the longest one:
     a person who knows of one of them knows of them all.
     """
-    graph = accidents.graph
-    loops = np.flatnonzero(~graph.odometry)
     misfit = residual_sigma(graph, graph.world_from_body)
     most = min(_MOST, max(_LEAST, _POSES // len(graph.world_from_body)))
-    runs: list[Ints] = []
+    families = [episodes.edges[episodes.families == number] for number in range(episodes.families.max(initial=-1) + 1)]
+    families.sort(key=len, reverse=True)
+    known: list[Ints] = []
     for used in (True, False):
-        some = [run[(weight[run] > 0) == used] for run in accidents.among(loops)]
+        some = [run[(weight[run] > 0) == used] for family in families for run in runs(graph, family)]
         some = [run for one in some if len(run := one[~decided[one]])]
         # as the search flips them: the used ones that fit worst, the others that fit best; and what stands alone
         doubtful = np.argsort([float(misfit[run].mean()) * (-1.0 if used else 1.0) for run in some], kind="stable")
         alone = np.argsort(-_apart(graph, some), kind="stable")
         chosen = dict.fromkeys([*doubtful[:most].tolist(), *alone[:most].tolist()])
         yield from ((some[at], some[at]) for at in chosen)
-        runs += some
-    families = [one for one in agreeing(accidents, loops)[:_FAMILIES] if not decided[one].any()]
-    for family in families:
+        known += some
+    for family in families[:_FAMILIES]:
+        if decided[family].any():
+            continue
         used = (weight[family] > 0).any()
-        members = [run for run in runs if (weight[run[0]] > 0) == used and np.isin(run[0], family)]
+        members = [run for run in known if (weight[run[0]] > 0) == used and np.isin(run[0], family)]
         if len(members) > 1:
             yield max(members, key=len), np.concatenate(members)
 

@@ -8,8 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from vplog.data import Bools, Floats, PoseGraph, Solution
-from vplog.graph.consistency import residual_sigma
-from vplog.graph.evidence import runs
+from vplog.graph.consistency import residual_sigma, runs
 from vplog.graph.factors import Factors
 from vplog.graph.gps_factors import Fixes, inlier_fixes, with_fixes, with_noise_of, world_from_enu
 from vplog.graph.least_squares import Objective, minimised

@@ -10,8 +10,8 @@ import numpy as np
 from vplog.data import Closures, EdgeKind, Floats, Ints, PoseGraph, Verdict
 from vplog.errors import ResultError
 from vplog.graph.build import busier, checked
-from vplog.graph.hypotheses import bounded
 from vplog.graph.questions import questions
+from vplog.graph.search import bounded
 from vplog.loops.false_rate import log_odds_false
 from vplog.results.report.page import ClosureQuestion
 

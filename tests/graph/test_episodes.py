@@ -1,0 +1,100 @@
+"""The prior of closures and the likelihood of false ones, against densities that are written out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.graph.drive import ring
+from vplog.geometry import se3
+from vplog.graph.consistency import OdometryChain, is_loop
+from vplog.graph.episodes import EPISODE, REPEATED, SHARES, Episodes
+from vplog.graph.factors import Factors
+from vplog.graph.least_squares import descend
+from vplog.graph.posterior import Linearised, Posterior
+from vplog.graph.variance_components import Sigmas
+
+VOLUME = 9.0
+"""Log of the volume of false closures."""
+
+
+def episodes_of(loops: int, seed: int = 0, log_odds: float | None = None) -> Episodes:
+    graph = ring(120, loops, seed=seed).graph
+    edges = np.flatnonzero(is_loop(graph))
+    odds = None if log_odds is None else np.full(len(graph.a), log_odds)
+    return Episodes.of(graph, edges, OdometryChain.of(graph), VOLUME, odds)
+
+
+def test_a_single_closure_is_true_or_anywhere_in_the_volume() -> None:
+    episodes = episodes_of(1)
+    assert episodes.log_density(np.array([False]))[0] == pytest.approx(math.log(np.mean(1.0 - SHARES)))
+    expected = math.log(np.mean(SHARES) * (1.0 - REPEATED)) - VOLUME
+    assert episodes.log_density(np.array([True]))[0] == pytest.approx(expected)
+
+
+def test_recognition_gives_the_prior_of_an_episode() -> None:
+    for p_false in (0.01, 0.3):
+        episodes = episodes_of(1, log_odds=math.log(p_false / (1.0 - p_false)))
+        assert episodes.log_density(np.array([False]))[0] == pytest.approx(math.log(1.0 - p_false))
+
+
+def test_two_false_closures_continue_repeat_or_are_independent() -> None:
+    """Against the density of the second displacement given the first, written out."""
+    episodes = episodes_of(2, seed=3)
+    error, covariance = episodes.claims.apart(np.array([0]), np.array([1]))
+    log_normal = -0.5 * (se3.mahalanobis2(error, covariance)[0] + np.linalg.slogdet(2.0 * np.pi * covariance[0])[1])
+    stays, alone = episodes.continues[1], (1.0 - REPEATED) * math.exp(-VOLUME)
+    begins = (1.0 - stays) * SHARES
+    second = stays * math.exp(log_normal) + begins * (REPEATED * math.exp(log_normal) + alone)
+    expected = math.log(np.mean(SHARES * alone * second))
+    assert episodes.log_density(np.array([True, True]))[0] == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_distance_of_episodes_is_that_of_the_nearest_earlier_closure() -> None:
+    episodes = episodes_of(40, seed=5)
+    ends = np.stack([episodes.claims.a, episodes.claims.b], axis=1)
+    for k in range(1, len(ends)):
+        gap = np.abs(ends[:k] - ends[k]).max(1).min()
+        assert episodes.continues[k] == pytest.approx(math.exp(-gap / EPISODE))
+
+
+def test_false_closures_that_claim_one_displacement_are_one_family() -> None:
+    """True ones all claim that the world has not moved, so they are one family, too."""
+    drive = ring(120, loops=30, false=20, seed=1)
+    edges = np.flatnonzero(is_loop(drive.graph))
+    episodes = Episodes.of(drive.graph, edges, OdometryChain.of(drive.graph), VOLUME, None)
+    largest = episodes.families == np.bincount(episodes.families).argmax()
+    assert largest[~drive.false[episodes.edges]].mean() > 0.9
+    assert largest[drive.false[episodes.edges]].mean() < 0.2
+
+
+def test_a_path_covered_by_one_false_displacement_becomes_unlikely_with_its_length() -> None:
+    """That is what tells a late revisit from a place that looks like another one."""
+    drop = []
+    for loops in (5, 10, 20):
+        episodes = episodes_of(loops, seed=2)
+        false, true = np.ones(loops, bool), np.zeros(loops, bool)
+        drop.append(episodes.log_density(true)[0] - episodes.log_density(false)[0])
+    assert drop[0] < drop[1] < drop[2]
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_flips_are_predicted_from_the_factorisation(size: int) -> None:
+    """The ring's closures are all true, so every flip away from them costs what a solve without them says."""
+    graph = ring(60, loops=20, seed=4).graph
+    posterior, weight = Posterior.of(Factors.of(graph), Sigmas()), np.ones(len(graph.a))
+    one = posterior.hypothesis(
+        weight, descend(posterior.factors, weight, graph.world_from_body, 50, 1e-9).world_from_body
+    )
+    linear = Linearised(posterior, one)
+    for start in range(0, 20 - size, 5):
+        group = np.arange(start, start + size)
+        changed = np.array(weight)
+        changed[posterior.episodes.edges[group]] = 0.0
+        other = posterior.hypothesis(changed, one.poses)
+        assert linear.gain(group) == pytest.approx(other.log_density - one.log_density, abs=2.5)
+        back = Linearised(posterior, replace(other, weight=changed))
+        assert back.gain(group) == pytest.approx(one.log_density - other.log_density, abs=2.5)

@@ -1,0 +1,154 @@
+"""Posterior density of a set of true closures: the objective of the decision.
+
+log p(T, s | z) = log p(z_T | odometry, s) + log p(z_F) + log P(T) + log p(s), up to a constant. T are the true closures
+and F the false ones, s the factors of the claimed noise (`Sigmas`). The first term integrates over the poses (Laplace's
+approximation, exact for a linear graph). `Episodes` has the second and the third term.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from vplog.data import Floats, Ints
+from vplog.graph.build import AXES, informed
+from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, residual_sigma
+from vplog.graph.episodes import Episodes
+from vplog.graph.factors import Factors
+from vplog.graph.false_volume import log_false_volume
+from vplog.graph.least_squares import GAUGE_SIGMA, Objective, descend
+from vplog.graph.leave_one_out import distance, errors, tension
+from vplog.graph.marginals import joint_covariance
+from vplog.graph.variance_components import Sigmas, claimed_times
+
+_TAIL = 3.0
+"""Noise of a true closure that errs more than others, as a multiple of its claim, or of the estimate if that is larger:
+Tukey's contaminated normal distribution (A survey of sampling from contaminated distributions, 1960)."""
+_TAIL_SHARES = np.array([0.0, 0.01, 0.02, 0.05, 0.1, 0.2])[:, None]
+"""Shares of such closures, equally likely."""
+_STEPS, _TOLERANCE = 100, 1e-4
+"""Limits of the least squares that compare hypotheses."""
+_LEAST_RATIO = 1e-9
+"""Smallest ratio of the variance of a residual to that of its closure, so that no quotient is infinite."""
+_LOG_2PI = math.log(2.0 * math.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A set of true closures with the poses and the noise that it implies."""
+
+    weight: Floats
+    """(E,) 1 for odometry and true closures, 0 for false ones."""
+    poses: Floats
+    """(N, 4, 4)."""
+    sigmas: Sigmas
+    log_density: float
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Posterior of the sets of true closures of one graph at fixed noise factors."""
+
+    sigmas: Sigmas
+    factors: Factors
+    """The graph with its noise multiplied."""
+    episodes: Episodes
+
+    @classmethod
+    def of(cls, claimed: Factors, sigmas: Sigmas, log_odds: Floats | None = None) -> Posterior:
+        """Prepare the graph `claimed` with its noise multiplied by `sigmas`; `log_odds` as in `Episodes.of`."""
+        graph = claimed_times(claimed.graph, sigmas)
+        chain, loops = OdometryChain.of(graph), np.flatnonzero(is_loop(graph))
+        episodes = Episodes.of(graph, loops, chain, log_false_volume(graph, chain.poses), log_odds)
+        return cls(sigmas, replace(claimed, graph=graph), episodes)
+
+    def hypothesis(self, weight: Floats, poses: Floats) -> Hypothesis:
+        """Solve the edges of weight (E,) 1 from `poses`. Raises GraphError if these are not determined."""
+        if (weight[~self.factors.graph.odometry] > 0).any():
+            poses = descend(self.factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
+        return Hypothesis(weight, poses, self.sigmas, self.log_density(weight, poses))
+
+    def log_density(self, weight: Floats, poses: Floats) -> float:
+        """Return the log of the posterior density; `poses` are the least squares of the edges of weight (E,) 1."""
+        density, _ = self.episodes.log_density(weight[self.episodes.edges] == 0)
+        true = np.flatnonzero(~self.factors.graph.odometry & (weight > 0))
+        return density + self.sigmas.log_prior() + (self._log_true(weight, poses, true) if len(true) else 0.0)
+
+    def _log_true(self, weight: Floats, poses: Floats, true: Ints) -> float:
+        """Log density of the true closures under the odometry: N(0, A C A^T + R) by the matrix determinant lemma."""
+        factors, graph = self.factors, self.factors.graph
+        d = degrees_of_freedom(graph)
+        loose = len(factors.loose(weight))
+        held = (1 + loose) * d * -2.0 * math.log(GAUGE_SIGMA)
+        joined = int(factors.piece.max()) - loose  # pieces of odometry that only closures join may be anywhere
+        determinant = Objective(factors, weight).information(poses).log_determinant() - held
+        known = np.linalg.slogdet(informed(graph, weight > 0))[1].sum()
+        chi2 = weight * residual_sigma(graph, poses) ** 2
+        normal = 0.5 * (known - determinant - chi2.sum()) - 0.5 * _LOG_2PI * d * (len(true) - joined)
+        return float(normal) - joined * self.episodes.log_volume + self._log_tails(chi2[true])
+
+    @cached_property
+    def _tail(self) -> float:
+        """Noise of closures that err more than others, as a multiple of that of the others."""
+        return _TAIL / min(self.sigmas.of_closures, 1.0)
+
+    def _log_tails(self, chi2: Floats) -> float:
+        """Log of how much likelier squared residuals (K,) are if a share of the closures errs more than the others."""
+        wide = 0.5 * chi2 * (1.0 - self._tail**-2) - degrees_of_freedom(self.factors.graph) * math.log(self._tail)
+        with np.errstate(divide="ignore"):
+            gain = np.logaddexp(np.log1p(-_TAIL_SHARES), np.log(_TAIL_SHARES) + wide).sum(1)
+        return float(np.logaddexp.reduce(gain)) - math.log(len(gain))
+
+    def log_predictive(self, one: Hypothesis) -> Floats:
+        """Return the log density (K,) of each closure given the true ones without it, in the order of the episodes."""
+        edges, d = self.episodes.edges, degrees_of_freedom(self.factors.graph)
+        result, true = np.empty(len(edges)), one.weight[edges] > 0
+        if not true.all():
+            cost, log_spread = distance(self.factors, one.weight, one.poses, edges[~true])
+            result[~true] = -0.5 * cost - np.minimum(log_spread + 0.5 * d * _LOG_2PI, self.episodes.log_volume)
+        if true.any():
+            found = tension(self.factors, one.weight, one.poses, edges[true])
+            result[true] = -0.5 * found.cost
+            result[true] -= np.minimum(found.log_spread + 0.5 * d * _LOG_2PI, self.episodes.log_volume)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """A hypothesis with its factorisation, from which changes are predicted without another solve."""
+
+    posterior: Posterior
+    one: Hypothesis
+
+    @cached_property
+    def _information(self):
+        return Objective(self.posterior.factors, self.one.weight).information(self.one.poses)
+
+    def gain(self, group: Ints) -> float:
+        """Return by how much the log density rises if the closures `group` of the episodes, all of one state, change
+        it. To first order, and without `_log_tails`.
+
+        The joint density of m closures is that of their m d residuals under the prediction of the other true ones.
+        """
+        posterior, one = self.posterior, self.one
+        edges, graph = posterior.episodes.edges[group], posterior.factors.graph
+        d, size = degrees_of_freedom(graph), len(group)
+        is_false = one.weight[posterior.episodes.edges] == 0
+        sign = 1.0 if is_false[group[0]] else -1.0
+        changed = np.array(is_false)
+        changed[group] = ~changed[group]
+        error, jacobian = errors(graph, one.poses, edges)
+        covariance = joint_covariance(posterior.factors, self._information, one.poses, edges)
+        root = np.linalg.cholesky(np.linalg.inv(informed(graph, edges)))
+        whiten = np.linalg.inv(root) @ jacobian
+        covariance = np.einsum("iab,ibjc,jdc->iajd", whiten, covariance.reshape(size, d, size, d), whiten)
+        share, turn = np.linalg.eigh(covariance.reshape(size * d, size * d))
+        ratio = np.maximum(1.0 + sign * share, _LEAST_RATIO)
+        white = turn.T @ np.linalg.solve(root, error[:, AXES[graph.dimension], None]).ravel()
+        log_density = -0.5 * ((white**2 / ratio).sum() + len(white) * _LOG_2PI + sign * np.log(ratio).sum())
+        log_density -= np.log(np.diagonal(root, axis1=1, axis2=2)).sum()
+        states = posterior.episodes.log_density(changed)[0] - posterior.episodes.log_density(is_false)[0]
+        return states + sign * float(log_density)

@@ -1,0 +1,247 @@
+"""Search for the set of true closures, and the noise, of greatest posterior density.
+
+Proposals are graduated non-convexity over all closures, the largest families of closures that claim one displacement,
+and the odometry alone. Each is improved by flips of closures, runs and families, as long as the posterior rises. A flip
+is predicted from the current factorisation; a full solve confirms it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vplog.data import Bools, Floats, Ints, PoseGraph
+from vplog.errors import GraphError
+from vplog.graph.build import informed, weakest_information
+from vplog.graph.consistency import OdometryChain, is_loop
+from vplog.graph.episodes import Episodes
+from vplog.graph.factors import Factors
+from vplog.graph.least_squares import Objective, descend
+from vplog.graph.posterior import Hypothesis, Linearised, Posterior
+from vplog.graph.variance_components import Sigmas, claimed_times, estimate
+
+Cost = Callable[[Factors, Floats, Floats], float]
+"""By how much the log likelihood of other measurements falls with factors, weights (E,) and poses (N, 4, 4)."""
+Proposal = Callable[[Factors], tuple[Floats, Floats]]
+"""Weights (E,), 0 or 1, and poses (N, 4, 4) from which the search starts."""
+
+_MOST_INFORMATION = 1e4
+"""Largest information of a closure as a multiple of the median one, so that none outweighs a hundred others."""
+_KNOWN = 10.0
+"""Information of an axis that a closure knows, as a multiple of what is known of any."""
+_STEADY = 0.05
+"""Change of a noise factor, as a share, below which it is settled."""
+_ROUNDS = 4
+"""Rounds of estimating the noise; 2 are usual."""
+_SHARES = (1.0, 0.25, 0.0625)
+"""Shares of the odometry's noise by which families are told apart: the finer, the better the odometry."""
+_LEAST_FAMILY = 3
+"""Number of closures from which a family is proposed."""
+_FAMILIES = 2
+"""Number of families that are proposed at each share, and that are improved."""
+_TRIED = 8
+"""Number of flips, the most promising first, that are predicted in one turn."""
+_TURNS = 30
+"""Number of turns after which an improvement ends."""
+_JOINT = 30
+"""Largest group of closures whose flip is predicted; its cost is cubic."""
+_MARGIN = 5.0
+"""Predicted loss up to which a flip is solved all the same: predictions are to first order."""
+_STEPS, _TOLERANCE = 100, 1e-4
+
+
+def best_hypothesis(
+    graph: PoseGraph, propose: Proposal, cost: Cost | None = None, log_odds: Floats | None = None
+) -> Hypothesis:
+    """Return the hypothesis of greatest posterior density, less the cost of other measurements.
+
+    `log_odds` (E,) are the log odds that an edge is false by recognition; None or all 0 if these are unknown. Raises
+    GraphError if the graph cannot be solved.
+    """
+    search = _Search(Factors.of(bounded(graph)), propose, log_odds)
+    found = search.hypotheses()
+    if cost is None:
+        return max(found, key=lambda one: one.log_density)
+    return max(found, key=lambda one: one.log_density - cost(search.at(one.sigmas).factors, one.weight, one.poses))
+
+
+def attempted(solve: Callable[[], Hypothesis]) -> list[Hypothesis]:
+    """Return the hypothesis of a solve in a list, which is empty if closures do not determine the poses."""
+    try:
+        return [solve()]
+    except (GraphError, np.linalg.LinAlgError):
+        return []
+
+
+def bounded(graph: PoseGraph) -> PoseGraph:
+    """Return the graph with the information of each closure at most `_MOST_INFORMATION` times the median one.
+
+    The median of an axis is taken over the closures that know it.
+    """
+    loops = np.flatnonzero(~graph.odometry)
+    if not len(loops):
+        return graph
+    axes = np.diagonal(informed(graph, loops), axis1=1, axis2=2)
+    unknown = axes <= _KNOWN * np.diagonal(weakest_information(graph))  # such as height if closures are planar
+    median = np.ma.median(np.ma.masked_array(axes, unknown), axis=0).filled(np.inf)
+    excess = (axes / (median * _MOST_INFORMATION)).max(1)
+    information = graph.information.copy()
+    information[loops] /= np.maximum(excess, 1.0)[:, None, None]
+    return replace(graph, information=information)
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The search in one graph with its claimed noise."""
+
+    claimed: Factors
+    propose: Proposal
+    log_odds: Floats | None
+
+    def at(self, sigmas: Sigmas) -> Posterior:
+        return Posterior.of(self.claimed, sigmas, self.log_odds)
+
+    def hypotheses(self) -> list[Hypothesis]:
+        """Return the likeliest hypotheses, each with its likeliest noise; the first is that no closure is true."""
+        loops, chain = is_loop(self.claimed.graph), OdometryChain.of(self.claimed.graph)
+        posterior = self.at(Sigmas())
+        none = posterior.hypothesis(np.where(loops, 0.0, 1.0), chain.poses)
+        found = [none]
+        annealed = attempted(lambda: self._refit(*self.propose(posterior.factors), Sigmas()))
+        found += [self._improved(one) for one in annealed]
+        best = max(found, key=_log_density)
+        families: list[Hypothesis] = []
+        for weight in self._families(best, loops):
+            families += attempted(lambda weight=weight: self._refit(weight, chain.poses, Sigmas()))
+        starts = sorted(families, key=_log_density)[-_FAMILIES:]
+        if not best.weight.all():
+            starts.append(none)
+        found += [self._improved(one) for one in starts]
+        likeliest = self._at_each_noise(found)
+        return [self._with_noise_of_false(likeliest[0]), *likeliest[1:]]
+
+    def _families(self, best: Hypothesis, loops: Bools) -> Iterator[Floats]:
+        """Weights (E,) of the largest families that may be true in place of the best set: those with a closure that it
+        rejects, and those that are most of it."""
+        proposed = {best.weight.tobytes()}
+        for share in _SHARES:
+            rotation, translation, *of_closures = best.sigmas
+            episodes = self.at(Sigmas(share * rotation, share * translation, *of_closures)).episodes
+            size = np.bincount(episodes.families)
+            for largest in np.argsort(-size, kind="stable")[:_FAMILIES].tolist():
+                weight = np.where(loops, 0.0, 1.0)
+                weight[episodes.edges[episodes.families == largest]] = 1.0
+                may_be = (weight > best.weight).any() or 2 * size[largest] >= best.weight[loops].sum()
+                if size[largest] >= _LEAST_FAMILY and may_be and weight.tobytes() not in proposed:
+                    proposed.add(weight.tobytes())
+                    yield weight
+
+    def _refit(self, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
+        """Solve the edges of weight (E,) 1 and estimate the noise, in turns."""
+        for _ in range(_ROUNDS):
+            factors = replace(self.claimed, graph=claimed_times(self.claimed.graph, sigmas))
+            poses = descend(factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
+            rotation, translation, *of_closures = estimate(Objective(factors, weight), poses, sigmas)
+            before, sigmas = sigmas, Sigmas(rotation, translation, *np.maximum(of_closures, 1.0).tolist())
+            if not sigmas.differ(before, _STEADY):
+                break
+        return self.at(sigmas).hypothesis(weight, poses)
+
+    def _improved(self, best: Hypothesis) -> Hypothesis:
+        """Flip closures, runs and families as long as the posterior rises; estimate the noise after each flip."""
+        posterior = self.at(best.sigmas)
+        for _ in range(_TURNS):
+            flipped = self._flipped(posterior, best)
+            if not flipped:
+                break
+            best = flipped[0]
+            if best.weight[is_loop(self.claimed.graph)].any():
+                for again in attempted(lambda best=best: self._refit(best.weight, best.poses, best.sigmas)):
+                    if again.log_density > best.log_density:
+                        best, posterior = again, self.at(again.sigmas)
+        return best
+
+    def _flipped(self, posterior: Posterior, best: Hypothesis) -> list[Hypothesis]:
+        """A likelier hypothesis after one flip; none if no flip that is tried makes it likelier.
+
+        First all promising flips are tried together, then the most promising ones alone. What a flip of a group gains
+        is foreseen from its median closure, because the others of a group follow from one of them, true or false.
+        """
+        episodes = posterior.episodes
+        is_false = best.weight[episodes.edges] == 0
+        try:
+            log_predictive = posterior.log_predictive(best)
+        except (GraphError, np.linalg.LinAlgError):
+            return []
+        promising: list[tuple[float, Ints]] = []
+        for group in _groups(episodes, is_false):
+            share = float(episodes.false_share[group].mean())
+            gain = float(np.median(log_predictive[group])) + episodes.log_volume + math.log((1.0 - share) / share)
+            promising.append((gain if is_false[group[0]] else -gain, group))
+        promising.sort(key=lambda one: -one[0])
+        together = [group for gain, group in promising if gain > 0]
+        linear = Linearised(posterior, best)
+        tried = [np.unique(np.concatenate(together))] if len(together) > 1 else []
+        for gain, group in promising[:_TRIED]:
+            if (linear.gain(group) > -_MARGIN) if len(group) <= _JOINT else gain > 0:
+                tried.append(group)
+        for group in tried:
+            weight = np.array(best.weight)
+            weight[episodes.edges[group]] = 1.0 - weight[episodes.edges[group]]
+            for one in attempted(lambda weight=weight: posterior.hypothesis(weight, best.poses)):
+                if one.log_density > best.log_density:
+                    return [one]
+        return []
+
+    def _at_each_noise(self, found: list[Hypothesis]) -> list[Hypothesis]:
+        """The sets found, in order, each with the noise of those found that makes it likeliest."""
+        best = dict.fromkeys(one.weight.tobytes() for one in found)
+        for one in found:
+            known = best[one.weight.tobytes()]
+            best[one.weight.tobytes()] = one if known is None else max(known, one, key=_log_density)
+        sets = [one for one in best.values() if one is not None]
+        for sigmas in dict.fromkeys(one.sigmas for one in sets):
+            posterior = self.at(sigmas)
+            for at, one in enumerate(sets):
+                others = attempted(lambda of=posterior, one=one: of.hypothesis(one.weight, one.poses))
+                sets[at] = max(sets[at], *others, key=_log_density) if others else one
+        return sets
+
+    def _with_noise_of_false(self, none: Hypothesis) -> Hypothesis:
+        """The hypothesis that no closure is true, with the noise of the odometry by which false closures agree best:
+        by factors of 2, one part after the other."""
+        improves = True
+        while improves:
+            improves = False
+            rotation, translation, *of_closures = none.sigmas
+            for by in ((0.5, 1.0), (2.0, 1.0), (1.0, 0.5), (1.0, 2.0)):
+                posterior = self.at(Sigmas(by[0] * rotation, by[1] * translation, *of_closures))
+                other = posterior.hypothesis(none.weight, none.poses)
+                if other.log_density > none.log_density:
+                    none, improves = other, True
+        return none
+
+
+def _log_density(one: Hypothesis) -> float:
+    return one.log_density
+
+
+def _groups(episodes: Episodes, is_false: Bools) -> list[Ints]:
+    """Closures that are flipped together: each alone, runs of one state and family, and families."""
+    _, family = episodes.log_density(is_false)
+    run = np.arange(len(family))
+    for k, nearest in enumerate(episodes.nearest.tolist()):
+        if nearest >= 0 and family[nearest] == family[k] and episodes.continues[k] >= math.exp(-1.0):
+            run[k] = run[nearest]
+    everything, false, true = np.arange(len(family)), np.flatnonzero(is_false), np.flatnonzero(~is_false)
+    groups: dict[bytes, Ints] = {}
+    alike = episodes.families
+    for label, members in ((everything, everything), (run, everything), (family, false), (alike, true), (alike, false)):
+        order = members[np.argsort(label[members], kind="stable")]
+        for group in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+            if len(group):
+                groups[group.tobytes()] = group
+    return list(groups.values())
