@@ -10,8 +10,8 @@ import numba
 import numpy as np
 
 from vplog.geometry import se3
+from vplog.graph.dense_front import eliminate_front
 from vplog.graph.normal_equations import logarithm
-from vplog.graph.sparse.dense_front import eliminate_front
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -32,7 +32,7 @@ from vplog.graph.odometry_mixture import modes
 from vplog.graph.outlier_test import OutlierTest
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import truncated_weights
-from vplog.graph.sparse.workers import Workers
+from vplog.graph.workers import Workers
 from vplog.settings import Settings
 
 _BRANCHES = 200

@@ -1,8 +1,4 @@
-"""Elimination of the first rows of one dense symmetric matrix, a front, on one thread or on several: the same bits.
-
-Without a BLAS, whose last bits depend on its threads: each entry is computed by the same operations in the same order
-whatever thread does it.
-"""
+"""Elimination of the first rows of one dense symmetric matrix, without a BLAS: the same bits on any machine's threads."""
 
 from __future__ import annotations
 
@@ -10,7 +6,6 @@ import numba
 import numpy as np
 
 from vplog.data import Floats
-from vplog.graph.sparse.workers import Workers
 
 AT_ONCE = 8
 """Rows subtracted from another in one loop: as many as a processor has registers for their pointers."""
@@ -18,29 +13,6 @@ STRIP = 512
 """Columns of a front per block: eight rows of them, 32 kB, stay in the L1 cache."""
 _PANEL = 8 * AT_ONCE
 """Rows eliminated before the rest is updated: a strip of them, 256 kB, stays in the L2 cache."""
-SHARED = 512
-"""Rows from which on a front is worth sharing between threads: a panel then takes five milliseconds of one."""
-_LEAST_SHARE = 32
-"""Rows or columns that a thread takes at least."""
-_BY_THREAD = 4
-"""Shares for each thread: the first rows of a triangle are longer, and other programs take their time."""
-
-
-def eliminate_together(front: Floats, eliminated: int, workers: Workers) -> bool:
-    """`eliminate_front` by several threads where the front is large."""
-    length = len(front)
-    if length < SHARED or workers.count == 1:
-        return eliminate_front(front, eliminated)
-    scale = np.empty(_PANEL)
-    for begun in range(0, eliminated, _PANEL):
-        end = min(begun + _PANEL, eliminated)
-        if not _panel(front, begun, end, scale, begun, end):
-            return False
-        columns = workers.ranges(end, length, 2 * _LEAST_SHARE)
-        workers.each(_panel, [(front, begun, end, scale, left, right) for left, right in columns])
-        rows = workers.ranges(end, length, _LEAST_SHARE, _BY_THREAD)
-        workers.each(_subtract_panel, [(front, begun, end, low, high) for low, high in rows])
-    return True
 
 
 @numba.njit(cache=True, nogil=True)
