@@ -1,4 +1,4 @@
-"""Elimination of the first rows of one dense symmetric matrix, without a BLAS: the same bits on any machine's threads."""
+"""Elimination of the first rows of one dense symmetric matrix, without a BLAS."""
 
 from __future__ import annotations
 
