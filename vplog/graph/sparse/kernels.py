@@ -8,7 +8,7 @@ Arrays are copied and filled by loops and not by slices, for which Numba compile
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -111,7 +111,7 @@ def factorise(panels: Panels, size: int, values: Floats) -> bool:
 
     Right-looking: each supernode is eliminated, and its outer product is subtracted from its ancestors' panels.
     """
-    zero = np.int64(0)  # Numba compiles _subtract once more for a literal 0
+    zero: Any = np.int64(0)  # Numba compiles _subtract once more for a literal 0
     start, longest = panels.start, panels.longest * size
     factor, line, column = np.empty(longest), np.empty(longest), np.empty(longest, np.int64)
     for node in range(len(start) - 1):
@@ -190,7 +190,7 @@ def invert(  # noqa: PLR0912 (one loop nest, compiled)
     Takahashi, Fagan and Chen 1973: Z_cb = -G Z_bb with G = R_cc^-1 R_cb, for the columns c of a supernode and the rows
     b below them. All blocks of Z_bb are in the panels of its ancestors.
     """
-    zero = np.int64(0)  # as in factorise
+    zero: Any = np.int64(0)  # as in factorise
     start, longest = panels.start, panels.longest * size
     for node in range(len(needed)):
         if needed[node] and start[node] < start[node + 1]:
