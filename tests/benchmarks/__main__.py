@@ -32,6 +32,7 @@ from tests.benchmarks.reading import LARGE_GB, SMALL_GB, reading
 from tests.benchmarks.scale import scale
 from tests.benchmarks.search import free_memory_gb, growth, search
 from tests.benchmarks.serve import hostile, serve
+from tests.benchmarks.sparse import sparse
 from vplog.pipeline import load_pipeline, pipeline_folder
 from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
@@ -53,7 +54,7 @@ DISCOVERY_BAR = 1000.0
 SEARCH_BARS = (4.0, 40.0)
 """Times faster than a scan of binary codes, and of vectors of floats."""
 SIZES = (10_000, 100_000, 1_000_000, 10_000_000)
-LONG = {"large", "batch", "localize", "condense", "compaction", "ask", "serve", "hostile", "city", "night"}
+LONG = {"large", "sparse", "batch", "localize", "condense", "compaction", "ask", "serve", "hostile", "city", "night"}
 """What is measured where it is named."""
 LARGEST_NEEDS_GB = 12.0
 """Memory that must be free for the largest map: the places, the index, and what the system needs beside."""
@@ -90,6 +91,7 @@ def _arguments() -> argparse.Namespace:
         "graphs",
         "reading",
         "large",
+        "sparse",
         "batch",
         "localize",
         "condense",
@@ -161,6 +163,8 @@ def _measure(arguments: argparse.Namespace) -> Iterator[Figure]:
 
 
 def _long(arguments: argparse.Namespace) -> Iterator[Figure]:
+    if "sparse" in arguments.what:
+        yield from sparse()
     if "large" in arguments.what:
         yield from large(arguments.poses)
     if "batch" in arguments.what:

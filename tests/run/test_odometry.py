@@ -14,10 +14,10 @@ from vplog.data import Odometry
 from vplog.errors import LogError
 from vplog.execution.execution import Execution
 from vplog.graph.noise import NoiseSettings, broken_edges, edge_covariance
+from vplog.odometry.self_calibration import Lens
 from vplog.pipeline import load_pipeline, run
 from vplog.run.keyframes import KeyframeSettings
 from vplog.run.odometry import camera_of, check_metric, read, source_of
-from vplog.run.visual_odometry.self_calibration import Lens
 from vplog.testing import pictures
 from vplog.verbs.demo import SMALL, make_drive
 from vplog.verbs.evaluate_run import evaluate

@@ -10,8 +10,8 @@ import pytest
 from vplog.data import Camera, Frame
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
+from vplog.odometry.self_calibration import Lens, lens_of
 from vplog.run import self_calibration
-from vplog.run.visual_odometry.self_calibration import Lens, lens_of
 from vplog.testing import pictures
 from vplog.verbs.demo.scene import make_scene, take_picture
 from vplog.verbs.demo.settings import DemoSettings

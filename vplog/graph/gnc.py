@@ -22,8 +22,8 @@ from vplog.graph.lm import half_chi2, solve_weighted
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import truncated_weights
 from vplog.graph.search import Cost, best_hypothesis, bounded
-from vplog.graph.sparse.workers import Workers
 from vplog.graph.variance_components import Sigmas, claimed_times
+from vplog.graph.workers import Workers
 from vplog.settings import Settings
 
 _BRANCHES = 200

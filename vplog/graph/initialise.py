@@ -12,8 +12,7 @@ from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.consistency import is_loop, odometry_chain, residual_sigma
 from vplog.graph.least_squares import anchored
-from vplog.graph.sparse.cholesky import Cholesky
-from vplog.graph.sparse.frontal import Blocks
+from vplog.graph.sparse.cholesky import Blocks, Cholesky
 
 if TYPE_CHECKING:
     from vplog.graph.factors import Factors

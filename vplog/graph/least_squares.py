@@ -11,9 +11,8 @@ from vplog.data import Floats, Ints
 from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.normal_equations import edge_costs, normal_equations
-from vplog.graph.sparse.cholesky import OPEN, Cholesky
-from vplog.graph.sparse.frontal import Blocks
-from vplog.graph.sparse.workers import Workers
+from vplog.graph.sparse.cholesky import OPEN, Blocks, Cholesky
+from vplog.graph.workers import Workers
 
 if TYPE_CHECKING:
     from vplog.graph.factors import Factors

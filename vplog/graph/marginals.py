@@ -12,8 +12,7 @@ from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed, parts
 from vplog.graph.least_squares import Objective
-from vplog.graph.sparse.cholesky import Cholesky
-from vplog.graph.sparse.selected_inversion import inverse_blocks, joint_inverse
+from vplog.graph.sparse.cholesky import Cholesky, inverse_blocks, joint_inverse
 
 if TYPE_CHECKING:
     from vplog.graph.factors import Factors

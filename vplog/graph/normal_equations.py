@@ -10,8 +10,8 @@ import numba
 import numpy as np
 
 from vplog.data import Floats, Int32s, Ints, PoseGraph
-from vplog.graph.sparse.frontal import Blocks
-from vplog.graph.sparse.workers import Workers
+from vplog.graph.sparse.cholesky import Blocks
+from vplog.graph.workers import Workers
 
 Terms = Callable[[Ints, int, int, "_Edges", Floats, "_Sums"], None]
 

@@ -15,6 +15,9 @@ from vplog.execution.run_warnings import warn
 from vplog.graph.gps_factors import NO_FIXES
 from vplog.logs import TopicChoice
 from vplog.logs.cameras import AHEAD
+from vplog.odometry.inertial import SURE, with_imu
+from vplog.odometry.metric_scale import in_metres
+from vplog.odometry.visual import PERIOD_NS, visual_odometry
 from vplog.run.cache.codecs import json_codec
 from vplog.run.cache.stage_cache import Inputs
 from vplog.run.cache.steps import Steps, step
@@ -22,9 +25,6 @@ from vplog.run.feature_extraction import image_topics
 from vplog.run.keyframes import KeyframeSettings, has_odometry, select_keyframes, ways_without_images
 from vplog.run.lidar_odometry import lidar_odometry, range_of
 from vplog.run.self_calibration import decoded, self_calibrated
-from vplog.run.visual_odometry.inertial import SURE, with_imu
-from vplog.run.visual_odometry.metres import in_metres
-from vplog.run.visual_odometry.visual import PERIOD_NS, visual_odometry
 from vplog.stages import Log
 
 UNIT = (

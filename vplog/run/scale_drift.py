@@ -17,10 +17,10 @@ from vplog.geometry import se3
 from vplog.graph.noise import broken_edges
 from vplog.loops.candidate import Drive, Row, check_queries
 from vplog.loops.propose import Proposals
+from vplog.odometry.metric_scale import random_walk, scaled
 from vplog.run.cache.codecs import json_codec
 from vplog.run.cache.steps import step
 from vplog.run.verification import DriveFeatures, for_verification
-from vplog.run.visual_odometry.metres import random_walk, scaled
 
 _RANKS = 2
 """Candidates of a keyframe that are measured: those of neighbouring ranks give the same ratio."""

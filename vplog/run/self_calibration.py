@@ -14,10 +14,10 @@ from vplog.errors import LogError
 from vplog.execution.execution import Execution
 from vplog.execution.run_warnings import warn
 from vplog.geometry.masking import masked
+from vplog.odometry.self_calibration import EXCERPT, Lens, lens_of
 from vplog.run.cache.codecs import json_codec
 from vplog.run.cache.stage_cache import Inputs
 from vplog.run.cache.steps import step
-from vplog.run.visual_odometry.self_calibration import EXCERPT, Lens, lens_of
 from vplog.stages import EncodedFrame, Log
 
 _FOCAL_LENGTH = 1.2

@@ -19,6 +19,7 @@ from vplog.logs import TopicChoice
 from vplog.logs.clocks import GAP_NS, GAP_PERIODS
 from vplog.logs.odometry_sources import PROPERTIES, evidence_text
 from vplog.logs.stamps import rate_hz
+from vplog.odometry.visual import visual_odometry
 from vplog.results.html import render
 from vplog.results.previews import jpeg
 from vplog.results.run_record import command_of
@@ -27,7 +28,6 @@ from vplog.run.lidar_odometry import new_registration
 from vplog.run.odometry import UNIT, gives_visual, is_metric, source_of
 from vplog.run.provenance import arguments
 from vplog.run.self_calibration import about_uncalibrated
-from vplog.run.visual_odometry.visual import visual_odometry
 from vplog.stages import Log
 from vplog.storage.json_records import plain
 from vplog.storage.scratch import replacing

@@ -22,10 +22,7 @@ from vplog.graph.factors import Factors
 from vplog.graph.gnc import GncSettings
 from vplog.graph.least_squares import descend
 from vplog.graph.normal_equations import normal_equations
-from vplog.graph.sparse import dense_front, frontal_inversion, subtrees
-from vplog.graph.sparse.cholesky import Cholesky
-from vplog.graph.sparse.frontal import Blocks
-from vplog.graph.sparse.selected_inversion import inverse_blocks, joint_inverse
+from vplog.graph.sparse.cholesky import Blocks, Cholesky, inverse_blocks, joint_inverse
 from vplog.graph.sparse.symbolic import Elimination
 
 if TYPE_CHECKING:
@@ -35,12 +32,6 @@ GRAPHS = {"planar": city(400, seed=1), "spatial": ring(80, loops=10).graph, "dri
 EXACT = {2: 1e-4, 3: 1e-7}
 """GTSAM loses digits of a planar edge's derivative where its residual turns by less than a milliradian."""
 each_graph = pytest.mark.parametrize("graph", GRAPHS.values(), ids=GRAPHS)
-
-
-@pytest.fixture(autouse=True)
-def many_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Graphs of this size are worked on in several runs, as large ones."""
-    monkeypatch.setattr(subtrees, "_LEAST_RUN", 0.0)
 
 
 def random_matrix(nodes: int, chords: int, size: int, seed: int) -> tuple[Blocks, np.ndarray]:
@@ -94,25 +85,7 @@ def test_solutions_and_inverses_are_those_of_the_dense_matrix(nodes: int, chords
     assert Cholesky.of(shape, matrix).values.tobytes() == factor.values.tobytes()
 
 
-def test_all_supernodes_are_in_one_run_or_above_all_of_them() -> None:
-    matrix, _ = random_matrix(400, 150, 3, 0)
-    shape = Elimination.of(400, matrix.a, matrix.b)
-    subtrees = shape.subtrees
-    runs = [list(range(*run)) for run in subtrees.runs]
-    assert sorted([node for run in runs for node in run] + subtrees.top) == list(range(len(shape.parent)))
-    for run, roots, after in zip(runs, subtrees.roots, subtrees.after, strict=True):
-        leaving = [node for node in run if shape.parent[node] not in run]
-        assert leaving == roots.tolist()
-        assert set(shape.parent[leaving].tolist()) <= {*subtrees.top, -1}
-        rows = np.concatenate([shape.rows[shape.start[node] : shape.start[node + 1]] for node in run])
-        np.testing.assert_array_equal(np.unique(rows[rows >= shape.first[run[-1] + 1]]), after)
-    for node, children in zip(subtrees.top, subtrees.children, strict=True):
-        np.testing.assert_array_equal(np.flatnonzero(shape.parent == node), children)
-
-
 def test_any_number_of_threads_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (dense_front, frontal_inversion):
-        monkeypatch.setattr(module, "SHARED", 40)  # so that fronts of this size are shared
     monkeypatch.setattr(normal, "_LEAST_SHARE", 16)
     # closures all over it, so that its fronts are large
     random, graph, more = np.random.default_rng(0), GRAPHS["drives"], 400
@@ -132,7 +105,6 @@ def test_any_number_of_threads_gives_the_same_bytes(monkeypatch: pytest.MonkeyPa
         matrix, gradient, error = normal_equations(graph, weight, poses)
         matrix.diagonal[0] += 1e6 * np.eye(6)
         factor = Cholesky.of(Elimination.of(len(poses), graph.a, graph.b), matrix)
-        assert np.diff(factor.shape.first).max() * 6 > 40
         arrays = (matrix.diagonal, matrix.other, gradient, factor.values, factor.solve(gradient[:, :, None]))
         return (
             b"".join(one.tobytes() for one in (*arrays, *inverse_blocks(factor, graph.a, graph.b)))

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from vplog.data import SCALE_WANDER, Camera, Floats, Ints, Odometry
-from vplog.run.visual_odometry.metres import random_walk, scaled, without_scale
+from vplog.odometry.metric_scale import random_walk, scaled, without_scale
 
 _DEPRESSION = np.sin(np.radians(4.0))
 """Sine of the angle below the horizon: what is farther is low by a small error of the pitch alone."""

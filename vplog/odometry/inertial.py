@@ -14,8 +14,8 @@ import numpy as np
 from vplog.data import Camera, Floats, Imu, Keyframes, Odometry
 from vplog.geometry import se3
 from vplog.graph.correct_trajectory import correct_trajectory
-from vplog.graph.inertial import GRAVITY, Solved, States, gyro_bias, preintegrated, solved
-from vplog.run.visual_odometry.metres import scaled
+from vplog.odometry.imu_graph import GRAVITY, Solved, States, gyro_bias, preintegrated, solved
+from vplog.odometry.metric_scale import scaled
 
 _PERIOD_NS = 190_000_000
 """ns between two states, at least: VINS' keyframes; a double integral over less is noise."""

@@ -10,9 +10,9 @@ import pytest
 from vplog.data import Camera, Floats, Frame, Odometry
 from vplog.geometry import se3
 from vplog.graph.noise import NoiseSettings, edge_covariance
-from vplog.run.visual_odometry.ground import Below, below, by_height
-from vplog.run.visual_odometry.metres import without_scale
-from vplog.run.visual_odometry.visual import visual_odometry
+from vplog.odometry.ground import Below, below, by_height
+from vplog.odometry.metric_scale import without_scale
+from vplog.odometry.visual import visual_odometry
 from vplog.verbs.demo.scene import make_scene, take_picture
 from vplog.verbs.demo.settings import DemoSettings
 

@@ -17,14 +17,14 @@ from vplog.data import Camera, Frame, Gps, Keyframes, Odometry
 from vplog.errors import TruthError
 from vplog.execution.execution import Execution
 from vplog.geometry import geodesy, se3
+from vplog.odometry.metric_scale import in_metres
+from vplog.odometry.sensor import Sensor
+from vplog.odometry.two_views import UNIT_DEPTH, rho_of, rho_variance, two_views
+from vplog.odometry.visual import visual_odometry
 from vplog.pipeline import load_pipeline, run
 from vplog.results import run_record, tables
 from vplog.run.landmarks import run_drive
 from vplog.run.scale_drift import in_one_scale
-from vplog.run.visual_odometry.metres import in_metres
-from vplog.run.visual_odometry.sensor import Sensor
-from vplog.run.visual_odometry.two_views import UNIT_DEPTH, rho_of, rho_variance, two_views
-from vplog.run.visual_odometry.visual import visual_odometry
 from vplog.testing import pictures
 from vplog.verbs.demo.scene import make_scene, take_picture
 from vplog.verbs.demo.settings import DemoSettings
@@ -33,7 +33,7 @@ from vplog.verbs.report import judge
 
 if TYPE_CHECKING:
     from vplog.data import Floats
-    from vplog.run.visual_odometry.sensor import Points
+    from vplog.odometry.sensor import Points
     from vplog.verbs.demo.record import Demo
 
 SENSOR = Sensor(Camera("camera", np.array([[500, 0, 320], [0, 500, 240], [0, 0, 1.0]]), "none", np.zeros(0), 640, 480,

@@ -14,9 +14,9 @@ from vplog import logs
 from vplog.data import Camera, Floats, Imu, Ints, Odometry
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
-from vplog.graph.inertial import GRAVITY
 from vplog.logs.topic_selection import TopicChoice
-from vplog.run.visual_odometry.inertial import SURE, Inertial, with_imu
+from vplog.odometry.imu_graph import GRAVITY
+from vplog.odometry.inertial import SURE, Inertial, with_imu
 from vplog.verbs.demo.record import IMU, make_drive
 from vplog.verbs.demo.settings import SMALL
 

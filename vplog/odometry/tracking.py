@@ -16,7 +16,7 @@ from vplog.geometry import se3
 from vplog.loops import undistort
 from vplog.loops.pose_refinement import LandmarkMatches
 from vplog.loops.verify_metric import MetricSettings, find_pose, log10_false_alarms, refit
-from vplog.run.visual_odometry.sensor import Points, Sensor, follow
+from vplog.odometry.sensor import Points, Sensor, follow
 
 _CORNERS = 300
 """Points of a frame: RTAB-Map's and VINS' 150 to 1000; more cost time, and hardly sharpen a pose."""

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from vplog.data import Camera, Floats, Frame, Ints
-from vplog.graph.bundle import Bundle, Observations, adjust
-from vplog.run.visual_odometry.sensor import Sensor
-from vplog.run.visual_odometry.visual import Tracker
+from vplog.odometry.bundle_adjustment import Bundle, Observations, adjust
+from vplog.odometry.sensor import Sensor
+from vplog.odometry.visual import Tracker
 
 EXCERPT = 80
 """Frames of an excerpt."""

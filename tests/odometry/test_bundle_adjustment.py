@@ -7,7 +7,7 @@ import pytest
 
 from vplog.data import Floats
 from vplog.geometry import se3
-from vplog.graph.bundle import Observations, adjust
+from vplog.odometry.bundle_adjustment import Observations, adjust
 
 SIGMA = 0.3 / 500.0
 """Of a normalised coordinate: 0.3 px at a focal length of 500 px."""

@@ -19,12 +19,12 @@ import numpy as np
 from vplog.data import Camera, Float32s, Floats, Frame, Odometry
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
-from vplog.graph.bundle import Observations, adjust
-from vplog.run.visual_odometry.ground import Below, below, by_height
-from vplog.run.visual_odometry.metres import scaled
-from vplog.run.visual_odometry.sensor import Points, Sensor, follow
-from vplog.run.visual_odometry.tracking import Motion, ReferenceFrame, cloud, corners, solve, track
-from vplog.run.visual_odometry.two_views import CERTAINTY, UNIT_DEPTH, rho_of, rho_variance, two_views
+from vplog.odometry.bundle_adjustment import Observations, adjust
+from vplog.odometry.ground import Below, below, by_height
+from vplog.odometry.metric_scale import scaled
+from vplog.odometry.sensor import Points, Sensor, follow
+from vplog.odometry.tracking import Motion, ReferenceFrame, cloud, corners, solve, track
+from vplog.odometry.two_views import CERTAINTY, UNIT_DEPTH, rho_of, rho_variance, two_views
 
 _WINDOW = 8
 """References that are adjusted together: as libviso's and VINS' 5 to 10; what is older hardly shares a landmark."""

@@ -13,9 +13,9 @@ from vplog.geometry import se3
 from vplog.graph.noise import NoiseSettings, edge_covariance
 from vplog.graph.refine import Refined
 from vplog.graph.variance_components import Sigmas, claimed_times
+from vplog.odometry.sensor import disparities, follow
+from vplog.odometry.visual import visual_odometry
 from vplog.run.back_end import BackEndResult, keyframe_covariances
-from vplog.run.visual_odometry.sensor import disparities, follow
-from vplog.run.visual_odometry.visual import visual_odometry
 from vplog.verbs.demo.scene import Scene, make_scene, take_picture
 from vplog.verbs.demo.settings import DemoSettings
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from vplog.data import Bools, Floats
 from vplog.geometry import se3
-from vplog.graph.bundle import Observations, adjust
+from vplog.odometry.bundle_adjustment import Observations, adjust
 
 if TYPE_CHECKING:
-    from vplog.run.visual_odometry.sensor import Points
+    from vplog.odometry.sensor import Points
 
 UNIT_DEPTH = 10.0
 """Units of the median depth, of two views and of a piece: that of a street in m, so that spacings of keyframes and

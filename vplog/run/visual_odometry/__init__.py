@@ -1,1 +1,0 @@
-"""Odometry by images: corners tracked from frame to frame, poses and landmarks adjusted together."""
