@@ -34,6 +34,10 @@ _KNOWN = 10.0
 """Information of an axis that a closure knows, as a multiple of what is known of any."""
 _STEADY = 0.05
 """Change of a noise factor, as a share, below which it is settled."""
+_LEAST_NOISE = Sigmas(0.5, 0.5, 1.0, 1.0)
+"""Smallest noise factors of a decision: those of the odometry, then those of closures. Neighbouring closures share
+landmarks, and odometry has biases. Both agree with themselves better than they are right, and an estimate from that
+agreement would reject the closures that show the error."""
 _ROUNDS = 4
 """Rounds of estimating the noise; 2 are usual."""
 _SHARES = (1.0, 0.25, 0.0625)
@@ -155,8 +159,8 @@ class _Search:
         for _ in range(_ROUNDS):
             factors = replace(self.claimed, graph=claimed_times(self.claimed.graph, sigmas))
             poses = descend(factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
-            rotation, translation, *of_closures = estimate(Objective(factors, weight), poses, sigmas)
-            before, sigmas = sigmas, Sigmas(rotation, translation, *np.maximum(of_closures, 1.0).tolist())
+            before, sigmas = sigmas, estimate(Objective(factors, weight), poses, sigmas)
+            sigmas = Sigmas(*np.maximum(sigmas, _LEAST_NOISE).tolist())
             if not sigmas.differ(before, _STEADY):
                 break
         return self.at(sigmas).hypothesis(weight, poses)
