@@ -103,6 +103,17 @@ def test_least_squares_uses_every_edge(path: Path, tmp_path: Path) -> None:
     assert not done.record["odometry_kept"]
 
 
+@pytest.mark.parametrize(("odometry", "closures"), [(1e-12, 1e-12), (1e12, 1e12), (1e-12, 1e12)])
+def test_information_that_no_sensor_has_is_refused(tmp_path: Path, odometry: float, closures: float) -> None:
+    """Closures cannot be judged by it; a method that does not judge them still solves the file."""
+    graph = ring(40, 12).graph
+    information = np.where(is_loop(graph)[:, None, None], closures, odometry) * np.eye(6)
+    write_g2o(tmp_path / "in.g2o", replace(graph, information=information), graph.world_from_body)
+    with pytest.raises(GraphError, match=r"claims a standard deviation of .* m for steps of .* m.* --method lm"):
+        optimize(tmp_path / "in.g2o", tmp_path / "out.g2o")
+    assert optimize(tmp_path / "in.g2o", tmp_path / "out.g2o", "lm").record["kept"] == 12
+
+
 def test_parts_are_solved_each_by_itself_and_that_is_said(tmp_path: Path) -> None:
     text = "".join(f"VERTEX_SE2 {node} {node} 9 0\n" for node in (0, 1, 2, 40, 41, 42, 99))
     text += "".join(f"EDGE_SE2 {a} {b} {EDGE}" for a, b in ((0, 1), (1, 2), (40, 41), (41, 42)))

@@ -13,12 +13,12 @@ from vplog.data import Bools, Ints, PoseGraph, Solution
 from vplog.errors import GraphError, plural
 from vplog.execution.timing import StageTimer
 from vplog.geometry.se3 import inverse
-from vplog.graph.build import checked, parts, subgraph
+from vplog.graph.build import AXES, checked, informed, parts, subgraph
 from vplog.graph.certificate import solve_certified
-from vplog.graph.consistency import OdometryChain, residual_sigma, residual_twists
+from vplog.graph.consistency import OdometryChain, is_loop, residual_sigma, residual_twists
 from vplog.graph.factors import Factors
 from vplog.graph.lm import LmSettings, solve_weighted
-from vplog.graph.solve import OptimiserSettings, about_jump, decided
+from vplog.graph.solve import GncSettings, OptimiserSettings, about_jump, decided
 from vplog.graph.variance_components import Sigmas
 from vplog.results.g2o import GraphFile, read_g2o, write_g2o
 
@@ -27,6 +27,9 @@ _RESTATED, _RESTATED_SIGMA = 1e-3, 1e-2
 measurements by themselves are as near only by chance."""
 _AS_CLAIMED = 2.0
 """Factor of a sigma up to which noise is as claimed."""
+_CLAIMS = 1e-5, 1e3
+"""Standard deviation of odometry, as a share of its steps, that a sensor may have: a thousandth of a per cent of the
+path is beyond any sensor, and a thousand times the path is no measurement."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +118,8 @@ def solve_parts(
             continue
         alone, repairs = checked(subgraph(graph, rows, edges))
         where = f"Part from {ids[rows[0]]} on: " if (size > 1).sum() > 1 else ""
+        if isinstance(optimiser, GncSettings):
+            _check_claims(alone)
         again, own = _restates_odometry(alone), np.ones(len(edges))
         judged = np.flatnonzero(~again)
         decision = decided(subgraph(alone, np.arange(len(rows)), judged), optimiser)
@@ -141,6 +146,23 @@ def solve_parts(
     reason = " ".join(one.reason for one in solutions)
     solution = Solution(poses, weight, before, after, iterations, converged, reason)
     return solution, replace(graph, information=information), sigmas, warnings
+
+
+def _check_claims(graph: PoseGraph) -> None:
+    """Raise GraphError if no odometry has the noise that the information claims: closures cannot be judged by it."""
+    edges = np.flatnonzero(graph.odometry)
+    step = float(np.sqrt((graph.a_from_b[edges, :3, 3] ** 2).sum(1).mean())) if len(edges) else 0.0
+    if not (step and is_loop(graph).any()):
+        return
+    axes = np.array(AXES[graph.dimension]) >= 3
+    variance = np.diagonal(np.linalg.inv(informed(graph, edges)), axis1=1, axis2=2)[:, axes]
+    sigma = float(np.sqrt(np.median(variance)))
+    if not _CLAIMS[0] <= sigma / step <= _CLAIMS[1]:
+        raise GraphError(
+            f"The information of the odometry claims a standard deviation of {sigma:.3g} m for steps of {step:.3g} m, "
+            "by which closures cannot be judged. Correct the information in the file, or use all edges as they are: "
+            "--method lm"
+        )
 
 
 def _about_noise(sigmas: Sigmas) -> list[str]:
