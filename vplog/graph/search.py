@@ -34,10 +34,10 @@ _KNOWN = 10.0
 """Information of an axis that a closure knows, as a multiple of what is known of any."""
 _STEADY = 0.05
 """Change of a noise factor, as a share, below which it is settled."""
-_LEAST_NOISE = Sigmas(0.5, 0.5, 1.0, 1.0)
-"""Smallest noise factors of a decision: those of the odometry, then those of closures. Neighbouring closures share
-landmarks, and odometry has biases. Both agree with themselves better than they are right, and an estimate from that
-agreement would reject the closures that show the error."""
+_LEAST_NOISE = Sigmas(0.25, 0.25, 1.0, 1.0)
+"""Smallest noise factors of a decision. Neighbouring closures share landmarks, and odometry has biases: both agree with
+themselves better than they are right. An estimate from that agreement would reject the closures that show the error. A
+quarter of the odometry's claim is one standard deviation of the prior."""
 _ROUNDS = 4
 """Rounds of estimating the noise; 2 are usual."""
 _SHARES = (1.0, 0.25, 0.0625)

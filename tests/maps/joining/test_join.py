@@ -136,7 +136,7 @@ def test_the_halves_of_a_drive_are_one_component(whole: Path, drive: Demo) -> No
     }
     for name, (_, world_from_body) in poses.items():
         found = se3.between(start[0], world_from_body)[:, :3, 3]
-        assert np.linalg.norm(found - se3.between(truth["after"][0], truth[name])[:, :3, 3], axis=1).max() < 2.0
+        assert np.linalg.norm(found - se3.between(truth["after"][0], truth[name])[:, :3, 3], axis=1).max() < 4.0
     ledger = tables.read_joins(folder / "joins.parquet")["before", "after"]
     assert np.nansum(ledger.weight) == told["joins"][0]["kept"]
     assert first.drive == "after"
