@@ -25,8 +25,8 @@ from vplog.graph.marginals import joint_covariance
 from vplog.graph.variance_components import Sigmas, claimed_times
 
 _TAIL = 3.0
-"""Noise of a true closure that errs more than others, as a multiple of its claim, or of the estimate if that is larger:
-Tukey's contaminated normal distribution (A survey of sampling from contaminated distributions, 1960)."""
+"""Noise of a true closure that errs more than others, as a multiple of the noise of the others: Tukey's contaminated
+normal distribution (A survey of sampling from contaminated distributions, 1960)."""
 _TAIL_SHARES = np.array([0.0, 0.01, 0.02, 0.05, 0.1, 0.2])[:, None]
 """Shares of such closures, equally likely."""
 _STEPS, _TOLERANCE = 100, 1e-4
@@ -90,14 +90,9 @@ class Posterior:
         normal = 0.5 * (known - determinant - chi2.sum()) - 0.5 * _LOG_2PI * d * (len(true) - joined)
         return float(normal) - joined * self.episodes.log_volume + self._log_tails(chi2[true])
 
-    @cached_property
-    def _tail(self) -> float:
-        """Noise of closures that err more than others, as a multiple of that of the others."""
-        return _TAIL / min(self.sigmas.of_closures, 1.0)
-
     def _log_tails(self, chi2: Floats) -> float:
         """Log of how much likelier squared residuals (K,) are if a share of the closures errs more than the others."""
-        wide = 0.5 * chi2 * (1.0 - self._tail**-2) - degrees_of_freedom(self.factors.graph) * math.log(self._tail)
+        wide = 0.5 * chi2 * (1.0 - _TAIL**-2) - degrees_of_freedom(self.factors.graph) * math.log(_TAIL)
         with np.errstate(divide="ignore"):
             gain = np.logaddexp(np.log1p(-_TAIL_SHARES), np.log(_TAIL_SHARES) + wide).sum(1)
         return float(np.logaddexp.reduce(gain)) - math.log(len(gain))
