@@ -26,8 +26,8 @@ EPISODE = 3.0
 """Mean length of an episode in keyframes. Prior: a few neighbouring keyframes share most of their features, and a cause
 of aliasing rarely covers a longer path."""
 REPEATED = 0.3
-"""Prior probability that a false episode repeats the displacement of an earlier one, as in a row of equal aisles. From 0.1
-to 0.7 the late revisits of a simulated lap are all kept; a drive whose closures are all false is accepted at 0.1."""
+"""Prior probability that a false episode repeats the displacement of an earlier one, as in a row of equal aisles. Late
+revisits of a simulated lap are all kept from 0.1 to 0.7. At 0.1 a drive was accepted whose closures are all false."""
 SHARES = np.linspace(0.05, 0.95, 10)
 """Values of phi, equally likely, if recognition does not tell how likely a closure is false."""
 _FAMILIES = 50
