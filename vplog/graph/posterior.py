@@ -122,6 +122,10 @@ class Linearised:
     def _information(self):
         return Objective(self.posterior.factors, self.one.weight).information(self.one.poses)
 
+    @cached_property
+    def _log_states(self) -> float:
+        return self.posterior.episodes.log_density(self.one.weight[self.posterior.episodes.edges] == 0)[0]
+
     def gain(self, group: Ints) -> float:
         """Return by how much the log density rises if the closures `group` of the episodes, all of one state, change
         it. To first order, and without `_log_tails`.
@@ -145,5 +149,5 @@ class Linearised:
         white = turn.T @ np.linalg.solve(root, error[:, AXES[graph.dimension], None]).ravel()
         log_density = -0.5 * ((white**2 / ratio).sum() + len(white) * _LOG_2PI + sign * np.log(ratio).sum())
         log_density -= np.log(np.diagonal(root, axis1=1, axis2=2)).sum()
-        states = posterior.episodes.log_density(changed)[0] - posterior.episodes.log_density(is_false)[0]
+        states = posterior.episodes.log_density(changed)[0] - self._log_states
         return states + sign * float(log_density)

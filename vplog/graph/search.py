@@ -213,11 +213,8 @@ class _Search:
 
     def _at_each_noise(self, found: list[Hypothesis]) -> list[Hypothesis]:
         """The sets found, in order, each with the noise of those found that makes it likeliest."""
-        best = dict.fromkeys(one.weight.tobytes() for one in found)
-        for one in found:
-            known = best[one.weight.tobytes()]
-            best[one.weight.tobytes()] = one if known is None else max(known, one, key=_log_density)
-        sets = [one for one in best.values() if one is not None]
+        best = {one.weight.tobytes(): one for one in sorted(found, key=_log_density)}
+        sets = [best[key] for key in dict.fromkeys(one.weight.tobytes() for one in found)]
         for sigmas in dict.fromkeys(one.sigmas for one in sets):
             posterior = self.at(sigmas)
             for at, one in enumerate(sets):

@@ -34,7 +34,7 @@ _SURE = 1e-3
 _FINER = 2.0
 """Times the least false rate that pairs can tell is below the rate that is asked for."""
 _STRONG = 0.05
-"""False rate from which on closures of one place are strong evidence by themselves (graph/episodes.py)."""
+"""False rate below which the closures of one place are strong evidence by themselves."""
 MOST_APART = 8
 """Keyframes between which odometry hardly drifts, as of the pairs that calibrate the camera."""
 
