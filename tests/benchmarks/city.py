@@ -24,6 +24,7 @@ from vplog.execution.execution import Execution
 from vplog.geometry import se3
 from vplog.graph import growth, joint
 from vplog.graph.lm import LmSettings
+from vplog.graph.slips import Slipping
 from vplog.graph.solve import Decision
 from vplog.graph.variance_components import Sigmas
 from vplog.loops.verify import no_closures
@@ -243,7 +244,7 @@ def undecided() -> Iterator[None]:
     before = joint.decided, growth.decided
 
     def plain(graph: PoseGraph, *_: Any, **__: Any) -> Decision:
-        return Decision(graph, LmSettings()(graph), Sigmas())
+        return Decision(graph, LmSettings()(graph), Sigmas(), Slipping.nowhere(graph))
 
     joint.decided = growth.decided = plain
     try:

@@ -15,8 +15,9 @@ from pydantic import TypeAdapter
 from tests.graph.drive import position_error, ring, without_loops
 from tests.graph.gtsam_graph import as_array, weighted
 from vplog.data import EdgeKind, PoseGraph, Solution
+from vplog.geometry import se3
 from vplog.graph.consistency import chi2_quantile
-from vplog.graph.solve import GncSettings, LmSettings, OptimiserSettings, about_jump, decided
+from vplog.graph.solve import GncSettings, LmSettings, OptimiserSettings, about_slips, decided
 
 METHODS = [GncSettings(), LmSettings()]
 
@@ -58,14 +59,46 @@ def test_false_closures_lose_their_weight_and_true_ones_keep_it(false: int, seed
 
 
 @pytest.mark.parametrize("jump_m", [0.0, 10.0])
-def test_rejected_closures_that_agree_tell_where_the_odometry_jumps(jump_m: float) -> None:
-    graph = ring(60, loops=20, false=5).graph
-    measured = graph.a_from_b.copy()
+def test_a_step_that_the_closures_contradict_is_not_used(jump_m: float) -> None:
+    drive = ring(60, loops=20, false=5)
+    measured = drive.graph.a_from_b.copy()
     measured[30, 0, 3] += jump_m
-    decision = decided(replace(graph, a_from_b=measured), GncSettings())
-    found = [re.search(r"between poses (\d+) and (\d+)", text) for text in about_jump(decision, np.arange(60) + 100)]
+    decision = decided(replace(drive.graph, a_from_b=measured), GncSettings())
+    true = ~drive.false & ~drive.graph.odometry
+    assert decision.solution.weight[true].all()
+    assert position_error(decision.solution.world_from_body, drive.true) < 0.5
+    found = [re.search(r"between poses (\d+) and (\d+)", text) for text in about_slips(decision, np.arange(60) + 100)]
     assert len(found) == (jump_m > 0.0)
     assert all(one is not None and 120 <= int(one[1]) <= 130 < int(one[2]) < 140 for one in found)
+
+
+def test_a_robot_that_is_held_in_place_keeps_its_closures() -> None:
+    """Its wheels turn for ten steps; closures see that it stands, and that the ways before and after meet there."""
+    random = np.random.default_rng(1)
+    drive = ring(60, loops=20, false=0)
+    stalled = np.insert(drive.true, [30] * 10, drive.true[30], axis=0)
+    graph = drive.graph
+    a, b = (np.where(end > 30, end + 10, end).astype(np.int32) for end in (graph.a, graph.b))
+    loops_ = ~graph.odometry
+    steps = np.arange(69, dtype=np.int32)
+    at, to = np.array([31, 33, 35, 32], np.int32), np.array([36, 38, 40, 39], np.int32)
+    step = se3.between(stalled[:-1], stalled[1:]) @ se3.exp(random.normal(size=(69, 6)) * 0.002)
+    step[30:40, 0, 3] += 1.0
+    stands = se3.exp(random.normal(size=(4, 6)) * 0.01)
+    info = graph.information
+    held = replace(
+        graph,
+        world_from_body=stalled,
+        a=np.concatenate([steps, a[loops_], at]),
+        b=np.concatenate([steps + 1, b[loops_], to]),
+        a_from_b=np.concatenate([step, graph.a_from_b[loops_], stands]),
+        information=np.concatenate([np.tile(info[0], (69, 1, 1)), info[loops_], np.tile(info[loops_][:1], (4, 1, 1))]),
+        kind=[EdgeKind.ODOMETRY] * 69 + [EdgeKind.LOOP] * (int(loops_.sum()) + 4),
+    )
+    decision = decided(held, GncSettings())
+    assert decision.solution.weight.all()
+    assert set(decision.slipping.edges.tolist()) == set(range(30, 40))
+    assert position_error(decision.solution.world_from_body, stalled) < 0.5
 
 
 def test_gnc_agrees_with_gtsam() -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from vplog.data import Bools, Floats, Ints, PoseGraph, Solution
+from vplog.graph.best_hypothesis import best_hypothesis
 from vplog.graph.build import checked
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, is_loop, residual_sigma
 from vplog.graph.factors import Factors
@@ -20,7 +21,8 @@ from vplog.graph.least_squares import descend
 from vplog.graph.lm import half_chi2, solve_weighted
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import truncated_weights
-from vplog.graph.search import Cost, best_hypothesis, bounded
+from vplog.graph.search import Cost, bounded
+from vplog.graph.slips import Slipping
 from vplog.graph.variance_components import Sigmas
 from vplog.graph.workers import Workers
 from vplog.settings import Settings
@@ -28,16 +30,19 @@ from vplog.settings import Settings
 _BRANCHES = 200
 """Branches of the search for the largest set of closures between two pieces of odometry: an exact search of some
 hundred closures, a hundredth of whose pairs disagree by chance, does not end."""
+_JOINS = 1e-6
+"""Least weight of odometry, so that the poses stay determined."""
 
 
 class Decision(NamedTuple):
-    """Selection of the true closures."""
+    """Selection of the true closures and of the steps of the odometry that slip."""
 
     graph: PoseGraph
-    """With the sigmas that are claimed, no closure's far below those of the others."""
+    """With the sigmas that are claimed, no closure's far below those of the others, and slipping steps replaced."""
     solution: Solution
     sigmas: Sigmas
     """By what the claimed sigmas were multiplied."""
+    slipping: Slipping
 
 
 class GncSettings(Settings):
@@ -73,28 +78,34 @@ class GncSettings(Settings):
             weight = np.ones(len(graph.a))
             start = initial_poses(factors, weight)
             solution = solve_weighted(factors, weight, start, self.max_iterations, self.tolerance, "")
-            return Decision(graph, solution, Sigmas())
+            return Decision(graph, solution, Sigmas(), Slipping.nowhere(graph))
         best = best_hypothesis(graph, self.annealed, cost, log_odds)
-        graph = bounded(graph)
+        graph = best.slipping.applied(bounded(graph), best.sigmas)
         count, inliers = int(loops.sum()), int(best.weight[loops].sum())
         if inliers == 0:
             why = f"Odometry was kept: the {count} closures are likelier to be all false than any of them to be true."
             before, after = (half_chi2(graph, best.weight, poses) for poses in (graph.world_from_body, best.poses))
-            return Decision(graph, Solution(best.poses, best.weight, before, after, 0, True, why), Sigmas())
+            solution = Solution(best.poses, best.weight, before, after, 0, True, why)
+            return Decision(graph, solution, Sigmas(), best.slipping)
         found = f"{inliers} of {count} closures were kept. "
         solution = solve_weighted(
             Factors.of(graph), best.weight, best.poses, self.max_iterations, self.tolerance, found
         )
-        return Decision(graph, solution, best.sigmas)
+        return Decision(graph, solution, best.sigmas, best.slipping)
 
-    def annealed(self, factors: Factors) -> tuple[Floats, Floats]:
-        """Return weights (E,), 0 or 1, and poses (N, 4, 4) by graduated non-convexity with the noise of the graph."""
+    def annealed(self, factors: Factors, may_be_false: Bools) -> tuple[Floats, Floats]:
+        """Return weights (E,), 0 or 1, and poses (N, 4, 4) by graduated non-convexity with the noise of the graph.
+
+        The edges `may_be_false` (E,) may be rejected: closures, or odometry as well.
+        """
         graph = factors.graph
-        loops = np.flatnonzero(is_loop(graph))
+        loops, chain = np.flatnonzero(is_loop(graph)), OdometryChain.of(graph)
         weight = np.ones(len(graph.a))
-        weight[loops] = self._consistent(graph, loops, OdometryChain.of(graph))
+        weight[loops] = self._consistent(graph, loops, chain)
         bound = chi2_quantile(self.inlier_probability, degrees_of_freedom(graph))
-        return self._anneal(factors, weight, initial_poses(factors, weight, bound), bound)
+        trusts_odometry = not (may_be_false & graph.odometry).any()
+        start = initial_poses(factors, weight, bound) if trusts_odometry else chain.poses
+        return self._anneal(factors, weight, start, bound, may_be_false)
 
     def _consistent(self, graph: PoseGraph, loops: Ints, chain: OdometryChain) -> Bools:
         """False for closures (K,) between two pieces of odometry that are not of the largest consistent set."""
@@ -113,10 +124,12 @@ class GncSettings(Settings):
                 good[np.searchsorted(loops, accepted)] = True
         return good
 
-    def _anneal(self, factors: Factors, weight: Floats, poses: Floats, bound: float) -> tuple[Floats, Floats]:
-        """Algorithm 1 of the paper over the closures of weight 1: weights 0 or 1, and poses."""
-        weight = np.array(weight)
-        judged = np.flatnonzero(is_loop(factors.graph) & (weight > 0))
+    def _anneal(
+        self, factors: Factors, weight: Floats, poses: Floats, bound: float, may_be_false: Bools
+    ) -> tuple[Floats, Floats]:
+        """Algorithm 1 of the paper over these edges (E,) of weight 1: weights 0 or 1, and poses."""
+        weight, joins = np.array(weight), np.where(factors.graph.odometry, _JOINS, 0.0)
+        judged = np.flatnonzero(may_be_false & (weight > 0))
         if len(judged) == 0:
             return weight, poses
         poses = descend(factors, weight, poses, self.max_iterations, 1e-3).world_from_body
@@ -128,7 +141,8 @@ class GncSettings(Settings):
             weight[judged] = truncated_weights(chi2, bound, mu)
             if ((weight == 0) | (weight == 1)).all():
                 break
-            poses = descend(factors, weight, poses, self.steps, self.stage_tolerance).world_from_body
+            trusted = np.maximum(weight, joins)
+            poses = descend(factors, trusted, poses, self.steps, self.stage_tolerance).world_from_body
             chi2 = residual_sigma(factors.graph, poses, judged) ** 2
             mu *= self.growth
         return np.where(weight > 0.5, 1.0, 0.0), poses

@@ -34,6 +34,8 @@ class Tension:
     """(K,) by how much chi-square falls without the closure, to first order."""
     whitened: Floats
     """(K, d) residuals in sigma, along axes on which the noise of the rest's prediction is independent."""
+    whitener: Floats
+    """(K, d, d) matrices that turn a residual into a whitened one."""
     redundancy: Floats
     """(K, d) share of a closure's error that its residual shows along these axes: 0 where nothing else checks it."""
     log_spread: Floats
@@ -54,10 +56,12 @@ def tension(factors: Factors, weight: Floats, poses: Floats, loops: Ints) -> Ten
     # leverage: 1 where nothing else constrains the ends of the closure
     leverage, turn = np.linalg.eigh(root @ covariance @ np.swapaxes(root, 1, 2))
     rest = np.clip(1.0 - leverage, _LEAST_REDUNDANCY, 1.0)
-    whitened = (np.swapaxes(turn, 1, 2) @ (root @ error[:, axes, None]))[:, :, 0]
+    whitener = np.swapaxes(turn, 1, 2) @ root
+    whitened = (whitener @ error[:, axes, None])[:, :, 0]
     return Tension(
         cost=(whitened**2 / rest).sum(1),
         whitened=whitened,
+        whitener=np.asarray(whitener, np.float64),
         redundancy=rest,
         log_spread=-0.5 * (np.linalg.slogdet(information)[1] + np.log(rest).sum(1)),
     )

@@ -15,13 +15,14 @@ import numpy as np
 
 from vplog.data import Floats, Ints
 from vplog.graph.build import AXES, informed
-from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, residual_sigma
+from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, odometry_chain, residual_sigma
 from vplog.graph.episodes import Episodes
 from vplog.graph.factors import Factors
 from vplog.graph.false_volume import log_false_volume
 from vplog.graph.least_squares import GAUGE_SIGMA, Objective, descend
 from vplog.graph.leave_one_out import distance, errors, tension
 from vplog.graph.marginals import joint_covariance
+from vplog.graph.slips import Slipping
 from vplog.graph.variance_components import Sigmas, claimed_times
 
 _TAIL = 3.0
@@ -38,7 +39,7 @@ _LOG_2PI = math.log(2.0 * math.pi)
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A set of true closures with the poses and the noise that it implies."""
+    """A set of true closures and of slipping steps, with the poses and the noise that it implies."""
 
     weight: Floats
     """(E,) 1 for odometry and true closures, 0 for false ones."""
@@ -46,6 +47,7 @@ class Hypothesis:
     """(N, 4, 4)."""
     sigmas: Sigmas
     log_density: float
+    slipping: Slipping
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,26 +58,32 @@ class Posterior:
     factors: Factors
     """The graph with its noise multiplied."""
     episodes: Episodes
+    slipping: Slipping
 
     @classmethod
-    def of(cls, claimed: Factors, sigmas: Sigmas, log_odds: Floats | None = None) -> Posterior:
+    def of(
+        cls, claimed: Factors, sigmas: Sigmas, log_odds: Floats | None = None, slipping: Slipping | None = None
+    ) -> Posterior:
         """Prepare the graph `claimed` with its noise multiplied by `sigmas`; `log_odds` as in `Episodes.of`."""
-        graph = claimed_times(claimed.graph, sigmas)
+        slipping = slipping or Slipping.nowhere(claimed.graph)
+        sound, graph = (claimed_times(one, sigmas) for one in (claimed.graph, slipping.applied(claimed.graph, sigmas)))
         chain, loops = OdometryChain.of(graph), np.flatnonzero(is_loop(graph))
-        episodes = Episodes.of(graph, loops, chain, log_false_volume(graph, chain.poses), log_odds)
-        return cls(sigmas, replace(claimed, graph=graph), episodes)
+        log_volume = log_false_volume(sound, odometry_chain(sound)[0])  # one volume for all states of the odometry
+        episodes = Episodes.of(graph, loops, chain, log_volume, log_odds)
+        return cls(sigmas, replace(claimed, graph=graph), episodes, slipping)
 
     def hypothesis(self, weight: Floats, poses: Floats) -> Hypothesis:
         """Solve the edges of weight (E,) 1 from `poses`. Raises GraphError if these are not determined."""
         if (weight[~self.factors.graph.odometry] > 0).any():
             poses = descend(self.factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
-        return Hypothesis(weight, poses, self.sigmas, self.log_density(weight, poses))
+        return Hypothesis(weight, poses, self.sigmas, self.log_density(weight, poses), self.slipping)
 
     def log_density(self, weight: Floats, poses: Floats) -> float:
         """Return the log of the posterior density; `poses` are the least squares of the edges of weight (E,) 1."""
         density, _ = self.episodes.log_density(weight[self.episodes.edges] == 0)
         true = np.flatnonzero(~self.factors.graph.odometry & (weight > 0))
-        return density + self.sigmas.log_prior() + (self._log_true(weight, poses, true) if len(true) else 0.0)
+        density += self.sigmas.log_prior() + self.slipping.log_prior
+        return density + (self._log_true(weight, poses, true) if len(true) else 0.0)
 
     def _log_true(self, weight: Floats, poses: Floats, true: Ints) -> float:
         """Log density of the true closures under the odometry: N(0, A C A^T + R) by the matrix determinant lemma."""
@@ -96,6 +104,16 @@ class Posterior:
         with np.errstate(divide="ignore"):
             gain = np.logaddexp(np.log1p(-_TAIL_SHARES), np.log(_TAIL_SHARES) + wide).sum(1)
         return float(np.logaddexp.reduce(gain)) - math.log(len(gain))
+
+    def most_gain(self, one: Hypothesis, group: Ints) -> float:
+        """Return the most by which the log density can rise if the false closures `group` of the episodes are true: if
+        all others predict them exactly."""
+        is_false = one.weight[self.episodes.edges] == 0
+        changed = np.array(is_false)
+        changed[group] = False
+        states = self.episodes.log_density(changed)[0] - self.episodes.log_density(is_false)[0]
+        known = np.linalg.slogdet(informed(self.factors.graph, self.episodes.edges[group]))[1].sum()
+        return states + float(0.5 * (known - len(group) * degrees_of_freedom(self.factors.graph) * _LOG_2PI))
 
     def log_predictive(self, one: Hypothesis) -> Floats:
         """Return the log density (K,) of each closure given the true ones without it, in the order of the episodes."""

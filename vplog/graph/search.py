@@ -1,4 +1,4 @@
-"""Search for the set of true closures, and the noise, of greatest posterior density.
+"""Search for the set of true closures, and the noise, of greatest posterior density with given odometry.
 
 Proposals are graduated non-convexity over all closures, the largest families of closures that claim one displacement,
 and the odometry alone. Each is improved by flips of closures, runs and families, as long as the posterior rises. A flip
@@ -21,12 +21,13 @@ from vplog.graph.episodes import Episodes
 from vplog.graph.factors import Factors
 from vplog.graph.least_squares import Objective, descend
 from vplog.graph.posterior import Hypothesis, Linearised, Posterior
+from vplog.graph.slips import Slipping
 from vplog.graph.variance_components import Sigmas, claimed_times, estimate
 
 Cost = Callable[[Factors, Floats, Floats], float]
 """By how much the log likelihood of other measurements falls with factors, weights (E,) and poses (N, 4, 4)."""
-Proposal = Callable[[Factors], tuple[Floats, Floats]]
-"""Weights (E,), 0 or 1, and poses (N, 4, 4) from which the search starts."""
+Proposal = Callable[[Factors, Bools], tuple[Floats, Floats]]
+"""Weights (E,), 0 or 1, and poses (N, 4, 4) from which the search starts; the edges of the mask (E,) may be false."""
 
 _MOST_INFORMATION = 1e4
 """Largest information of a closure as a multiple of the median one, so that none outweighs a hundred others."""
@@ -57,31 +58,6 @@ _MARGIN = 5.0
 _STEPS, _TOLERANCE = 100, 1e-4
 
 
-def best_hypothesis(
-    graph: PoseGraph, propose: Proposal, cost: Cost | None = None, log_odds: Floats | None = None
-) -> Hypothesis:
-    """Return the hypothesis of greatest posterior density, less the cost of other measurements.
-
-    `log_odds` (E,) are the log odds that an edge is false by recognition; None or all 0 if these are unknown. Raises
-    GraphError if the graph cannot be solved.
-    """
-    search = _Search(Factors.of(bounded(graph)), propose, log_odds)
-    found, loops = search.hypotheses(), is_loop(graph)
-    best = max((one for one in found if one.weight[loops].any()), key=_log_density, default=found[0])
-    if best.sigmas.at_bound:  # the noise may be larger still: true closures are lost beyond the bound
-        again = _Search(Factors.of(bounded(claimed_times(graph, best.sigmas))), propose, log_odds).hypotheses()
-        found += [_in_claims(one, best.sigmas) for one in again]
-    if cost is None:
-        return max(found, key=_log_density)
-    return max(found, key=lambda one: one.log_density - cost(search.at(one.sigmas).factors, one.weight, one.poses))
-
-
-def _in_claims(one: Hypothesis, by: Sigmas) -> Hypothesis:
-    """A hypothesis of the graph with its noise multiplied `by` these factors, as one of the graph as claimed."""
-    sigmas = by.times(one.sigmas)
-    return replace(one, sigmas=sigmas, log_density=one.log_density - one.sigmas.log_prior() + sigmas.log_prior())
-
-
 def attempted(solve: Callable[[], Hypothesis]) -> list[Hypothesis]:
     """Return the hypothesis of a solve in a list, which is empty if closures do not determine the poses."""
     try:
@@ -108,34 +84,50 @@ def bounded(graph: PoseGraph) -> PoseGraph:
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
-    """The search in one graph with its claimed noise."""
+class Search:
+    """The search in one graph with its claimed noise and one state of each step of the odometry."""
 
     claimed: Factors
     propose: Proposal
     log_odds: Floats | None
+    slipping: Slipping
 
     def at(self, sigmas: Sigmas) -> Posterior:
-        return Posterior.of(self.claimed, sigmas, self.log_odds)
+        return Posterior.of(self.claimed, sigmas, self.log_odds, self.slipping)
+
+    def with_slips(self, slipping: Slipping) -> Search:
+        """Return the same search with other states of the odometry's steps."""
+        return replace(self, slipping=slipping)
+
+    def improved_from(self, start: Hypothesis) -> list[Hypothesis]:
+        """Return the likeliest hypothesis that a set of true closures and graduated non-convexity lead to; none if
+        neither determines the poses."""
+        found = attempted(lambda: self._refit(start.weight, start.poses, start.sigmas))
+        found += attempted(lambda: self._refit(*self.annealed(Sigmas()), Sigmas()))
+        return sorted((self.improved(one) for one in found), key=log_density)[-1:]
+
+    def annealed(self, sigmas: Sigmas) -> tuple[Floats, Floats]:
+        """Weights (E,) and poses (N, 4, 4) that are proposed for the closures with this noise."""
+        return self.propose(self.at(sigmas).factors, is_loop(self.claimed.graph))
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the likeliest hypotheses, each with its likeliest noise; the first is that no closure is true."""
-        loops, chain = is_loop(self.claimed.graph), OdometryChain.of(self.claimed.graph)
         posterior = self.at(Sigmas())
+        loops, chain = is_loop(self.claimed.graph), OdometryChain.of(posterior.factors.graph)
         none = posterior.hypothesis(np.where(loops, 0.0, 1.0), chain.poses)
         found = [none]
-        annealed = attempted(lambda: self._refit(*self.propose(posterior.factors), Sigmas()))
+        annealed = attempted(lambda: self._refit(*self.annealed(Sigmas()), Sigmas()))
         if not (annealed and annealed[0].weight.all()):  # claims may be too small for any closure to agree with them
             annealed += attempted(lambda: self._refit(np.ones(len(loops)), chain.poses, Sigmas()))
-        found += [self._improved(one) for one in annealed]
-        best = max(found, key=_log_density)
+        found += [self.improved(one) for one in annealed]
+        best = max(found, key=log_density)
         families: list[Hypothesis] = []
         for weight in self._families(best, loops):
             families += attempted(lambda weight=weight: self._refit(weight, chain.poses, Sigmas()))
-        starts = sorted(families, key=_log_density)[-_FAMILIES:]
+        starts = sorted(families, key=log_density)[-_FAMILIES:]
         if not best.weight.all():
             starts.append(none)
-        found += [self._improved(one) for one in starts]
+        found += [self.improved(one) for one in starts]
         return self._at_each_noise(found)
 
     def _families(self, best: Hypothesis, loops: Bools) -> Iterator[Floats]:
@@ -157,7 +149,8 @@ class _Search:
     def _refit(self, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
         """Solve the edges of weight (E,) 1 and estimate the noise, in turns."""
         for _ in range(_ROUNDS):
-            factors = replace(self.claimed, graph=claimed_times(self.claimed.graph, sigmas))
+            slipping = self.slipping.applied(self.claimed.graph, sigmas)
+            factors = replace(self.claimed, graph=claimed_times(slipping, sigmas))
             poses = descend(factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
             before, sigmas = sigmas, estimate(Objective(factors, weight), poses, sigmas)
             sigmas = Sigmas(*np.maximum(sigmas, _LEAST_NOISE).tolist())
@@ -165,7 +158,7 @@ class _Search:
                 break
         return self.at(sigmas).hypothesis(weight, poses)
 
-    def _improved(self, best: Hypothesis) -> Hypothesis:
+    def improved(self, best: Hypothesis) -> Hypothesis:
         """Flip closures, runs and families as long as the posterior rises; estimate the noise after each flip."""
         posterior = self.at(best.sigmas)
         for _ in range(_TURNS):
@@ -192,7 +185,7 @@ class _Search:
         except (GraphError, np.linalg.LinAlgError):
             return []
         promising: list[tuple[float, Ints]] = []
-        for group in _groups(episodes, is_false):
+        for group in groups(episodes, is_false):
             share = float(episodes.false_share[group].mean())
             gain = float(np.median(log_predictive[group])) + episodes.log_volume + math.log((1.0 - share) / share)
             promising.append((gain if is_false[group[0]] else -gain, group))
@@ -213,33 +206,46 @@ class _Search:
 
     def _at_each_noise(self, found: list[Hypothesis]) -> list[Hypothesis]:
         """The sets found, in order, each with the noise of those found that makes it likeliest."""
-        best = {one.weight.tobytes(): one for one in sorted(found, key=_log_density)}
+        best = {one.weight.tobytes(): one for one in sorted(found, key=log_density)}
         sets = [best[key] for key in dict.fromkeys(one.weight.tobytes() for one in found)]
         for sigmas in dict.fromkeys(one.sigmas for one in sets):
             posterior = self.at(sigmas)
             for at, one in enumerate(sets):
                 others = attempted(lambda of=posterior, one=one: of.hypothesis(one.weight, one.poses))
-                sets[at] = max(sets[at], *others, key=_log_density) if others else one
+                sets[at] = max(sets[at], *others, key=log_density) if others else one
         return sets
 
 
-def _log_density(one: Hypothesis) -> float:
+def log_density(one: Hypothesis) -> float:
+    """Key by which hypotheses are compared."""
     return one.log_density
 
 
-def _groups(episodes: Episodes, is_false: Bools) -> list[Ints]:
+def groups(episodes: Episodes, is_false: Bools) -> list[Ints]:
     """Closures that are flipped together: each alone, runs of one state and family, and families."""
     _, family = episodes.log_density(is_false)
-    run = np.arange(len(family))
-    for k, nearest in enumerate(episodes.nearest.tolist()):
-        if nearest >= 0 and family[nearest] == family[k] and episodes.continues[k] >= math.exp(-1.0):
-            run[k] = run[nearest]
+    run = _run_labels(episodes, family)
     everything, false, true = np.arange(len(family)), np.flatnonzero(is_false), np.flatnonzero(~is_false)
-    groups: dict[bytes, Ints] = {}
+    found: dict[bytes, Ints] = {}
     alike = episodes.families
     for label, members in ((everything, everything), (run, everything), (family, false), (alike, true), (alike, false)):
         order = members[np.argsort(label[members], kind="stable")]
         for group in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
             if len(group):
-                groups[group.tobytes()] = group
-    return list(groups.values())
+                found[group.tobytes()] = group
+    return list(found.values())
+
+
+def _run_labels(episodes: Episodes, family: Ints) -> Ints:
+    """Number of the run of neighbouring closures of one state and family that each closure is of, (K,)."""
+    run = np.arange(len(family))
+    for k, nearest in enumerate(episodes.nearest.tolist()):
+        if nearest >= 0 and family[nearest] == family[k] and episodes.continues[k] >= math.exp(-1.0):
+            run[k] = run[nearest]
+    return run
+
+
+def true_runs(episodes: Episodes, is_false: Bools) -> list[Ints]:
+    """Runs of neighbouring true closures."""
+    run = np.where(is_false, -1, _run_labels(episodes, episodes.log_density(is_false)[1]))
+    return [np.flatnonzero(run == one) for one in np.unique(run[run >= 0]).tolist()]

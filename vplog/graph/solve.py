@@ -9,19 +9,14 @@ from pydantic import Field
 
 from vplog.data import Floats, Ints, PoseGraph
 from vplog.graph.build import checked
-from vplog.graph.consistency import OdometryChain, is_loop, runs
-from vplog.graph.episodes import Episodes
-from vplog.graph.false_volume import log_false_volume
 from vplog.graph.gnc import Decision, GncSettings
 from vplog.graph.lm import LmSettings
 from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import CauchySettings, DcsSettings, GemanMcClureSettings
 from vplog.graph.search import Cost
+from vplog.graph.slips import STANDS, Slipping
 from vplog.graph.variance_components import Sigmas
 from vplog.stages import Optimiser
-
-_SHARE, _PLACES = 1 / 3, 3
-"""Share of the closures, and their runs, that agree on a displacement before it is said to be the odometry's."""
 
 OptimiserSettings = Annotated[
     GncSettings | PcmSettings | DcsSettings | CauchySettings | GemanMcClureSettings | LmSettings,
@@ -43,27 +38,20 @@ def decided(
     if isinstance(optimiser, GncSettings):
         return optimiser.decided(graph, cost, log_odds)
     graph, _ = checked(graph)
-    return Decision(graph, optimiser(graph), Sigmas())
+    return Decision(graph, optimiser(graph), Sigmas(), Slipping.nowhere(graph))
 
 
-def about_jump(decision: Decision, names: Ints) -> list[str]:
-    """A warning where many rejected closures claim one displacement, as they do across a step of the odometry that is
-    far beyond its noise, where a wheel slipped or frames are missing. `names` (N,) are those of the poses."""
-    graph, loops = decision.graph, is_loop(decision.graph)
-    rejected = np.flatnonzero(loops & (decision.solution.weight < 0.5))
-    if len(rejected) <= _SHARE * loops.sum():
-        return []
-    chain = OdometryChain.of(graph)
-    episodes = Episodes.of(graph, rejected, chain, log_false_volume(graph, chain.poses), None)
-    largest = episodes.edges[episodes.families == np.bincount(episodes.families).argmax()]
-    places = sum(1 for _ in runs(graph, largest))
-    if len(largest) <= _SHARE * loops.sum() or places < _PLACES:
-        return []
-    ends = np.sort([graph.a[largest], graph.b[largest]], axis=0)
-    first, last = int(ends[0].max()), int(ends[1].min())
-    if first >= last:
-        return []
+def about_slips(decision: Decision, names: Ints) -> list[str]:
+    """A warning of each run of steps in which the odometry slips. `names` (N,) are those of the poses."""
+    state, graph = decision.slipping.state, decision.graph
+    edges = decision.slipping.edges
+    first = np.minimum(graph.a[edges], graph.b[edges])
+    edges = edges[np.argsort(first, kind="stable")]
+    first = np.sort(first)
+    cuts = np.flatnonzero((np.diff(first) > 1) | (np.diff(state[edges]) != 0)) + 1
     return [
-        f"{len(largest)} rejected closures of {places} places agree on one displacement: they are true if the odometry "
-        f"jumps between poses {names[first]} and {names[last]}. Look at it there."
+        f"The closures contradict the odometry between poses {names[run[0]]} and {names[run[-1] + 1]}: the robot "
+        f"{'stood still' if state[edges[start]] == STANDS else 'moved as elsewhere'}. Its odometry is not used there."
+        for start, run in zip([0, *cuts.tolist()], np.split(first, cuts), strict=True)
+        if len(run)
     ]

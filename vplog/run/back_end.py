@@ -36,7 +36,7 @@ from vplog.graph.noise import NoiseSettings, broken_edges, edge_covariance
 from vplog.graph.pieces import pieces_placed
 from vplog.graph.refine import Refined, RefineSettings, Scale, refine, rescaled
 from vplog.graph.search import bounded
-from vplog.graph.solve import Decision, OptimiserSettings, about_jump, decided
+from vplog.graph.solve import Decision, OptimiserSettings, about_slips, decided
 from vplog.graph.variance_components import Sigmas, claimed_times
 from vplog.loops.false_rate import log_odds_false
 from vplog.run.cache.steps import step
@@ -97,11 +97,12 @@ def solve(
     log_odds = np.zeros(len(graph.a))
     log_odds[~graph.odometry] = log_odds_false(closures)[rows]
     decision = decided(present, settings.solve, cost, log_odds)
-    refined = refine(bounded(graph), decision.solution, of_odometry, settings.refine, fixes, decision.sigmas, scale)
+    measured = decision.slipping.applied(bounded(graph), decision.sigmas)
+    refined = refine(measured, decision.solution, of_odometry, settings.refine, fixes, decision.sigmas, scale)
     turns = SharedScale(graph.odometry | odometry.of_images, settings.noise.turn_per_radian, of_rotation=True)
     refined = replace(refined, unknown=[*refined.unknown, turns])
     warnings = noise_warnings + build_warnings + (fixes.warnings if fixes else [])
-    warnings += about_jump(decision, np.arange(len(keyframes.stamp_ns)))
+    warnings += about_slips(decision, np.arange(len(keyframes.stamp_ns)))
     apart, pieces = _apart(broken, graph, refined)
     if len(apart):
         seconds = (keyframes.stamp_ns[apart[0] + 1] - odometry.stamp_ns[0]) / 1e9

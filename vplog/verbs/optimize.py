@@ -18,7 +18,7 @@ from vplog.graph.certificate import solve_certified
 from vplog.graph.consistency import OdometryChain, is_loop, residual_sigma, residual_twists
 from vplog.graph.factors import Factors
 from vplog.graph.lm import LmSettings, solve_weighted
-from vplog.graph.solve import GncSettings, OptimiserSettings, about_jump, decided
+from vplog.graph.solve import GncSettings, OptimiserSettings, about_slips, decided
 from vplog.graph.variance_components import Sigmas
 from vplog.results.g2o import GraphFile, read_g2o, write_g2o
 
@@ -125,7 +125,7 @@ def solve_parts(
         decision = decided(subgraph(alone, np.arange(len(rows)), judged), optimiser)
         solution, own[judged] = decision.solution, decision.solution.weight
         sigmas.append(decision.sigmas)
-        repairs = [*repairs, *_about_noise(decision.sigmas), *about_jump(decision, ids[rows])]
+        repairs = [*repairs, *_about_noise(decision.sigmas), *about_slips(decision, ids[rows])]
         if again.any():
             found = plural(int(again.sum()), "edge")
             repairs = [*repairs, f"Accepted without being judged, as they restate the odometry: {found}."]

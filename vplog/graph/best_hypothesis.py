@@ -1,0 +1,163 @@
+"""The likeliest true closures and slipping steps of a graph.
+
+Closures that the odometry contradicts are false, or the odometry slips. `Search` finds the likeliest closures for given
+states of the odometry. Here closures and states are found together: a set of true closures grows, group by group, and
+each group must gain more than the slips that it implies cost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vplog.data import Floats, Ints, PoseGraph
+from vplog.graph.consistency import OdometryChain, is_loop
+from vplog.graph.factors import Factors
+from vplog.graph.posterior import Hypothesis
+from vplog.graph.search import Cost, Proposal, Search, attempted, bounded, groups, log_density, true_runs
+from vplog.graph.slips import Slipping, Slips
+from vplog.graph.variance_components import Sigmas, claimed_times
+
+_LEAST_GROUP = 2
+"""Number of closures from which a group may show a slip."""
+_GROUPS = 12
+"""Number of groups, the largest first, that are tried before the set is taken as grown."""
+_TURNS = 30
+"""Largest number of groups that join a set."""
+_ROUNDS = 4
+"""Rounds of leaving out runs of closures."""
+
+
+def best_hypothesis(
+    graph: PoseGraph, propose: Proposal, cost: Cost | None = None, log_odds: Floats | None = None
+) -> Hypothesis:
+    """Return the hypothesis of greatest posterior density, less the cost of other measurements.
+
+    `log_odds` (E,) are the log odds that an edge is false by recognition; None or all 0 if these are unknown. Raises
+    GraphError if the graph cannot be solved.
+    """
+    claimed, loops = Factors.of(bounded(graph)), is_loop(graph)
+    search = Search(claimed, propose, log_odds, Slipping.nowhere(graph))
+    found = search.hypotheses()
+    best = max((one for one in found if one.weight[loops].any()), key=log_density, default=found[0])
+    if best.sigmas.at_bound:  # the noise may be larger still: true closures are lost beyond the bound
+        more = Factors.of(bounded(claimed_times(graph, best.sigmas)))
+        again = Search(more, propose, log_odds, Slipping.nowhere(graph)).hypotheses()
+        found += [_in_claims(one, best.sigmas) for one in again]
+    found += _WithSlips(search, Slips(claimed.graph)).hypotheses(found)
+
+    def less_cost(one: Hypothesis) -> float:
+        if cost is None:
+            return one.log_density
+        factors = search.with_slips(one.slipping).at(one.sigmas).factors
+        return one.log_density - cost(factors, one.weight, one.poses)
+
+    likeliest = max(found, key=less_cost)
+    return likeliest if likeliest.weight[loops].any() else found[0]  # nothing but true closures shows a slip
+
+
+def _in_claims(one: Hypothesis, by: Sigmas) -> Hypothesis:
+    """A hypothesis of the graph with its noise multiplied `by` these factors, as one of the graph as claimed."""
+    sigmas = by.times(one.sigmas)
+    return replace(one, sigmas=sigmas, log_density=one.log_density - one.sigmas.log_prior() + sigmas.log_prior())
+
+
+@dataclass(frozen=True, eq=False)
+class _WithSlips:
+    """The search for slipping steps, and the closures that are true with them."""
+
+    sound: Search
+    slips: Slips
+
+    def hypotheses(self, found: list[Hypothesis]) -> list[Hypothesis]:
+        """Return likely hypotheses with slips, and those `found` without slips with the noise of these."""
+        best, result = max(found, key=log_density), list[Hypothesis]()
+        for start in self._starts(best):
+            with_slips = [one for one in self._improved(self._grown(start)) if one.slipping.state.any()]
+            result += [self._pruned(one) if one.log_density > best.log_density else one for one in with_slips]
+        for one in list(result):
+            result += self._again(one)
+        for one in list(result):
+            for weight in (found[0].weight, best.weight):
+                for slipping in (self.sound.slipping, one.slipping):
+                    result += self._solved(slipping, replace(one, weight=weight))
+        return result
+
+    def _starts(self, best: Hypothesis) -> Iterator[Hypothesis]:
+        """Sets of closures from which slips are sought: those that are true without slips. If these imply a slip, or a
+        group is rejected, no closure, too, and those that graduated non-convexity keeps if it may reject odometry as
+        well."""
+        graph = self.sound.claimed.graph
+        loops, chain = is_loop(graph), OdometryChain.of(graph)
+        noise = Sigmas(max(best.sigmas.rotation, 1.0), max(best.sigmas.translation, 1.0))
+        implied = self._with_implied(replace(best, poses=chain.poses, sigmas=noise))
+        slip = [one for one in implied if one.slipping.state.any()]
+        yield from slip
+        if slip or not implied or self._rejected(best):
+            kept, _ = self.sound.propose(self.sound.claimed, np.ones(len(loops), bool))
+            for weight in (np.where(loops, 0.0, 1.0), np.where(loops, kept, 1.0)):
+                yield from self._with_implied(replace(best, weight=weight, poses=chain.poses, sigmas=Sigmas()))
+
+    def _rejected(self, one: Hypothesis) -> list[Ints]:
+        """Groups of rejected closures that may show a slip, the largest first."""
+        episodes = self.sound.with_slips(one.slipping).at(one.sigmas).episodes
+        is_false = one.weight[episodes.edges] == 0
+        found = [group for group in groups(episodes, is_false) if is_false[group[0]] and len(group) >= _LEAST_GROUP]
+        return sorted(found, key=len, reverse=True)
+
+    def _solved(self, slipping: Slipping, one: Hypothesis) -> list[Hypothesis]:
+        """The closures and the noise of a hypothesis with other states of the steps; none if that cannot be solved."""
+        posterior, poses = self.sound.with_slips(slipping).at(one.sigmas), one.poses
+        if not one.weight[is_loop(self.sound.claimed.graph)].any():
+            poses = OdometryChain.of(posterior.factors.graph).poses
+        return attempted(lambda: posterior.hypothesis(one.weight, poses))
+
+    def _with_implied(self, one: Hypothesis, least: float = -np.inf) -> list[Hypothesis]:
+        """The closures and the noise of a hypothesis with the slips that they imply; `least` as in Slips.likeliest."""
+        slipping = self.slips.likeliest(self.sound.claimed, one.weight, one.poses, one.sigmas, one.slipping, least)
+        return [] if slipping is None else self._solved(slipping, one)
+
+    def _improved(self, one: Hypothesis) -> list[Hypothesis]:
+        return self.sound.with_slips(one.slipping).improved_from(one)
+
+    def _again(self, one: Hypothesis) -> list[Hypothesis]:
+        """The likeliest hypothesis with the slips that the closures of this one imply; none if it has just these."""
+        changed = [other for other in self._with_implied(one) if (other.slipping.state != one.slipping.state).any()]
+        return [better for other in changed for better in self._improved(other)]
+
+    def _grown(self, best: Hypothesis) -> Hypothesis:
+        """Add groups of closures that gain more than the slips that they imply cost, the largest first."""
+        best, tried = self.sound.with_slips(best.slipping).improved(best), set[bytes]()
+        for _ in range(_TURNS):
+            posterior, before = self.sound.with_slips(best.slipping).at(best.sigmas), best
+            new = [group for group in self._rejected(best) if group.tobytes() not in tried]
+            for group in new[:_GROUPS]:
+                tried.add(group.tobytes())
+                weight = np.array(best.weight)
+                weight[posterior.episodes.edges[group]] = 1.0
+                least = best.slipping.log_prior - posterior.most_gain(best, group)
+                best = max([best, *self._with_implied(replace(best, weight=weight), least)], key=log_density)
+                if best is not before:
+                    break
+            if best is before:
+                break
+            best = self.sound.with_slips(best.slipping).improved(best)
+        return best
+
+    def _pruned(self, best: Hypothesis) -> Hypothesis:
+        """Leave out runs of closures that gain less than the slips that they imply cost."""
+        for _ in range(_ROUNDS):
+            before = best
+            episodes = self.sound.with_slips(best.slipping).at(best.sigmas).episodes
+            for run in true_runs(episodes, best.weight[episodes.edges] == 0):
+                weight = np.array(best.weight)
+                weight[episodes.edges[run]] = 0.0
+                for one in self._with_implied(replace(best, weight=weight)):
+                    if (one.slipping.state != best.slipping.state).any():
+                        best = max(best, one, key=log_density)
+            if best is before:
+                break
+            best = max([best, *self._improved(best)], key=log_density)
+        return best
