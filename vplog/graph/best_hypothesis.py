@@ -20,9 +20,9 @@ from vplog.graph.search import Cost, Proposal, Search, attempted, bounded, group
 from vplog.graph.slips import Slipping, Slips
 from vplog.graph.variance_components import Sigmas, claimed_times
 
-_LEAST_GROUP = 2
+_LEAST_GROUP = 3
 """Number of closures from which a group may show a slip."""
-_GROUPS = 12
+_GROUPS = 20
 """Number of groups, the largest first, that are tried before the set is taken as grown."""
 _TURNS = 30
 """Largest number of groups that join a set."""
@@ -98,14 +98,16 @@ class _WithSlips:
         if slip or not implied or self._rejected(best):
             kept, _ = self.sound.propose(self.sound.claimed, np.ones(len(loops), bool))
             for weight in (np.where(loops, 0.0, 1.0), np.where(loops, kept, 1.0)):
-                yield from self._with_implied(replace(best, weight=weight, poses=chain.poses, sigmas=Sigmas()))
+                at = noise if best.sigmas.at_bound else Sigmas()
+                yield from self._with_implied(replace(best, weight=weight, poses=chain.poses, sigmas=at))
 
     def _rejected(self, one: Hypothesis) -> list[Ints]:
-        """Groups of rejected closures that may show a slip, the largest first."""
+        """Groups of rejected closures that may show a slip, those that span the shortest path first."""
         episodes = self.sound.with_slips(one.slipping).at(one.sigmas).episodes
         is_false = one.weight[episodes.edges] == 0
         found = [group for group in groups(episodes, is_false) if is_false[group[0]] and len(group) >= _LEAST_GROUP]
-        return sorted(found, key=len, reverse=True)
+        span = episodes.claims.b - episodes.claims.a
+        return sorted(found, key=lambda group: (int(span[group].max()), -len(group)))
 
     def _solved(self, slipping: Slipping, one: Hypothesis) -> list[Hypothesis]:
         """The closures and the noise of a hypothesis with other states of the steps; none if that cannot be solved."""

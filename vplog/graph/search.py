@@ -15,7 +15,8 @@ import numpy as np
 
 from vplog.data import Bools, Floats, Ints, PoseGraph
 from vplog.errors import GraphError
-from vplog.graph.build import informed, weakest_information
+from vplog.geometry import se3
+from vplog.graph.build import informed, parts, weakest_information
 from vplog.graph.consistency import OdometryChain, is_loop
 from vplog.graph.episodes import Episodes
 from vplog.graph.factors import Factors
@@ -175,7 +176,8 @@ class Search:
     def _flipped(self, posterior: Posterior, best: Hypothesis) -> list[Hypothesis]:
         """A likelier hypothesis after one flip; none if no flip that is tried makes it likelier.
 
-        First all promising flips are tried together, then the most promising ones alone. What a flip of a group gains
+        First groups that join pieces are tried, then all promising flips together, then the most promising ones alone.
+        What a flip of a group gains
         is foreseen from its median closure, because the others of a group follow from one of them, true or false.
         """
         episodes = posterior.episodes
@@ -184,6 +186,7 @@ class Search:
             log_predictive = posterior.log_predictive(best)
         except (GraphError, np.linalg.LinAlgError):
             return []
+        tried = _joining(posterior, best)[:_TRIED]
         promising: list[tuple[float, Ints]] = []
         for group in groups(episodes, is_false):
             share = float(episodes.false_share[group].mean())
@@ -192,14 +195,14 @@ class Search:
         promising.sort(key=lambda one: -one[0])
         together = [group for gain, group in promising if gain > 0]
         linear = Linearised(posterior, best)
-        tried = [np.unique(np.concatenate(together))] if len(together) > 1 else []
+        tried += [(np.unique(np.concatenate(together)), best.poses)] if len(together) > 1 else []
         for gain, group in promising[:_TRIED]:
             if (linear.gain(group) > -_MARGIN) if len(group) <= _JOINT else gain > 0:
-                tried.append(group)
-        for group in tried:
+                tried.append((group, best.poses))
+        for group, poses in tried:
             weight = np.array(best.weight)
             weight[episodes.edges[group]] = 1.0 - weight[episodes.edges[group]]
-            for one in attempted(lambda weight=weight: posterior.hypothesis(weight, best.poses)):
+            for one in attempted(lambda weight=weight, poses=poses: posterior.hypothesis(weight, poses)):
                 if one.log_density > best.log_density:
                     return [one]
         return []
@@ -219,6 +222,24 @@ class Search:
 def log_density(one: Hypothesis) -> float:
     """Key by which hypotheses are compared."""
     return one.log_density
+
+
+def _joining(posterior: Posterior, one: Hypothesis) -> list[tuple[Ints, Floats]]:
+    """Groups of false closures between pieces that no true closure joins, the largest first, and poses (N, 4, 4) with
+    these pieces joined. Nothing predicts such closures."""
+    graph, episodes, on = posterior.factors.graph, posterior.episodes, one.weight > 0
+    part = parts(len(one.poses), graph.a[on], graph.b[on])
+    result = list[tuple[Ints, Floats]]()
+    for group in groups(episodes, one.weight[episodes.edges] == 0):
+        edges = episodes.edges[group]
+        if (part[graph.a[edges]] != part[graph.b[edges]]).all():
+            a, b, between = int(graph.a[edges[0]]), int(graph.b[edges[0]]), graph.a_from_b[edges[0]]
+            if part[b] == part[0]:  # pose 0 stays
+                a, b, between = b, a, se3.inverse(between)
+            poses = np.array(one.poses)
+            poses[part == part[b]] = poses[a] @ between @ se3.inverse(poses[b]) @ poses[part == part[b]]
+            result.append((group, poses))
+    return sorted(result, key=lambda joined: -len(joined[0]))
 
 
 def groups(episodes: Episodes, is_false: Bools) -> list[Ints]:
