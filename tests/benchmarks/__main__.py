@@ -33,6 +33,7 @@ from tests.benchmarks.scale import scale
 from tests.benchmarks.search import free_memory_gb, growth, search
 from tests.benchmarks.serve import hostile, serve
 from tests.benchmarks.sparse import sparse
+from tests.benchmarks.speed import speed
 from vplog.pipeline import load_pipeline, pipeline_folder
 from vplog.places.bobb import BobbSettings
 from vplog.places.bobb_paper import PaperBobbSettings
@@ -54,7 +55,20 @@ DISCOVERY_BAR = 1000.0
 SEARCH_BARS = (4.0, 40.0)
 """Times faster than a scan of binary codes, and of vectors of floats."""
 SIZES = (10_000, 100_000, 1_000_000, 10_000_000)
-LONG = {"large", "sparse", "batch", "localize", "condense", "compaction", "ask", "serve", "hostile", "city", "night"}
+LONG = {
+    "large",
+    "sparse",
+    "speed",
+    "batch",
+    "localize",
+    "condense",
+    "compaction",
+    "ask",
+    "serve",
+    "hostile",
+    "city",
+    "night",
+}
 """What is measured where it is named."""
 LARGEST_NEEDS_GB = 12.0
 """Memory that must be free for the largest map: the places, the index, and what the system needs beside."""
@@ -92,6 +106,7 @@ def _arguments() -> argparse.Namespace:
         "reading",
         "large",
         "sparse",
+        "speed",
         "batch",
         "localize",
         "condense",
@@ -165,6 +180,8 @@ def _measure(arguments: argparse.Namespace) -> Iterator[Figure]:
 def _long(arguments: argparse.Namespace) -> Iterator[Figure]:
     if "sparse" in arguments.what:
         yield from sparse()
+    if "speed" in arguments.what:
+        yield from speed()
     if "large" in arguments.what:
         yield from large(arguments.poses)
     if "batch" in arguments.what:

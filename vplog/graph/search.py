@@ -177,8 +177,8 @@ class Search:
         """A likelier hypothesis after one flip; none if no flip that is tried makes it likelier.
 
         First groups that join pieces are tried, then all promising flips together, then the most promising ones alone.
-        What a flip of a group gains
-        is foreseen from its median closure, because the others of a group follow from one of them, true or false.
+        What a flip of a group gains is foreseen from its median closure, because the others of a group follow from one
+        of them, true or false.
         """
         episodes = posterior.episodes
         is_false = best.weight[episodes.edges] == 0
