@@ -13,9 +13,11 @@ def main(method: str, file: str) -> None:
     factors, values = gtsam.readG2o(file, is3D=spatial)
     keys = [[gtsam.symbolIndex(key) for key in factors.at(row).keys()] for row in range(factors.size())]  # noqa: SIM118 (a method of GTSAM)
     true = [row for row, ends in enumerate(keys) if max(ends) - min(ends) == 1]
-    pose, size = (gtsam.Pose3(), 6) if spatial else (gtsam.Pose2(), 3)
-    kind = gtsam.PriorFactorPose3 if spatial else gtsam.PriorFactorPose2
-    factors.add(kind(min(values.keys()), pose, gtsam.noiseModel.Isotropic.Sigma(size, 1e-6)))
+    first, noise = min(values.keys()), gtsam.noiseModel.Isotropic.Sigma(6 if spatial else 3, 1e-6)
+    if spatial:
+        factors.add(gtsam.PriorFactorPose3(first, gtsam.Pose3(), noise))
+    else:
+        factors.add(gtsam.PriorFactorPose2(first, gtsam.Pose2(), noise))
     if method == "lm":
         gtsam.LevenbergMarquardtOptimizer(factors, values).optimize()
     else:
