@@ -78,8 +78,6 @@ class _WithSlips:
             with_slips = [one for one in self._improved(self._grown(start)) if one.slipping.state.any()]
             result += [self._pruned(one) if one.log_density > best.log_density else one for one in with_slips]
         for one in list(result):
-            result += self._again(one)
-        for one in list(result):
             for weight in (found[0].weight, best.weight):
                 for slipping in (self.sound.slipping, one.slipping):
                     result += self._solved(slipping, replace(one, weight=weight))
@@ -123,11 +121,6 @@ class _WithSlips:
 
     def _improved(self, one: Hypothesis) -> list[Hypothesis]:
         return self.sound.with_slips(one.slipping).improved_from(one)
-
-    def _again(self, one: Hypothesis) -> list[Hypothesis]:
-        """The likeliest hypothesis with the slips that the closures of this one imply; none if it has just these."""
-        changed = [other for other in self._with_implied(one) if (other.slipping.state != one.slipping.state).any()]
-        return [better for other in changed for better in self._improved(other)]
 
     def _grown(self, best: Hypothesis) -> Hypothesis:
         """Add groups of closures that gain more than the slips that they imply cost, the largest first."""
