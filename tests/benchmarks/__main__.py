@@ -55,20 +55,12 @@ DISCOVERY_BAR = 1000.0
 SEARCH_BARS = (4.0, 40.0)
 """Times faster than a scan of binary codes, and of vectors of floats."""
 SIZES = (10_000, 100_000, 1_000_000, 10_000_000)
-LONG = {
-    "large",
-    "sparse",
-    "speed",
-    "batch",
-    "localize",
-    "condense",
-    "compaction",
-    "ask",
-    "serve",
-    "hostile",
-    "city",
-    "night",
-}
+SHORT = ("mining", "describe", "discovery", "search", "growth", "scale", "graphs", "reading")
+"""What is measured if nothing is named."""
+LONG = (
+    *("serve", "hostile", "large", "sparse", "speed", "batch", "localize"),
+    *("condense", "compaction", "ask", "city", "night"),
+)
 """What is measured where it is named."""
 LARGEST_NEEDS_GB = 12.0
 """Memory that must be free for the largest map: the places, the index, and what the system needs beside."""
@@ -93,30 +85,9 @@ def main() -> int:
 
 
 def _arguments() -> argparse.Namespace:
-    kinds = (
-        "mining",
-        "describe",
-        "discovery",
-        "search",
-        "growth",
-        "scale",
-        "serve",
-        "hostile",
-        "graphs",
-        "reading",
-        "large",
-        "sparse",
-        "speed",
-        "batch",
-        "localize",
-        "condense",
-        "compaction",
-        "ask",
-        "city",
-        "night",
-    )
+    kinds = (*SHORT, *LONG)
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
-    named = f"of {', '.join(kinds)}; where none is named all but {', '.join(sorted(LONG))}. Or backend (its own --help)"
+    named = f"of {', '.join(kinds)}; the default is {', '.join(SHORT)}. Or backend (its own --help)"
     parser.add_argument("what", nargs="*", metavar="WHAT", help=named)
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     parser.add_argument("--rounds", type=int, default=5, help="turns of each pair; medians are told")
@@ -143,7 +114,7 @@ def _arguments() -> argparse.Namespace:
     unknown = sorted(set(arguments.what) - set(kinds))
     if unknown:
         parser.error(f"no benchmark {', '.join(unknown)}; there are {', '.join(kinds)}")
-    arguments.what = arguments.what or [kind for kind in kinds if kind not in LONG]
+    arguments.what = arguments.what or list(SHORT)
     return arguments
 
 
@@ -173,7 +144,7 @@ def _measure(arguments: argparse.Namespace) -> Iterator[Figure]:
         yield from reading(rounds, *READING_BARS, (SMALL_GB, LARGE_GB))
     if "graphs" in what:
         yield from graphs(arguments.seeds, rounds)
-    if what & LONG:
+    if not what.isdisjoint(LONG):
         yield from _long(arguments)
 
 
