@@ -23,11 +23,11 @@ from vplog.graph.variance_components import Sigmas, claimed_times
 _LEAST_GROUP = 3
 """Number of closures from which a group may show a slip."""
 _GROUPS = 20
-"""Number of groups, the largest first, that are tried before the set is taken as grown."""
+"""Number of groups that are tried in a row. If none is accepted, no more closures are added."""
 _TURNS = 30
-"""Largest number of groups that join a set."""
+"""Largest number of groups that are added to the true closures."""
 _ROUNDS = 4
-"""Rounds of leaving out runs of closures."""
+"""Largest number of passes in which runs of closures are left out."""
 
 
 def best_hypothesis(
@@ -59,7 +59,7 @@ def best_hypothesis(
 
 
 def _in_claims(one: Hypothesis, by: Sigmas) -> Hypothesis:
-    """A hypothesis of the graph with its noise multiplied `by` these factors, as one of the graph as claimed."""
+    """Return a hypothesis found with the claimed noise multiplied `by` these factors, relative to the claims."""
     sigmas = by.times(one.sigmas)
     return replace(one, sigmas=sigmas, log_density=one.log_density - one.sigmas.log_prior() + sigmas.log_prior())
 
@@ -123,7 +123,7 @@ class _WithSlips:
         return self.sound.with_slips(one.slipping).improved_from(one)
 
     def _grown(self, best: Hypothesis) -> Hypothesis:
-        """Add groups of closures that gain more than the slips that they imply cost, the largest first."""
+        """Add groups of closures that gain more than the slips that they imply cost, in the order of `_rejected`."""
         best, tried = self.sound.with_slips(best.slipping).improved(best), set[bytes]()
         for _ in range(_TURNS):
             posterior, before = self.sound.with_slips(best.slipping).at(best.sigmas), best

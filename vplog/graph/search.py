@@ -267,6 +267,6 @@ def _run_labels(episodes: Episodes, family: Ints) -> Ints:
 
 
 def true_runs(episodes: Episodes, is_false: Bools) -> list[Ints]:
-    """Runs of neighbouring true closures."""
+    """Return each run of neighbouring true closures, as indices (n,) of the closures of the episodes."""
     run = np.where(is_false, -1, _run_labels(episodes, episodes.log_density(is_false)[1]))
     return [np.flatnonzero(run == one) for one in np.unique(run[run >= 0]).tolist()]

@@ -19,7 +19,7 @@ from vplog.geometry import se3
 from vplog.graph.build import AXES, informed
 from vplog.graph.factors import Factors
 from vplog.graph.least_squares import Objective, descend
-from vplog.graph.leave_one_out import tension
+from vplog.graph.leave_one_out import Tension, tension
 from vplog.graph.variance_components import Sigmas, claimed_times
 
 SOUND, STANDS, MOVES = range(3)
@@ -29,11 +29,11 @@ _BEGINS = 1e-6
 _LENGTH = 5.0
 """Mean length of a run in keyframes."""
 _UNUSUAL = 0.01
-"""Prior probability that a step slips if the odometry begins to report no motion, or far too much."""
+"""Prior probability that such a run begins at a step that reports no motion, or far more than the others."""
 _STILL, _FAR = 0.01, 2.0
 """Motion that is reported as none, and motion that is far too much, as a share of what 95 % of the steps stay below."""
 _MOST = 0.5
-"""Largest share of the steps that may slip: odometry that slips more often is none."""
+"""Largest share of slipping steps. A search for slips that exceeds it ends without a result."""
 _STEPS, _TOLERANCE = 5, 1e-2
 """Limits of the least squares after each change of state."""
 
@@ -120,9 +120,9 @@ class Slips:
 
     def _changed(self, weight: Floats, sigmas: Sigmas, present: _States) -> _States | None:
         """Change the step that gains most, and as many beside it as gain more; None if no step gains."""
-        slips = present.state > 0
+        slips, rest = present.state > 0, tension(present.factors, weight, present.poses, self.edges)
         now, other = (
-            self._log_likelihood(present, weight, sigmas, state)
+            self._log_likelihood(present.factors.graph, rest, sigmas, state)
             for state in (present.state, np.where(slips, SOUND, self._slips_as))
         )
         prior_gain = self._log_prior_gain(slips)
@@ -195,18 +195,17 @@ class Slips:
 
         return of(~slips) - of(slips)
 
-    def _log_likelihood(self, present: _States, weight: Floats, sigmas: Sigmas, state: Ints) -> Floats:
-        """Log density (S,) of the motions that the steps measure in these states (S,), given all other edges, up to a
-        constant."""
-        factors, graph, axes = present.factors, present.factors.graph, AXES[present.factors.graph.dimension]
-        found = tension(factors, weight, present.poses, self.edges)
-        predicted = found.whitened / found.redundancy
+    def _log_likelihood(self, graph: PoseGraph, rest: Tension, sigmas: Sigmas, state: Ints) -> Floats:
+        """Log density (S,) of the motions that the steps measure in these states (S,), given the `rest` of the edges,
+        up to a constant."""
+        axes = AXES[graph.dimension]
+        predicted = rest.whitened / rest.redundancy
         motion, covariance = _measured(self._graph, self.edges, state, sigmas)
         apart = se3.log(se3.between(graph.a_from_b[self.edges], motion))[:, axes]
-        error = predicted - (found.whitener @ apart[:, :, None])[:, :, 0]
-        total = found.whitener @ covariance[:, axes][:, :, axes] @ np.swapaxes(found.whitener, 1, 2)
+        error = predicted - (rest.whitener @ apart[:, :, None])[:, :, 0]
+        total = rest.whitener @ covariance[:, axes][:, :, axes] @ np.swapaxes(rest.whitener, 1, 2)
         diagonal = np.arange(len(axes))
-        total[:, diagonal, diagonal] += (1.0 - found.redundancy) / found.redundancy
+        total[:, diagonal, diagonal] += (1.0 - rest.redundancy) / rest.redundancy
         return -0.5 * (se3.mahalanobis2(error, total) + np.linalg.slogdet(total)[1])
 
 
@@ -222,8 +221,8 @@ def _forward(graph: PoseGraph, edges: Ints, motion: Floats) -> Floats:
 
 
 def _measured(graph: PoseGraph, edges: Ints, state: Ints, sigmas: Sigmas) -> tuple[Floats, Floats]:
-    """What `edges` (K,) in these states (K,) measure: a_from_b (K, 4, 4) and its covariance (K, 6, 6). The noise that
-    is claimed is multiplied by `sigmas`."""
+    """Return the motion a_from_b (K, 4, 4) that `edges` (K,) measure in these states (K,), and its covariance
+    (K, 6, 6) with the claimed noise multiplied by `sigmas`."""
     factor, moves = np.repeat(sigmas[:2], 3), state == MOVES
     covariance = np.asarray(np.linalg.inv(graph.information[edges]), np.float64) * factor[:, None] * factor
     motion = np.where((state == STANDS)[:, None, None], np.eye(4), graph.a_from_b[edges])
