@@ -25,11 +25,6 @@ from vplog.graph.marginals import joint_covariance
 from vplog.graph.slips import Slipping
 from vplog.graph.variance_components import Sigmas, claimed_times
 
-_TAIL = 3.0
-"""Noise of a true closure that errs more than others, as a multiple of the noise of the others: Tukey's contaminated
-normal distribution (A survey of sampling from contaminated distributions, 1960)."""
-_TAIL_SHARES = np.array([0.0, 0.01, 0.02, 0.05, 0.1, 0.2])[:, None]
-"""Shares of such closures, equally likely."""
 _STEPS, _TOLERANCE = 100, 1e-4
 """Limits of the least squares that compare hypotheses."""
 _LEAST_RATIO = 1e-9
@@ -96,14 +91,7 @@ class Posterior:
         known = np.linalg.slogdet(informed(graph, weight > 0))[1].sum()
         chi2 = weight * residual_sigma(graph, poses) ** 2
         normal = 0.5 * (known - determinant - chi2.sum()) - 0.5 * _LOG_2PI * d * (len(true) - joined)
-        return float(normal) - joined * self.episodes.log_volume + self._log_tails(chi2[true])
-
-    def _log_tails(self, chi2: Floats) -> float:
-        """Log of how much likelier squared residuals (K,) are if a share of the closures errs more than the others."""
-        wide = 0.5 * chi2 * (1.0 - _TAIL**-2) - degrees_of_freedom(self.factors.graph) * math.log(_TAIL)
-        with np.errstate(divide="ignore"):
-            gain = np.logaddexp(np.log1p(-_TAIL_SHARES), np.log(_TAIL_SHARES) + wide).sum(1)
-        return float(np.logaddexp.reduce(gain)) - math.log(len(gain))
+        return float(normal) - joined * self.episodes.log_volume
 
     def most_gain(self, one: Hypothesis, group: Ints) -> float:
         """Return the most by which the log density can rise if the false closures `group` of the episodes are true: if
@@ -146,7 +134,7 @@ class Linearised:
 
     def gain(self, group: Ints) -> float:
         """Return by how much the log density rises if the closures `group` of the episodes, all of one state, change
-        it. To first order, and without `_log_tails`.
+        it. To first order.
 
         The joint density of m closures is that of their m d residuals under the prediction of the other true ones.
         """
