@@ -7,7 +7,6 @@ each group must gain more than the slips that it implies cost.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +15,18 @@ from vplog.data import Floats, Ints, PoseGraph
 from vplog.graph.consistency import OdometryChain, is_loop
 from vplog.graph.factors import Factors
 from vplog.graph.posterior import Hypothesis
-from vplog.graph.search import Cost, Proposal, Search, attempted, bounded, groups, log_density, true_runs
+from vplog.graph.search import (
+    STEADY,
+    Cost,
+    Proposal,
+    Search,
+    attempted,
+    bounded,
+    false_runs,
+    groups,
+    log_density,
+    true_runs,
+)
 from vplog.graph.slips import Slipping, Slips
 from vplog.graph.variance_components import Sigmas, claimed_times
 
@@ -27,7 +37,7 @@ _GROUPS = 20
 _TURNS = 30
 """Largest number of groups that are added to the true closures."""
 _ROUNDS = 4
-"""Largest number of passes in which runs of closures are left out."""
+"""Largest number of turns between slips and noise, and of passes in which runs of closures are left out."""
 
 
 def best_hypothesis(
@@ -83,29 +93,29 @@ class _WithSlips:
                     result += self._solved(slipping, replace(one, weight=weight))
         return result
 
-    def _starts(self, best: Hypothesis) -> Iterator[Hypothesis]:
-        """Sets of closures from which slips are sought: those that are true without slips. If these imply a slip, or a
-        group is rejected, no closure, too, and those that graduated non-convexity keeps if it may reject odometry as
-        well."""
+    def _starts(self, best: Hypothesis) -> list[Hypothesis]:
+        """Sets of closures, with the slips that they imply, from which the search starts: those that are true without
+        slips, and those that graduated non-convexity keeps if it may reject odometry as well. None if the first imply
+        no slip and are all closures."""
         graph = self.sound.claimed.graph
         loops, chain = is_loop(graph), OdometryChain.of(graph)
         noise = Sigmas(max(best.sigmas.rotation, 1.0), max(best.sigmas.translation, 1.0))
         implied = self._with_implied(replace(best, poses=chain.poses, sigmas=noise))
-        slip = [one for one in implied if one.slipping.state.any()]
-        yield from slip
-        if slip or not implied or self._rejected(best):
-            kept, _ = self.sound.propose(self.sound.claimed, np.ones(len(loops), bool))
-            for weight in (np.where(loops, 0.0, 1.0), np.where(loops, kept, 1.0)):
-                at = noise if best.sigmas.at_bound else Sigmas()
-                yield from self._with_implied(replace(best, weight=weight, poses=chain.poses, sigmas=at))
+        if implied and not implied[0].slipping.state.any() and not self._rejected(best):
+            return []
+        kept, _ = self.sound.propose(self.sound.claimed, np.ones(len(loops), bool))
+        annealed = replace(best, weight=np.where(loops, kept, 1.0), poses=chain.poses)
+        return implied + self._with_implied(replace(annealed, sigmas=noise if best.sigmas.at_bound else Sigmas()))
 
     def _rejected(self, one: Hypothesis) -> list[Ints]:
         """Groups of rejected closures that may show a slip, those that span the shortest path first."""
         episodes = self.sound.with_slips(one.slipping).at(one.sigmas).episodes
         is_false = one.weight[episodes.edges] == 0
-        found = [group for group in groups(episodes, is_false) if is_false[group[0]] and len(group) >= _LEAST_GROUP]
+        alike = [group for group in groups(episodes, is_false) if is_false[group[0]]]
+        found = {group.tobytes(): group for group in alike + false_runs(episodes, is_false)}
         span = episodes.claims.b - episodes.claims.a
-        return sorted(found, key=lambda group: (int(span[group].max()), -len(group)))
+        large = [group for group in found.values() if len(group) >= _LEAST_GROUP]
+        return sorted(large, key=lambda group: (int(span[group].max()), -len(group)))
 
     def _solved(self, slipping: Slipping, one: Hypothesis) -> list[Hypothesis]:
         """The closures and the noise of a hypothesis with other states of the steps; none if that cannot be solved."""
@@ -115,9 +125,26 @@ class _WithSlips:
         return attempted(lambda: posterior.hypothesis(one.weight, poses))
 
     def _with_implied(self, one: Hypothesis, least: float = -np.inf) -> list[Hypothesis]:
-        """The closures and the noise of a hypothesis with the slips that they imply; `least` as in Slips.likeliest."""
-        slipping = self.slips.likeliest(self.sound.claimed, one.weight, one.poses, one.sigmas, one.slipping, least)
-        return [] if slipping is None else self._solved(slipping, one)
+        """The closures of a hypothesis with the slips and the noise that they imply, in turns; none if the prior of the
+        slips falls below `least` at first, as in Slips.likeliest."""
+        found: list[Hypothesis] = []
+        for _ in range(_ROUNDS):
+            slipping = self.slips.likeliest(self.sound.claimed, one.weight, one.poses, one.sigmas, one.slipping, least)
+            new = [] if slipping is None else self._refit(slipping, one)
+            if not new or (found and new[0].log_density <= found[0].log_density):
+                break
+            found = new
+            if not new[0].sigmas.differ(one.sigmas, STEADY):
+                break
+            one = new[0]
+        return found
+
+    def _refit(self, slipping: Slipping, one: Hypothesis) -> list[Hypothesis]:
+        """The closures of a hypothesis with other states of the steps and the noise that they imply."""
+        if not one.weight[is_loop(self.sound.claimed.graph)].any():
+            return self._solved(slipping, one)
+        search = self.sound.with_slips(slipping)
+        return attempted(lambda: search.refit(one.weight, one.poses, one.sigmas))
 
     def _improved(self, one: Hypothesis) -> list[Hypothesis]:
         return self.sound.with_slips(one.slipping).improved_from(one)
@@ -149,9 +176,10 @@ class _WithSlips:
             for run in true_runs(episodes, best.weight[episodes.edges] == 0):
                 weight = np.array(best.weight)
                 weight[episodes.edges[run]] = 0.0
-                for one in self._with_implied(replace(best, weight=weight)):
-                    if (one.slipping.state != best.slipping.state).any():
-                        best = max(best, one, key=log_density)
+                slipping = self.slips.likeliest(self.sound.claimed, weight, best.poses, best.sigmas, best.slipping)
+                if slipping is not None and (slipping.state != best.slipping.state).any():
+                    less = replace(best, weight=weight, slipping=slipping)
+                    best = max([best, *self._with_implied(less)], key=log_density)
             if best is before:
                 break
             best = max([best, *self._improved(best)], key=log_density)

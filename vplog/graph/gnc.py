@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from vplog.data import Bools, Floats, Ints, PoseGraph, Solution
+from vplog.data import Bools, Floats, PoseGraph, Solution
 from vplog.graph.best_hypothesis import best_hypothesis
 from vplog.graph.build import checked
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, is_loop, residual_sigma
@@ -19,17 +19,12 @@ from vplog.graph.factors import Factors
 from vplog.graph.initialise import initial_poses
 from vplog.graph.least_squares import descend
 from vplog.graph.lm import half_chi2, solve_weighted
-from vplog.graph.pcm import PcmSettings
 from vplog.graph.robust_kernels import truncated_weights
 from vplog.graph.search import Cost, bounded
 from vplog.graph.slips import Slipping
 from vplog.graph.variance_components import Sigmas
-from vplog.graph.workers import Workers
 from vplog.settings import Settings
 
-_BRANCHES = 200
-"""Branches of the search for the largest set of closures between two pieces of odometry: an exact search of some
-hundred closures, a hundredth of whose pairs disagree by chance, does not end."""
 _JOINS = 1e-6
 """Least weight of odometry, so that the poses stay determined."""
 
@@ -99,30 +94,11 @@ class GncSettings(Settings):
         The edges `may_be_false` (E,) may be rejected: closures, or odometry as well.
         """
         graph = factors.graph
-        loops, chain = np.flatnonzero(is_loop(graph)), OdometryChain.of(graph)
         weight = np.ones(len(graph.a))
-        weight[loops] = self._consistent(graph, loops, chain)
         bound = chi2_quantile(self.inlier_probability, degrees_of_freedom(graph))
         trusts_odometry = not (may_be_false & graph.odometry).any()
-        start = initial_poses(factors, weight, bound) if trusts_odometry else chain.poses
+        start = initial_poses(factors, weight, bound) if trusts_odometry else OdometryChain.of(graph).poses
         return self._anneal(factors, weight, start, bound, may_be_false)
-
-    def _consistent(self, graph: PoseGraph, loops: Ints, chain: OdometryChain) -> Bools:
-        """False for closures (K,) between two pieces of odometry that are not of the largest consistent set."""
-        part = chain.part
-        one, two = part[graph.a[loops]], part[graph.b[loops]]
-        across = one != two
-        consistency = PcmSettings(pair_probability=self.inlier_probability, clique_steps=_BRANCHES)
-        good = ~across
-        # closures between other pieces do not constrain each other, so each two pieces are tested separately
-        pairs = np.minimum(one, two) * (int(part.max()) + 1) + np.maximum(one, two)
-        by_pair = np.flatnonzero(across)[np.argsort(pairs[across], kind="stable")]
-        first = np.flatnonzero(np.diff(pairs[by_pair], prepend=-1))
-        with Workers() as workers:
-            tasks = [(graph, loops[rows], chain) for rows in np.split(by_pair, first)[1:]]
-            for accepted, _ in workers.each(consistency.consistent, tasks):
-                good[np.searchsorted(loops, accepted)] = True
-        return good
 
     def _anneal(
         self, factors: Factors, weight: Floats, poses: Floats, bound: float, may_be_false: Bools

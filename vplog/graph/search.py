@@ -34,7 +34,7 @@ _MOST_INFORMATION = 1e4
 """Largest information of a closure as a multiple of the median one, so that none outweighs a hundred others."""
 _KNOWN = 10.0
 """Information of an axis that a closure knows, as a multiple of what is known of any."""
-_STEADY = 0.05
+STEADY = 0.05
 """Change of a noise factor, as a share, below which it is settled."""
 _LEAST_NOISE = Sigmas(0.25, 0.25, 1.0, 1.0)
 """Smallest noise factors of a decision. Neighbouring closures share landmarks, and odometry has biases: both agree with
@@ -47,7 +47,7 @@ _SHARES = (1.0, 0.25, 0.0625)
 _LEAST_FAMILY = 3
 """Number of closures from which a family is proposed."""
 _FAMILIES = 2
-"""Number of families that are proposed at each share, and that are improved."""
+"""Number of families that are proposed at each share."""
 _TRIED = 8
 """Number of flips, the most promising first, that are predicted in one turn."""
 _TURNS = 30
@@ -103,8 +103,8 @@ class Search:
     def improved_from(self, start: Hypothesis) -> list[Hypothesis]:
         """Return the likeliest hypothesis that a set of true closures and graduated non-convexity lead to; none if
         neither determines the poses."""
-        found = attempted(lambda: self._refit(start.weight, start.poses, start.sigmas))
-        found += attempted(lambda: self._refit(*self.annealed(Sigmas()), Sigmas()))
+        found = attempted(lambda: self.refit(start.weight, start.poses, start.sigmas))
+        found += attempted(lambda: self.refit(*self.annealed(Sigmas()), Sigmas()))
         return sorted((self.improved(one) for one in found), key=log_density)[-1:]
 
     def annealed(self, sigmas: Sigmas) -> tuple[Floats, Floats]:
@@ -117,19 +117,18 @@ class Search:
         loops, chain = is_loop(self.claimed.graph), OdometryChain.of(posterior.factors.graph)
         none = posterior.hypothesis(np.where(loops, 0.0, 1.0), chain.poses)
         found = [none]
-        annealed = attempted(lambda: self._refit(*self.annealed(Sigmas()), Sigmas()))
+        annealed = attempted(lambda: self.refit(*self.annealed(Sigmas()), Sigmas()))
         if not (annealed and annealed[0].weight.all()):  # claims may be too small for any closure to agree with them
-            annealed += attempted(lambda: self._refit(np.ones(len(loops)), chain.poses, Sigmas()))
+            annealed += attempted(lambda: self.refit(np.ones(len(loops)), chain.poses, Sigmas()))
         found += [self.improved(one) for one in annealed]
         best = max(found, key=log_density)
-        families: list[Hypothesis] = []
+        starts = [] if best.weight.all() else [none]
         for weight in self._families(best, loops):
-            families += attempted(lambda weight=weight: self._refit(weight, chain.poses, Sigmas()))
-        starts = sorted(families, key=log_density)[-_FAMILIES:]
-        if not best.weight.all():
-            starts.append(none)
+            starts += attempted(lambda weight=weight: self.refit(weight, chain.poses, Sigmas()))
         found += [self.improved(one) for one in starts]
-        return self._at_each_noise(found)
+        # nothing but the other hypotheses tells the noise if no closure is true
+        none_at = [self.at(sigmas).hypothesis(none.weight, chain.poses) for sigmas in {one.sigmas for one in found}]
+        return [max(none_at, key=log_density), *found[1:]]
 
     def _families(self, best: Hypothesis, loops: Bools) -> Iterator[Floats]:
         """Weights (E,) of the largest families that may be true in place of the best set: those with a closure that it
@@ -147,7 +146,7 @@ class Search:
                     proposed.add(weight.tobytes())
                     yield weight
 
-    def _refit(self, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
+    def refit(self, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
         """Solve the edges of weight (E,) 1 and estimate the noise, in turns."""
         for _ in range(_ROUNDS):
             slipping = self.slipping.applied(self.claimed.graph, sigmas)
@@ -155,7 +154,7 @@ class Search:
             poses = descend(factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
             before, sigmas = sigmas, estimate(Objective(factors, weight), poses, sigmas)
             sigmas = Sigmas(*np.maximum(sigmas, _LEAST_NOISE).tolist())
-            if not sigmas.differ(before, _STEADY):
+            if not sigmas.differ(before, STEADY):
                 break
         return self.at(sigmas).hypothesis(weight, poses)
 
@@ -168,7 +167,7 @@ class Search:
                 break
             best = flipped[0]
             if best.weight[is_loop(self.claimed.graph)].any():
-                for again in attempted(lambda best=best: self._refit(best.weight, best.poses, best.sigmas)):
+                for again in attempted(lambda best=best: self.refit(best.weight, best.poses, best.sigmas)):
                     if again.log_density > best.log_density:
                         best, posterior = again, self.at(again.sigmas)
         return best
@@ -206,17 +205,6 @@ class Search:
                 if one.log_density > best.log_density:
                     return [one]
         return []
-
-    def _at_each_noise(self, found: list[Hypothesis]) -> list[Hypothesis]:
-        """The sets found, in order, each with the noise of those found that makes it likeliest."""
-        best = {one.weight.tobytes(): one for one in sorted(found, key=log_density)}
-        sets = [best[key] for key in dict.fromkeys(one.weight.tobytes() for one in found)]
-        for sigmas in dict.fromkeys(one.sigmas for one in sets):
-            posterior = self.at(sigmas)
-            for at, one in enumerate(sets):
-                others = attempted(lambda of=posterior, one=one: of.hypothesis(one.weight, one.poses))
-                sets[at] = max(sets[at], *others, key=log_density) if others else one
-        return sets
 
 
 def log_density(one: Hypothesis) -> float:
@@ -269,4 +257,10 @@ def _run_labels(episodes: Episodes, family: Ints) -> Ints:
 def true_runs(episodes: Episodes, is_false: Bools) -> list[Ints]:
     """Return each run of neighbouring true closures, as indices (n,) of the closures of the episodes."""
     run = np.where(is_false, -1, _run_labels(episodes, episodes.log_density(is_false)[1]))
+    return [np.flatnonzero(run == one) for one in np.unique(run[run >= 0]).tolist()]
+
+
+def false_runs(episodes: Episodes, is_false: Bools) -> list[Ints]:
+    """Return each run of neighbouring false closures of any family, as indices (n,) of those of the episodes."""
+    run = np.where(is_false, _run_labels(episodes, np.where(is_false, 0, -1)), -1)
     return [np.flatnonzero(run == one) for one in np.unique(run[run >= 0]).tolist()]
