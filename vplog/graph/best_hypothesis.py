@@ -100,9 +100,10 @@ class _WithSlips:
         graph = self.sound.claimed.graph
         loops, chain = is_loop(graph), OdometryChain.of(graph)
         noise = Sigmas(max(best.sigmas.rotation, 1.0), max(best.sigmas.translation, 1.0))
-        implied = self._with_implied(replace(best, poses=chain.poses, sigmas=noise))
-        if implied and not implied[0].slipping.state.any() and not self._rejected(best):
+        slipping = self.slips.likeliest(self.sound.claimed, best.weight, best.poses, noise, best.slipping)
+        if slipping is not None and not slipping.state.any() and not self._rejected(best):
             return []
+        implied = self._with_implied(replace(best, sigmas=noise))
         kept, _ = self.sound.propose(self.sound.claimed, np.ones(len(loops), bool))
         annealed = replace(best, weight=np.where(loops, kept, 1.0), poses=chain.poses)
         return implied + self._with_implied(replace(annealed, sigmas=noise if best.sigmas.at_bound else Sigmas()))
