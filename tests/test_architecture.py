@@ -26,6 +26,8 @@ LAYERS = (
     {"settings", "execution", "storage"},
     {"stages", "geometry"},
     {"features", "logs", "graph", "results", "evaluate"},
+    {"refinement"},
+    {"joint"},
     {"places", "loops"},
     {"odometry"},
     {"run", "testing"},

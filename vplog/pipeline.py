@@ -15,11 +15,9 @@ from vplog.execution.execution import Execution
 from vplog.features.extractors import FeatureSettings
 from vplog.features.sift import SiftSettings
 from vplog.features.stereo_depth import StereoSettings
-from vplog.graph.gps_factors import GpsSettings
-from vplog.graph.joint import JoinSettings
 from vplog.graph.noise import NoiseSettings
-from vplog.graph.refine import RefineSettings
 from vplog.graph.solve import GncSettings, OptimiserSettings
+from vplog.joint.graph import JoinSettings
 from vplog.loops.false_rate import FalseRateSettings
 from vplog.loops.propose import ProposeSettings
 from vplog.loops.verify import VerifySettings
@@ -28,6 +26,8 @@ from vplog.places.bobb import BobbSettings
 from vplog.places.plugin import as_plugin
 from vplog.places.reference_choice import LibrarySettings
 from vplog.places.sequence import SequenceSettings
+from vplog.refinement.gps_factors import GpsSettings
+from vplog.refinement.refine import RefineSettings
 from vplog.results import tables
 from vplog.results.previews import PictureSettings
 from vplog.results.run_record import CACHE

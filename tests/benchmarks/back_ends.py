@@ -18,9 +18,9 @@ from vplog.errors import VplogError
 from vplog.geometry import se3
 from vplog.graph.build import subgraph
 from vplog.graph.consistency import chi2_quantile, is_loop
-from vplog.graph.gps_factors import GpsSettings
 from vplog.graph.solve import GncSettings, OptimiserSettings, decided
 from vplog.pipeline import Pipeline
+from vplog.refinement.gps_factors import GpsSettings
 from vplog.run import back_end
 
 if TYPE_CHECKING:

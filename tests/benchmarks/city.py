@@ -22,11 +22,12 @@ from tests.benchmarks.measure import Figure
 from vplog.data import Closures, EdgeKind, Keyframes, Odometry, PoseGraph, Solution, Trajectory, Verdict
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
-from vplog.graph import growth, joint
 from vplog.graph.lm import LmSettings
 from vplog.graph.slips import Slipping
 from vplog.graph.solve import Decision
 from vplog.graph.variance_components import Sigmas
+from vplog.joint import graph as joint
+from vplog.joint import growth
 from vplog.loops.verify import no_closures
 from vplog.maps.joining import components
 from vplog.maps.joining.components import Drives, PairLedger

@@ -11,10 +11,10 @@ import pytest
 from vplog.data import EdgeKind, Frame, Odometry, PoseGraph, Solution, Trajectory
 from vplog.geometry import se3
 from vplog.graph.noise import NoiseSettings, edge_covariance
-from vplog.graph.refine import Refined
 from vplog.graph.variance_components import Sigmas, claimed_times
 from vplog.odometry.sensor import disparities, follow
 from vplog.odometry.visual import visual_odometry
+from vplog.refinement.refine import Refined
 from vplog.run.back_end import BackEndResult, keyframe_covariances
 from vplog.verbs.demo.scene import Scene, make_scene, take_picture
 from vplog.verbs.demo.settings import DemoSettings

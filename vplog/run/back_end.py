@@ -29,16 +29,16 @@ from vplog.geometry import se3
 from vplog.graph import build, consistency, correct_trajectory
 from vplog.graph.consistency import is_loop
 from vplog.graph.factors import Factors
-from vplog.graph.gps_factors import GpsSettings, cost_of_fixes, fixes_on, noisier, with_fixes
 from vplog.graph.least_squares import Objective
 from vplog.graph.marginals import SharedScale, pose_covariances
 from vplog.graph.noise import NoiseSettings, broken_edges, edge_covariance
-from vplog.graph.pieces import pieces_placed
-from vplog.graph.refine import Refined, RefineSettings, Scale, refine, rescaled
 from vplog.graph.search import bounded
 from vplog.graph.solve import Decision, OptimiserSettings, about_slips, decided
 from vplog.graph.variance_components import Sigmas, claimed_times
+from vplog.joint.pieces import pieces_placed
 from vplog.loops.false_rate import log_odds_false
+from vplog.refinement.gps_factors import GpsSettings, cost_of_fixes, fixes_on, noisier, with_fixes
+from vplog.refinement.refine import Refined, RefineSettings, Scale, refine, rescaled
 from vplog.run.cache.steps import step
 
 _FIXES_OF_A_PIECE = 2

@@ -12,12 +12,12 @@ from vplog.data import Camera, Imu, Keyframes, Odometry
 from vplog.errors import LogError, plural
 from vplog.execution.execution import Execution
 from vplog.execution.run_warnings import warn
-from vplog.graph.gps_factors import NO_FIXES
 from vplog.logs import TopicChoice
 from vplog.logs.cameras import AHEAD
 from vplog.odometry.inertial import SURE, with_imu
 from vplog.odometry.metric_scale import in_metres
 from vplog.odometry.visual import PERIOD_NS, visual_odometry
+from vplog.refinement.gps_factors import NO_FIXES
 from vplog.run.cache.codecs import json_codec
 from vplog.run.cache.stage_cache import Inputs
 from vplog.run.cache.steps import Steps, step

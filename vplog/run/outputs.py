@@ -23,9 +23,9 @@ from vplog.data import (
 )
 from vplog.geometry import se3, tum
 from vplog.graph import consistency
-from vplog.graph.joint import spaced_apart
-from vplog.graph.refine import about_odometry
+from vplog.joint.graph import spaced_apart
 from vplog.places.library_files import name_extractor
+from vplog.refinement.refine import about_odometry
 from vplog.results import g2o, mcap, run_record, tables
 from vplog.results.previews import thumbnail
 from vplog.results.report.page import Pictures, ReportContent

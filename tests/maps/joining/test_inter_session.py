@@ -12,7 +12,7 @@ from tests.graph.drive import ledger
 from vplog.data import Closures, Verdict
 from vplog.execution.execution import Execution
 from vplog.features.learned import OnnxFeatureSettings
-from vplog.graph.joint import JoinSettings
+from vplog.joint.graph import JoinSettings
 from vplog.loops.false_rate import FalseRateSettings
 from vplog.loops.propose import Proposals
 from vplog.maps.joining import inter_session

@@ -18,7 +18,7 @@ from vplog.errors import ResultError
 from vplog.evaluate.truth import read_truth
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
-from vplog.graph.joint import JoinSettings
+from vplog.joint.graph import JoinSettings
 from vplog.loops.false_rate import FalseRateSettings
 from vplog.loops.propose import ProposeSettings, propose
 from vplog.maps.joining import candidate_drives as candidates

@@ -13,7 +13,7 @@ import vplog
 from tests.maps.bucket import counting, serving
 from tests.maps.joining.test_join import LOGS, PIPELINE, joined, put
 from vplog.execution.execution import Execution
-from vplog.graph.joint import JoinSettings
+from vplog.joint.graph import JoinSettings
 from vplog.maps.info import describe_map
 from vplog.maps.joining import candidate_drives
 from vplog.maps.joining import join as map_join

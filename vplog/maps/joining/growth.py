@@ -19,15 +19,15 @@ import numpy as np
 from vplog.data import Closures, Floats, Keyframes
 from vplog.errors import GraphError, ResultError
 from vplog.geometry import se3
-from vplog.graph.growth import Anchored, place, solve_again, turned_round
-from vplog.graph.joint import middle
-from vplog.graph.refine import Refined
+from vplog.joint.graph import middle
+from vplog.joint.growth import Anchored, place, solve_again, turned_round
 from vplog.maps.joining import joint_graph
 from vplog.maps.joining.joint_graph import SolvedDrive, verified, verified_closures, with_solve
 from vplog.maps.joining.joint_record import count_between, fetch_poses, is_whole, joint_ledgers
 from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.layout import folder_name
 from vplog.maps.storage.map_store import Store
+from vplog.refinement.refine import Refined
 from vplog.results import tables
 from vplog.storage.json_records import key_of
 

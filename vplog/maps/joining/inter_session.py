@@ -22,7 +22,7 @@ from vplog.run.verification import merged
 from vplog.stages import PlaceState, index_of_part
 
 if TYPE_CHECKING:
-    from vplog.graph.joint import JoinSettings
+    from vplog.joint.graph import JoinSettings
     from vplog.pipeline import Pipeline
 
 _NO_POSE = (Verdict.TOO_FEW_MATCHES, Verdict.TOO_FEW_LANDMARKS, Verdict.TOO_FEW_INLIERS)

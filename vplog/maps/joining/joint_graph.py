@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vplog.data import Closures, Floats, Ints, Keyframes, Odometry, PoseGraph, Trajectory, Verdict
-from vplog.graph import joint as graph_joint
 from vplog.graph.build import busier, subgraph
 from vplog.graph.correct_trajectory import correct_trajectory
-from vplog.graph.refine import Refined, about_odometry
+from vplog.joint import graph as graph_joint
 from vplog.loops.false_rate import log_odds_false
 from vplog.maps.storage.damage import reading_drive
 from vplog.maps.storage.layout import folder_name
+from vplog.refinement.refine import Refined, about_odometry
 from vplog.results import g2o, run_record, tables
 from vplog.run.back_end import by_odometry
 from vplog.storage.scratch import put_in_place

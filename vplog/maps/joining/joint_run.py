@@ -33,7 +33,7 @@ from vplog.run.verification import for_verification
 from vplog.storage.folders import numbered
 
 if TYPE_CHECKING:
-    from vplog.graph.joint import Joined
+    from vplog.joint.graph import Joined
     from vplog.maps.joining.joint_graph import Ledgers
     from vplog.stages import PlaceState
 

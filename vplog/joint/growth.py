@@ -16,10 +16,10 @@ from vplog.data import EdgeKind, Floats, Ints, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.consistency import OdometryChain, chi2_quantile, degrees_of_freedom, residual_sigma
 from vplog.graph.factors import Factors
-from vplog.graph.joint import Between, Joined, JoinSettings, SessionGraph, as_one, log_odds_of, maps_of, middle, places
 from vplog.graph.least_squares import descend
-from vplog.graph.refine import Refined, RefineSettings, refine, rescaled
 from vplog.graph.solve import decided
+from vplog.joint.graph import Between, Joined, JoinSettings, SessionGraph, as_one, log_odds_of, maps_of, middle, places
+from vplog.refinement.refine import Refined, RefineSettings, refine, rescaled
 from vplog.stages import Optimiser
 
 _STAYS, _LEAVES = 0.99, 0.999999

@@ -13,8 +13,8 @@ from vplog.data import Bools, EdgeKind, Floats, Ints, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.build import parts
 from vplog.graph.consistency import residual_sigma
-from vplog.graph.refine import Refined, RefineSettings, refine
 from vplog.graph.solve import decided
+from vplog.refinement.refine import Refined, RefineSettings, refine
 from vplog.settings import Settings
 from vplog.stages import Optimiser
 

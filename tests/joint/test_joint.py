@@ -12,9 +12,9 @@ from tests.graph import drive as drives
 from vplog.data import EdgeKind, Trajectory
 from vplog.evaluate.trajectory import ate
 from vplog.geometry import se3
-from vplog.graph.joint import Between, JoinSettings, SessionGraph, join
-from vplog.graph.refine import RefineSettings
 from vplog.graph.solve import GncSettings
+from vplog.joint.graph import Between, JoinSettings, SessionGraph, join
+from vplog.refinement.refine import RefineSettings
 
 SHIFT = se3.exp(np.array([0.1, -0.2, 2.0, 30.0, 10.0, -3.0]))
 CLOSURE = np.diag(1.0 / drives.CLOSURE_SIGMA**2)

@@ -8,8 +8,8 @@ import numpy as np
 
 from vplog.data import EdgeKind, PoseGraph
 from vplog.geometry import se3
-from vplog.graph.pieces import pieces_placed
 from vplog.graph.solve import GncSettings, decided
+from vplog.joint.pieces import pieces_placed
 
 N, BREAK = 60, 29
 WRONG = 4

@@ -10,8 +10,8 @@ from vplog.data import Floats, Ints, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.build import subgraph
 from vplog.graph.consistency import is_loop
-from vplog.graph.joint import JoinSettings, spaced_apart
 from vplog.graph.pcm import PcmSettings
+from vplog.joint.graph import JoinSettings, spaced_apart
 
 _TIMES = 10.0
 """A break's sigmas as a multiple of the spread of the closures across it: a hundredth of one closure's weight."""

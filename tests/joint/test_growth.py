@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.graph.test_joint import SHIFT, between, joint_error, lap, moved
+from tests.joint.test_joint import SHIFT, between, joint_error, lap, moved
 from vplog.geometry import se3
-from vplog.graph.growth import Anchored, place, solve_again, turned_round
-from vplog.graph.joint import Between, JoinSettings, join
-from vplog.graph.refine import RefineSettings
 from vplog.graph.solve import GncSettings
+from vplog.joint.graph import Between, JoinSettings, join
+from vplog.joint.growth import Anchored, place, solve_again, turned_round
+from vplog.refinement.refine import RefineSettings
 
 HOW = (GncSettings(), JoinSettings())
 

@@ -16,13 +16,13 @@ from vplog.geometry.geodesy import geodetic, local_enu
 from vplog.graph.build import build_graph
 from vplog.graph.consistency import residual_sigma
 from vplog.graph.factors import Factors
-from vplog.graph.gps_factors import Fixes, GpsSettings, antennas, cost_of_fixes, fixes_on
 from vplog.graph.least_squares import descend
 from vplog.graph.lm import LmSettings
-from vplog.graph.refine import Refined, RefineSettings, refine
 from vplog.graph.solve import GncSettings, decided
 from vplog.graph.variance_components import Sigmas
 from vplog.pipeline import Pipeline
+from vplog.refinement.gps_factors import Fixes, GpsSettings, antennas, cost_of_fixes, fixes_on
+from vplog.refinement.refine import Refined, RefineSettings, refine
 from vplog.run.back_end import solve
 
 DEGREE_M = 111_195.0

@@ -10,11 +10,11 @@ from pydantic import Field
 from vplog.data import Bools, Floats, PoseGraph, Solution
 from vplog.graph.consistency import residual_sigma, runs
 from vplog.graph.factors import Factors
-from vplog.graph.gps_factors import Fixes, inlier_fixes, with_fixes, with_noise_of, world_from_enu
 from vplog.graph.least_squares import Objective, minimised
 from vplog.graph.lm import half_chi2
 from vplog.graph.marginals import SharedScale, positions_redundancy
 from vplog.graph.variance_components import Sigmas, claimed_times, estimate, extrapolated
+from vplog.refinement.gps_factors import Fixes, inlier_fixes, with_fixes, with_noise_of, world_from_enu
 from vplog.settings import Settings
 
 _STEP = 1e-4

@@ -1,0 +1,1 @@
+"""Several drives, or pieces of one, in one pose graph."""
