@@ -16,7 +16,10 @@ from vplog.graph.consistency import OdometryChain, is_loop
 from vplog.graph.factors import Factors
 from vplog.graph.posterior import Hypothesis
 from vplog.graph.search import (
+    LEAST_GROUP,
+    ROUNDS,
     STEADY,
+    TURNS,
     Cost,
     Proposal,
     Search,
@@ -30,14 +33,8 @@ from vplog.graph.search import (
 from vplog.graph.slips import Slipping, Slips
 from vplog.graph.variance_components import Sigmas, claimed_times
 
-_LEAST_GROUP = 3
-"""Number of closures from which a group may show a slip."""
 _GROUPS = 20
 """Number of groups that are tried in a row. If none is accepted, no more closures are added."""
-_TURNS = 30
-"""Largest number of groups that are added to the true closures."""
-_ROUNDS = 4
-"""Largest number of turns between slips and noise, and of passes in which runs of closures are left out."""
 
 
 def best_hypothesis(
@@ -115,7 +112,7 @@ class _WithSlips:
         alike = [group for group in groups(episodes, is_false) if is_false[group[0]]]
         found = {group.tobytes(): group for group in alike + false_runs(episodes, is_false)}
         span = episodes.claims.b - episodes.claims.a
-        large = [group for group in found.values() if len(group) >= _LEAST_GROUP]
+        large = [group for group in found.values() if len(group) >= LEAST_GROUP]
         return sorted(large, key=lambda group: (int(span[group].max()), -len(group)))
 
     def _solved(self, slipping: Slipping, one: Hypothesis) -> list[Hypothesis]:
@@ -129,7 +126,7 @@ class _WithSlips:
         """The closures of a hypothesis with the slips and the noise that they imply, in turns; none if the prior of the
         slips falls below `least` at first, as in Slips.likeliest."""
         found: list[Hypothesis] = []
-        for _ in range(_ROUNDS):
+        for _ in range(ROUNDS):
             slipping = self.slips.likeliest(self.sound.claimed, one.weight, one.poses, one.sigmas, one.slipping, least)
             new = [] if slipping is None else self._refit(slipping, one)
             if not new or (found and new[0].log_density <= found[0].log_density):
@@ -153,7 +150,7 @@ class _WithSlips:
     def _grown(self, best: Hypothesis) -> Hypothesis:
         """Add groups of closures that gain more than the slips that they imply cost, in the order of `_rejected`."""
         best, tried = self.sound.with_slips(best.slipping).improved(best), set[bytes]()
-        for _ in range(_TURNS):
+        for _ in range(TURNS):
             posterior, before = self.sound.with_slips(best.slipping).at(best.sigmas), best
             new = [group for group in self._rejected(best) if group.tobytes() not in tried]
             for group in new[:_GROUPS]:
@@ -171,7 +168,7 @@ class _WithSlips:
 
     def _pruned(self, best: Hypothesis) -> Hypothesis:
         """Leave out runs of closures that gain less than the slips that they imply cost."""
-        for _ in range(_ROUNDS):
+        for _ in range(ROUNDS):
             before = best
             episodes = self.sound.with_slips(best.slipping).at(best.sigmas).episodes
             for run in true_runs(episodes, best.weight[episodes.edges] == 0):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,10 +12,7 @@ from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed, parts
 from vplog.graph.least_squares import Objective
-from vplog.graph.sparse.cholesky import Cholesky, inverse_blocks, joint_inverse
-
-if TYPE_CHECKING:
-    from vplog.graph.factors import Factors
+from vplog.graph.sparse.cholesky import inverse_blocks
 
 
 class SharedScale(NamedTuple):
@@ -101,20 +98,3 @@ def positions_redundancy(objective: Objective, poses: Floats) -> float:
         return 3.0 * float(used.sum())
     spread = jacobian @ own @ np.swapaxes(jacobian, 1, 2)
     return 3.0 * float(used.sum()) - float(np.einsum("fij,fji->", positions.Omega[used], spread))
-
-
-def joint_covariance(factors: Factors, information: Cholesky, poses: Floats, edges: Ints) -> Floats:
-    """Covariance (K d, K d) of a_from_b of a few edges together, each in the frame of its b."""
-    graph = factors.graph
-    axes = AXES[graph.dimension]
-    size = len(axes)
-    ends = np.stack([graph.a[edges], graph.b[edges]], axis=1)
-    nodes = np.unique(ends).astype(np.int64)
-    covariance = joint_inverse(information, nodes)
-    Ad = se3.adjoint(se3.between(poses[ends[:, 1]], poses[ends[:, 0]]))[:, axes][:, :, axes]
-    jacobian = np.zeros((len(edges) * size, len(covariance)))
-    for row, (a, b) in enumerate(np.searchsorted(nodes, ends).tolist()):
-        part = slice(row * size, (row + 1) * size)
-        jacobian[part, a * size : (a + 1) * size] = -Ad[row]
-        jacobian[part, b * size : (b + 1) * size] = np.eye(size)
-    return jacobian @ covariance @ jacobian.T

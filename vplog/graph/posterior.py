@@ -9,26 +9,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from vplog.data import Floats, Ints
-from vplog.graph.build import AXES, informed
+from vplog.graph.build import informed
 from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, odometry_chain, residual_sigma
 from vplog.graph.episodes import Episodes
 from vplog.graph.factors import Factors
 from vplog.graph.false_volume import log_false_volume
 from vplog.graph.least_squares import GAUGE_SIGMA, Objective, descend
-from vplog.graph.leave_one_out import distance, errors, tension
-from vplog.graph.marginals import joint_covariance
+from vplog.graph.leave_one_out import distance, tension
 from vplog.graph.slips import Slipping
 from vplog.graph.variance_components import Sigmas, claimed_times
 
-_STEPS, _TOLERANCE = 100, 1e-4
+STEPS, TOLERANCE = 100, 1e-4
 """Limits of the least squares that compare hypotheses."""
-_LEAST_RATIO = 1e-9
-"""Smallest ratio of the variance of a residual to that of its closure, so that no quotient is infinite."""
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
@@ -70,7 +66,7 @@ class Posterior:
     def hypothesis(self, weight: Floats, poses: Floats) -> Hypothesis:
         """Solve the edges of weight (E,) 1 from `poses`. Raises GraphError if these are not determined."""
         if (weight[~self.factors.graph.odometry] > 0).any():
-            poses = descend(self.factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
+            poses = descend(self.factors, weight, poses, STEPS, TOLERANCE).world_from_body
         return Hypothesis(weight, poses, self.sigmas, self.log_density(weight, poses), self.slipping)
 
     def log_density(self, weight: Floats, poses: Floats) -> float:
@@ -115,45 +111,3 @@ class Posterior:
             result[true] = -0.5 * found.cost
             result[true] -= np.minimum(found.log_spread + 0.5 * d * _LOG_2PI, self.episodes.log_volume)
         return result
-
-
-@dataclass(frozen=True, eq=False)
-class Linearised:
-    """A hypothesis with its factorisation, from which changes are predicted without another solve."""
-
-    posterior: Posterior
-    one: Hypothesis
-
-    @cached_property
-    def _information(self):
-        return Objective(self.posterior.factors, self.one.weight).information(self.one.poses)
-
-    @cached_property
-    def _log_states(self) -> float:
-        return self.posterior.episodes.log_density(self.one.weight[self.posterior.episodes.edges] == 0)[0]
-
-    def gain(self, group: Ints) -> float:
-        """Return by how much the log density rises if the closures `group` of the episodes, all of one state, change
-        it. To first order.
-
-        The joint density of m closures is that of their m d residuals under the prediction of the other true ones.
-        """
-        posterior, one = self.posterior, self.one
-        edges, graph = posterior.episodes.edges[group], posterior.factors.graph
-        d, size = degrees_of_freedom(graph), len(group)
-        is_false = one.weight[posterior.episodes.edges] == 0
-        sign = 1.0 if is_false[group[0]] else -1.0
-        changed = np.array(is_false)
-        changed[group] = ~changed[group]
-        error, jacobian = errors(graph, one.poses, edges)
-        covariance = joint_covariance(posterior.factors, self._information, one.poses, edges)
-        root = np.linalg.cholesky(np.linalg.inv(informed(graph, edges)))
-        whiten = np.linalg.inv(root) @ jacobian
-        covariance = np.einsum("iab,ibjc,jdc->iajd", whiten, covariance.reshape(size, d, size, d), whiten)
-        share, turn = np.linalg.eigh(covariance.reshape(size * d, size * d))
-        ratio = np.maximum(1.0 + sign * share, _LEAST_RATIO)
-        white = turn.T @ np.linalg.solve(root, error[:, AXES[graph.dimension], None]).ravel()
-        log_density = -0.5 * ((white**2 / ratio).sum() + len(white) * _LOG_2PI + sign * np.log(ratio).sum())
-        log_density -= np.log(np.diagonal(root, axis1=1, axis2=2)).sum()
-        states = posterior.episodes.log_density(changed)[0] - self._log_states
-        return states + sign * float(log_density)

@@ -21,7 +21,7 @@ from vplog.graph.consistency import OdometryChain, is_loop
 from vplog.graph.episodes import Episodes
 from vplog.graph.factors import Factors
 from vplog.graph.least_squares import Objective, descend
-from vplog.graph.posterior import Hypothesis, Linearised, Posterior
+from vplog.graph.posterior import STEPS, TOLERANCE, Hypothesis, Posterior
 from vplog.graph.slips import Slipping
 from vplog.graph.variance_components import Sigmas, claimed_times, estimate
 
@@ -40,23 +40,18 @@ _LEAST_NOISE = Sigmas(0.25, 0.25, 1.0, 1.0)
 """Smallest noise factors of a decision. Neighbouring closures share landmarks, and odometry has biases: both agree with
 themselves better than they are right. An estimate from that agreement would reject the closures that show the error. A
 quarter of the odometry's claim is one standard deviation of the prior."""
-_ROUNDS = 4
-"""Rounds of estimating the noise; 2 are usual."""
+ROUNDS = 4
+"""Largest number of turns between two estimates that depend on each other, as of poses and noise; 2 are usual."""
 _SHARES = (1.0, 0.25, 0.0625)
 """Shares of the odometry's noise by which families are told apart: the finer, the better the odometry."""
-_LEAST_FAMILY = 3
-"""Number of closures from which a family is proposed."""
+LEAST_GROUP = 3
+"""Number of closures from which a family is proposed, or a group may show a slip."""
 _FAMILIES = 2
 """Number of families that are proposed at each share."""
 _TRIED = 8
-"""Number of flips, the most promising first, that are predicted in one turn."""
-_TURNS = 30
-"""Number of turns after which an improvement ends."""
-_JOINT = 30
-"""Largest group of closures whose flip is predicted; its cost is cubic."""
-_MARGIN = 5.0
-"""Predicted loss up to which a flip is solved all the same: predictions are to first order."""
-_STEPS, _TOLERANCE = 100, 1e-4
+"""Number of flips, the most promising first, that are solved in one turn."""
+TURNS = 30
+"""Number of changes after which an improvement ends."""
 
 
 def attempted(solve: Callable[[], Hypothesis]) -> list[Hypothesis]:
@@ -142,16 +137,16 @@ class Search:
                 weight = np.where(loops, 0.0, 1.0)
                 weight[episodes.edges[episodes.families == largest]] = 1.0
                 may_be = (weight > best.weight).any() or 4 * size[largest] >= best.weight[loops].sum()
-                if size[largest] >= _LEAST_FAMILY and may_be and weight.tobytes() not in proposed:
+                if size[largest] >= LEAST_GROUP and may_be and weight.tobytes() not in proposed:
                     proposed.add(weight.tobytes())
                     yield weight
 
     def refit(self, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
         """Solve the edges of weight (E,) 1 and estimate the noise, in turns."""
-        for _ in range(_ROUNDS):
+        for _ in range(ROUNDS):
             slipping = self.slipping.applied(self.claimed.graph, sigmas)
             factors = replace(self.claimed, graph=claimed_times(slipping, sigmas))
-            poses = descend(factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
+            poses = descend(factors, weight, poses, STEPS, TOLERANCE).world_from_body
             before, sigmas = sigmas, estimate(Objective(factors, weight), poses, sigmas)
             sigmas = Sigmas(*np.maximum(sigmas, _LEAST_NOISE).tolist())
             if not sigmas.differ(before, STEADY):
@@ -161,7 +156,7 @@ class Search:
     def improved(self, best: Hypothesis) -> Hypothesis:
         """Flip closures, runs and families as long as the posterior rises; estimate the noise after each flip."""
         posterior = self.at(best.sigmas)
-        for _ in range(_TURNS):
+        for _ in range(TURNS):
             flipped = self._flipped(posterior, best)
             if not flipped:
                 break
@@ -193,11 +188,8 @@ class Search:
             promising.append((gain if is_false[group[0]] else -gain, group))
         promising.sort(key=lambda one: -one[0])
         together = [group for gain, group in promising if gain > 0]
-        linear = Linearised(posterior, best)
         tried += [(np.unique(np.concatenate(together)), best.poses)] if len(together) > 1 else []
-        for gain, group in promising[:_TRIED]:
-            if (linear.gain(group) > -_MARGIN) if len(group) <= _JOINT else gain > 0:
-                tried.append((group, best.poses))
+        tried += [(group, best.poses) for gain, group in promising[:_TRIED] if gain > 0]
         for group, poses in tried:
             weight = np.array(best.weight)
             weight[episodes.edges[group]] = 1.0 - weight[episodes.edges[group]]

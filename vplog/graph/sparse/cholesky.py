@@ -104,13 +104,3 @@ def inverse_blocks(factor: Cholesky, a: Int32s | Ints, b: Int32s | Ints) -> tupl
 
     ab = blocks(low, high)
     return blocks(one, one), np.where((one > two)[:, None, None], np.swapaxes(ab, 1, 2), ab), blocks(two, two)
-
-
-def joint_inverse(factor: Cholesky, nodes: Ints) -> Floats:
-    """Return the inverse (K d, K d) at a few different nodes (K,)."""
-    size = factor.size
-    unit = np.zeros((len(factor.shape.place), size, len(nodes) * size))
-    unit[nodes] = np.eye(len(nodes) * size).reshape(len(nodes), size, -1)
-    solved = factor.forward(unit)
-    solved = solved[:, solved.any(0)]
-    return np.einsum("ik,jk->ij", solved, solved)
