@@ -1,7 +1,8 @@
 """`python -m tests.benchmarks [WHAT...] [--json]`, from the top; `--help` lists what there is.
 
 Prints every ratio with its bar, and what it was measured on. The exit status is 0 only when every bar is reached.
-Pose graph back ends on random worlds have arguments of their own: `python -m tests.benchmarks backend --help`.
+Pose graph back ends on random worlds have arguments of their own: `python -m tests.benchmarks backend --help`, and
+`second --help` for the worlds of a second, independent generator.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tests.benchmarks import backend
+from tests.benchmarks import backend, second_worlds
 from tests.benchmarks.ask import ask
 from tests.benchmarks.batch import PARTS, batch
 from tests.benchmarks.city import city
@@ -69,6 +70,8 @@ LARGEST_NEEDS_GB = 12.0
 def main() -> int:
     if sys.argv[1:2] == ["backend"]:
         return backend.main(sys.argv[2:])
+    if sys.argv[1:2] == ["second"]:
+        return second_worlds.main(sys.argv[2:])
     arguments = _arguments()
     figures = []
     for figure in _measure(arguments):
@@ -87,7 +90,7 @@ def main() -> int:
 def _arguments() -> argparse.Namespace:
     kinds = (*SHORT, *LONG)
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
-    named = f"of {', '.join(kinds)}; the default is {', '.join(SHORT)}. Or backend (its own --help)"
+    named = f"of {', '.join(kinds)}; the default is {', '.join(SHORT)}. Or backend, second (own --help)"
     parser.add_argument("what", nargs="*", metavar="WHAT", help=named)
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     parser.add_argument("--rounds", type=int, default=5, help="turns of each pair; medians are told")
