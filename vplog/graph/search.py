@@ -107,7 +107,7 @@ class Search:
         return self.propose(self.at(sigmas).factors, is_loop(self.claimed.graph))
 
     def hypotheses(self) -> list[Hypothesis]:
-        """Return the likeliest hypotheses, each with its likeliest noise; the first is that no closure is true."""
+        """Return likely hypotheses; the first is that no closure is true, with the noise that suits it best."""
         posterior = self.at(Sigmas())
         loops, chain = is_loop(self.claimed.graph), OdometryChain.of(posterior.factors.graph)
         none = posterior.hypothesis(np.where(loops, 0.0, 1.0), chain.poses)
@@ -122,7 +122,10 @@ class Search:
             starts += attempted(lambda weight=weight: self.refit(weight, chain.poses, Sigmas()))
         found += [self.improved(one) for one in starts]
         # nothing but the other hypotheses tells the noise if no closure is true
-        none_at = [self.at(sigmas).hypothesis(none.weight, chain.poses) for sigmas in {one.sigmas for one in found}]
+        none_at = [
+            self.at(sigmas).hypothesis(none.weight, chain.poses)
+            for sigmas in dict.fromkeys(one.sigmas for one in found)
+        ]
         return [max(none_at, key=log_density), *found[1:]]
 
     def _families(self, best: Hypothesis, loops: Bools) -> Iterator[Floats]:
