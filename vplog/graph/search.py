@@ -117,15 +117,14 @@ class Search:
             annealed += attempted(lambda: self.refit(np.ones(len(loops)), chain.poses, Sigmas()))
         found += [self.improved(one) for one in annealed]
         best = max(found, key=log_density)
-        starts = [] if best.weight.all() else [none]
+        starts = [none]
         for weight in self._families(best, loops):
             starts += attempted(lambda weight=weight: self.refit(weight, chain.poses, Sigmas()))
+        if best.weight.all():  # it agrees as a whole, so no set that is less likely leads to a better one
+            starts = [one for one in starts if one.log_density > best.log_density]
         found += [self.improved(one) for one in starts]
-        # nothing but the other hypotheses tells the noise if no closure is true
-        none_at = [
-            self.at(sigmas).hypothesis(none.weight, chain.poses)
-            for sigmas in dict.fromkeys(one.sigmas for one in found)
-        ]
+        noise = dict.fromkeys(one.sigmas for one in found)  # nothing else tells it if no closure is true
+        none_at = [self.at(sigmas).hypothesis(none.weight, chain.poses) for sigmas in noise]
         return [max(none_at, key=log_density), *found[1:]]
 
     def _families(self, best: Hypothesis, loops: Bools) -> Iterator[Floats]:
