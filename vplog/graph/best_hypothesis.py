@@ -92,17 +92,18 @@ class _WithSlips:
 
     def _starts(self, best: Hypothesis) -> list[Hypothesis]:
         """Sets of closures, with the slips that they imply, from which the search starts: those that are true without
-        slips, and those that graduated non-convexity keeps if it may reject odometry as well. None if the first imply
-        no slip and are all closures."""
+        slips, and those that graduated non-convexity keeps if it may reject odometry as well. Empty if the first imply
+        no slip and no group is rejected."""
         graph = self.sound.claimed.graph
         loops, chain = is_loop(graph), OdometryChain.of(graph)
         noise = Sigmas(max(best.sigmas.rotation, 1.0), max(best.sigmas.translation, 1.0))
-        slipping = self.slips.likeliest(self.sound.claimed, best.weight, best.poses, noise, best.slipping)
+        noisier = replace(best, sigmas=noise)
+        slipping = self._implied(noisier)
         if slipping is not None and not slipping.state.any() and not self._rejected(best):
             return []
-        implied = self._with_implied(replace(best, sigmas=noise))
         kept, _ = self.sound.propose(self.sound.claimed, np.ones(len(loops), bool))
         annealed = replace(best, weight=np.where(loops, kept, 1.0), poses=chain.poses)
+        implied = self._settled(slipping, noisier)
         return implied + self._with_implied(replace(annealed, sigmas=noise if best.sigmas.at_bound else Sigmas()))
 
     def _rejected(self, one: Hypothesis) -> list[Ints]:
@@ -123,18 +124,26 @@ class _WithSlips:
         return attempted(lambda: posterior.hypothesis(one.weight, poses))
 
     def _with_implied(self, one: Hypothesis, least: float = -np.inf) -> list[Hypothesis]:
-        """The closures of a hypothesis with the slips and the noise that they imply, in turns; none if the prior of the
-        slips falls below `least` at first, as in Slips.likeliest."""
+        """The closures of a hypothesis with the slips and the noise that they imply; none if the log prior of the slips
+        falls below `least`, as in `Slips.likeliest`."""
+        return self._settled(self._implied(one, least), one, least)
+
+    def _implied(self, one: Hypothesis, least: float = -np.inf) -> Slipping | None:
+        return self.slips.likeliest(self.sound.claimed, one.weight, one.poses, one.sigmas, one.slipping, least)
+
+    def _settled(self, slipping: Slipping | None, one: Hypothesis, least: float = -np.inf) -> list[Hypothesis]:
+        """The closures of a hypothesis with these states of the steps, from which noise and states are estimated in
+        turns; none if these are None or do not determine the poses."""
         found: list[Hypothesis] = []
         for _ in range(ROUNDS):
-            slipping = self.slips.likeliest(self.sound.claimed, one.weight, one.poses, one.sigmas, one.slipping, least)
             new = [] if slipping is None else self._refit(slipping, one)
             if not new or (found and new[0].log_density <= found[0].log_density):
                 break
-            found = new
-            if not new[0].sigmas.differ(one.sigmas, STEADY):
-                break
+            found, before = new, one.sigmas
             one = new[0]
+            if not one.sigmas.differ(before, STEADY):
+                break
+            slipping = self._implied(one, least)
         return found
 
     def _refit(self, slipping: Slipping, one: Hypothesis) -> list[Hypothesis]:
@@ -174,10 +183,10 @@ class _WithSlips:
             for run in true_runs(episodes, best.weight[episodes.edges] == 0):
                 weight = np.array(best.weight)
                 weight[episodes.edges[run]] = 0.0
-                slipping = self.slips.likeliest(self.sound.claimed, weight, best.poses, best.sigmas, best.slipping)
+                less = replace(best, weight=weight)
+                slipping = self._implied(less)
                 if slipping is not None and (slipping.state != best.slipping.state).any():
-                    less = replace(best, weight=weight, slipping=slipping)
-                    best = max([best, *self._with_implied(less)], key=log_density)
+                    best = max([best, *self._settled(slipping, less)], key=log_density)
             if best is before:
                 break
             best = max([best, *self._improved(best)], key=log_density)

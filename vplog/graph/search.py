@@ -41,15 +41,15 @@ _LEAST_NOISE = Sigmas(0.25, 0.25, 1.0, 1.0)
 themselves better than they are right. An estimate from that agreement would reject the closures that show the error. A
 quarter of the odometry's claim is one standard deviation of the prior."""
 ROUNDS = 4
-"""Largest number of turns between two estimates that depend on each other, as of poses and noise; 2 are usual."""
+"""Largest number of rounds of two estimates that depend on each other, such as poses and noise. Two are usual."""
 _SHARES = (1.0, 0.25, 0.0625)
 """Shares of the odometry's noise by which families are told apart: the finer, the better the odometry."""
 LEAST_GROUP = 3
-"""Number of closures from which a family is proposed, or a group may show a slip."""
+"""Smallest number of closures in a family that is proposed, and in a group that may show a slip."""
 _FAMILIES = 2
 """Number of families that are proposed at each share."""
 _TRIED = 8
-"""Number of flips, the most promising first, that are solved in one turn."""
+"""Largest number of flips that are solved in one turn; the most promising ones come first."""
 TURNS = 30
 """Number of changes after which an improvement ends."""
 
@@ -107,7 +107,7 @@ class Search:
         return self.propose(self.at(sigmas).factors, is_loop(self.claimed.graph))
 
     def hypotheses(self) -> list[Hypothesis]:
-        """Return likely hypotheses; the first is that no closure is true, with the noise that suits it best."""
+        """Return likely hypotheses. In the first, no closure is true, with the likeliest noise of those found."""
         posterior = self.at(Sigmas())
         loops, chain = is_loop(self.claimed.graph), OdometryChain.of(posterior.factors.graph)
         none = posterior.hypothesis(np.where(loops, 0.0, 1.0), chain.poses)

@@ -1,1 +1,1 @@
-"""Several drives, or pieces of one, in one pose graph."""
+"""Pose graphs of several drives, and of the pieces of one drive."""

@@ -1,1 +1,1 @@
-"""The solution after the decision: noise, scale and GPS fixes estimated together with the poses."""
+"""Refinement after the decision: noise, scale and GPS fixes are estimated together with the poses."""
