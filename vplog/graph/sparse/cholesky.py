@@ -64,17 +64,12 @@ class Cholesky:
 
     def solve(self, right: Floats) -> Floats:
         """x (n, d, c) of R^T R x = right (n, d, c)."""
-        x = self.forward(right)
-        kernels.substitute(self.shape.panels, self.size, self.values, x, False)
-        return x.reshape(right.shape[2], *right.shape[:2]).transpose(1, 2, 0)[self.shape.place]
-
-    def forward(self, right: Floats) -> Floats:
-        """Return R^-T right, (c, n d) in elimination order, from `right` (n, d, c) in the order of the nodes."""
         moved = np.empty((right.shape[2], *right.shape[:2]))
         moved[:, self.shape.place] = right.transpose(2, 0, 1)
         x = moved.reshape(right.shape[2], -1)
-        kernels.substitute(self.shape.panels, self.size, self.values, x, True)
-        return x
+        for forward in (True, False):
+            kernels.substitute(self.shape.panels, self.size, self.values, x, forward)
+        return x.reshape(right.shape[2], *right.shape[:2]).transpose(1, 2, 0)[self.shape.place]
 
     def log_determinant(self) -> float:
         """Log of the determinant of the matrix."""
