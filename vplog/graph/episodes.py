@@ -20,7 +20,6 @@ import numpy as np
 from vplog.data import Bools, Floats, Ints, PoseGraph
 from vplog.graph.consistency import OdometryChain
 from vplog.graph.displacements import Displacements
-from vplog.graph.normal_equations import logarithm
 
 EPISODE = 3.0
 """Mean length of an episode in keyframes. Prior: a few neighbouring keyframes share most of their features, and a cause
@@ -75,13 +74,24 @@ class Episodes:
 
         Closures of one family claim one displacement; -1 stands for a true closure.
         """
-        family, claims = np.full(len(self.edges), -1), self.claims
-        log_density = _log_density(
-            np.asarray(is_false, bool), self.nearest, self.continues, self.false_share, self.log_volume, family,
-            claims.a, claims.b, claims.chain.part, np.array(claims.axes), claims.displaced, claims.own, claims.after,
-            claims.chain.total,
+        claims, K, d = self.claims, len(self.edges), len(self.claims.axes)
+        family, (first, last, size) = np.full(K, -1), np.zeros((3, K), np.int64)
+        continued, repeated = np.zeros((2, K))
+        stays = np.where(self.nearest >= 0, self.continues, 0.0)[:, None]
+        begins = (1.0 - stays) * self.false_share
+        alone = (1.0 - REPEATED) * math.exp(-self.log_volume)
+        _track(
+            np.flatnonzero(is_false), self.nearest, self.continues, begins[:, begins.shape[1] // 2], alone,
+            self.log_volume + _FAR, claims.a, claims.b, claims.chain.part, np.array(claims.axes), claims.displaced,
+            claims.own, claims.after, claims.chain.total, np.zeros((K, d)), claims.own.copy(),
+            np.empty((4, d, d + 2)), first, last, size, family, continued, repeated,
         )  # fmt: skip
-        return log_density, family
+        goes_on = np.where((family[self.nearest] == -1)[:, None], stays, 0.0)
+        if_true = goes_on + (1.0 - stays) * (1.0 - self.false_share)
+        if_false = continued[:, None] + begins * (alone + REPEATED * repeated[:, None])
+        of_share = np.log(np.where(is_false[:, None], if_false, if_true) + 1e-300).sum(0)
+        most = of_share.max()
+        return float(most + np.log(np.exp(of_share - most).mean())), family
 
     @cached_property
     def families(self) -> Ints:
@@ -89,107 +99,145 @@ class Episodes:
         return self.log_density(np.ones(len(self.edges), bool))[1]
 
 
-@numba.njit(cache=True, nogil=True)
 def _nearest_before(a: Ints, b: Ints, part: Ints) -> tuple[Ints, Floats]:
     """Nearest earlier closure (K,) between the same two pieces of odometry, and its distance in keyframes (K,): the
     larger one of the distances at both ends."""
-    nearest, gap = np.full(len(a), -1), np.full(len(a), np.inf)
-    for k in range(len(a)):
-        for j in range(k - 1, -1, -1):
-            if b[k] - b[j] >= gap[k]:
-                break
-            if part[a[j]] == part[a[k]] and part[b[j]] == part[b[k]]:
-                apart = max(abs(a[k] - a[j]), b[k] - b[j])
-                if apart < gap[k]:
-                    nearest[k], gap[k] = j, apart
+    nearest, gap, k = np.full(len(a), -1), np.full(len(a), np.inf), np.arange(len(a))
+    for lag in range(1, len(a)):
+        k = k[k >= lag]
+        k = k[b[k] - b[k - lag] < gap[k]]  # b increases, so no earlier closure is nearer
+        if len(k) == 0:
+            break
+        apart = np.maximum(np.abs(a[k] - a[k - lag]), b[k] - b[k - lag])
+        nearer = (apart < gap[k]) & (part[a[k]] == part[a[k - lag]]) & (part[b[k]] == part[b[k - lag]])
+        nearest[k[nearer]], gap[k[nearer]] = k[nearer] - lag, apart[nearer]
     return nearest, gap
 
 
-@numba.njit(cache=True, nogil=True)
-def _log_density(
-    is_false: Bools, nearest: Ints, continues: Floats, false_share: Floats, log_volume: float, family: Ints,
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _track(
+    false: Ints, nearest: Ints, continues: Floats, begins: Floats, alone: float, most: float,
     a: Ints, b: Ints, part: Ints, axes: Ints, displaced: Floats, own: Floats, after: Floats, total: Floats,
-) -> float:  # fmt: skip
-    """See `Episodes.log_density`; `family` (K,) is filled in place.
+    mean: Floats, covariance: Floats, room: Floats,
+    first: Ints, last: Ints, size: Ints, family: Ints, continued: Floats, repeated: Floats,
+) -> None:  # fmt: skip
+    """Write the family (K,) of the closures `false`, and the densities (K,) if each continues or repeats a family.
 
     The displacement of each family is tracked by a Kalman filter, about that of its first member: the odometry between
-    two members is its process noise. A closure joins the family that it most likely belongs to.
+    two members is its process noise. A closure joins the family that it most likely belongs to. The `first` and `last`
+    member and the `size` of each family are overwritten, as are `mean` (K, d) and `covariance` (K, d, d) at its first
+    member, and `room` (4, d, d + 2). Loops and not array expressions, for which Numba compiles for seconds.
     """
-    K, d, S = len(is_false), len(axes), false_share.shape[1]
-    count, middle = 0, S // 2
-    reference, last, size = np.empty(K, np.int64), np.empty(K, np.int64), np.empty(K, np.int64)
-    mean, covariance = np.empty((K, d)), np.empty((K, d, d))
-    error, spread = np.empty(d), np.empty((d, d))
-    best_error, best_spread = np.empty(d), np.empty((d, d))
-    moved, root = np.empty((d, d)), np.empty((d, d + 1))
-    result, density = np.zeros(S), np.empty(S)
-    for k in range(K):
-        stay = continues[k] if nearest[k] >= 0 else 0.0
-        before = family[nearest[k]] if nearest[k] >= 0 else -2
-        if not is_false[k]:
-            goes_on = stay if before == -1 else 0.0
-            result += np.log(goes_on + (1.0 - stay) * (1.0 - false_share[k]) + 1e-300)
-            continue
-        begins = (1.0 - stay) * false_share[k]
-        density[:] = begins * (1.0 - REPEATED) * math.exp(-log_volume)
-        chosen, most = count, density[middle]
-        first = max(0, count - _FAMILIES)
-        members = size[first:count].sum()
-        for at in range(first - 1, count):  # first the family that may continue, then those that may be repeated
-            f = before if at < first else at
-            if f < 0 or part[a[last[f]]] != part[a[k]] or part[b[last[f]]] != part[b[k]]:
+    d, count, spread = len(axes), 0, room[2]
+    for k in false:
+        stay, before = 0.0, -1
+        if nearest[k] >= 0:
+            stay, before = continues[k], family[nearest[k]]
+        chosen, best, slot = count, begins[k] * alone, 0
+        begin = max(0, count - _FAMILIES)
+        members = 0
+        for f in range(begin, count):
+            members += size[f]
+        for at in range(begin - 1, count):  # an older family may only continue
+            f = before if at < begin else at
+            if f < 0 or (at < begin <= f) or part[a[last[f]]] != part[a[k]] or part[b[last[f]]] != part[b[k]]:
                 continue
-            _error(displaced[reference[f]], displaced[k], axes, mean[f], error)
-            _odometry_noise(after[reference[f]], total, a[last[f]], a[k], b[last[f]], b[k], moved, spread)
+            root = room[slot]
+            _twist(displaced[first[f]], displaced[k], axes, room[3], root)
+            _odometry_noise(after[first[f]], total, a[last[f]], a[k], b[last[f]], b[k], room[3], spread)
             for i in range(d):
+                root[i, d + 1] -= mean[first[f], i]
                 for j in range(d):
-                    spread[i, j] += covariance[f, i, j] + own[k, i, j]
-            value = math.exp(_log_normal(error, spread, root, log_volume + _FAR))
-            if at < first:
-                density += value * stay
-                value *= stay
-            else:
-                density += value * begins * REPEATED * size[f] / members
-                value *= begins[middle] * REPEATED * size[f] / members
-            if value > most:
-                chosen, most = f, value
-                best_error[:], best_spread[:] = error, spread
-        result += np.log(density + 1e-300)
+                    spread[i, j] += covariance[first[f], i, j] + own[k, i, j]
+            density = math.exp(_log_normal(spread, root, most))
+            joint = 0.0
+            if f == before:
+                continued[k] = joint = density * stay
+            if at >= begin:
+                density *= size[f] / members
+                repeated[k] += density
+                joint = max(joint, density * begins[k] * REPEATED)
+            if joint > best:
+                chosen, best, slot = f, joint, 1 - slot
         if chosen == count:
-            reference[count], size[count] = k, 0
-            mean[count], covariance[count] = 0.0, own[k]
+            first[count] = k
             count += 1
         else:
-            gain = np.linalg.solve(best_spread, best_spread - own[k]).T
-            mean[chosen] += gain @ best_error
-            covariance[chosen] = gain @ own[k]
+            _update(room[1 - slot], own[k], room[3], mean[first[chosen]], covariance[first[chosen]])
         last[chosen] = k
         size[chosen] += 1
         family[k] = chosen
-    best = result.max()
-    return best + math.log(np.exp(result - best).mean())
 
 
-@numba.njit(cache=True, nogil=True)
-def _error(one: Floats, two: Floats, axes: Ints, mean: Floats, error: Floats) -> None:
-    """Twist from one pose to another, less the mean (d,), in place."""
-    R, t, twist = np.empty((3, 3)), np.empty(3), np.empty(6)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _update(root: Floats, own: Floats, white: Floats, mean: Floats, covariance: Floats) -> None:
+    """Kalman update of the mean (d,) and covariance (d, d) of a family by a closure's `own` noise (d, d).
+
+    Take the `root` of `_log_normal`. `white` (d, d) is overwritten.
+    """
+    d = len(mean)
+    for i in range(d):
+        mean[i] += root[i, d + 1]
+        for j in range(d):
+            white[i, j] = own[i, j]
+            for k in range(i):
+                white[i, j] -= root[i, k] * white[k, j]
+            white[i, j] /= root[i, i]
+    for i in range(d):
+        for j in range(d):
+            covariance[i, j] = own[i, j]
+            for k in range(d):
+                covariance[i, j] -= white[k, i] * white[k, j]
+            mean[i] -= white[j, i] * root[j, d]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _twist(one: Floats, two: Floats, axes: Ints, turn: Floats, result: Floats) -> None:
+    """Write the axes (d,) of the twist from one pose (4, 4) to another to the last column of `result` (d, d + 2).
+
+    As `se3.log`, through the quaternion, stable up to half a turn. `turn` (3, 4) is overwritten.
+    """
     for i in range(3):
-        t[i] = 0.0
+        turn[i, 3] = 0.0
         for j in range(3):
-            t[i] += one[j, i] * (two[j, 3] - one[j, 3])
-            R[i, j] = one[0, i] * two[0, j] + one[1, i] * two[1, j] + one[2, i] * two[2, j]
-    logarithm(R, t, twist)
-    for row in range(len(error)):
-        error[row] = twist[axes[row]] - mean[row]
+            turn[i, 3] += one[j, i] * (two[j, 3] - one[j, 3])
+            turn[i, j] = one[0, i] * two[0, j] + one[1, i] * two[1, j] + one[2, i] * two[2, j]
+    m, x, y, z = turn, turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
+    w = 1.0 + m[0, 0] + m[1, 1] + m[2, 2]
+    if w < 1.0:
+        if m[0, 0] >= m[1, 1] and m[0, 0] >= m[2, 2]:
+            w, x, y, z = x, 1.0 + m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]
+        elif m[1, 1] >= m[2, 2]:
+            w, x, y, z = y, m[0, 1] + m[1, 0], 1.0 - m[0, 0] + m[1, 1] - m[2, 2], m[1, 2] + m[2, 1]
+        else:
+            w, x, y, z = z, m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1.0 - m[0, 0] - m[1, 1] + m[2, 2]
+        if w < 0.0:
+            w, x, y, z = -w, -x, -y, -z
+    norm = math.sqrt(x * x + y * y + z * z)
+    scale = 2.0 / w if norm < 1e-9 * w else 2.0 * math.atan2(norm, w) / norm
+    x, y, z = scale * x, scale * y, scale * z
+    # the inverse of the left Jacobian: v = t - omega x t / 2 + k omega x (omega x t)
+    square = x * x + y * y + z * z
+    half = math.sqrt(square) / 2.0
+    k = 1.0 / 12.0 + square / 720.0
+    if half > 1e-2:
+        k = (1.0 - half * math.cos(half) / math.sin(half)) / square
+    tx, ty, tz = turn[0, 3], turn[1, 3], turn[2, 3]
+    cx, cy, cz = y * tz - z * ty, z * tx - x * tz, x * ty - y * tx
+    turn[0, 0], turn[0, 1], turn[0, 2] = x, y, z
+    turn[1, 0] = tx - cx / 2.0 + k * (y * cz - z * cy)
+    turn[1, 1] = ty - cy / 2.0 + k * (z * cx - x * cz)
+    turn[1, 2] = tz - cz / 2.0 + k * (x * cy - y * cx)
+    for row in range(len(axes)):
+        result[row, len(axes) + 1] = turn[axes[row] // 3, axes[row] % 3]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _odometry_noise(
     after: Floats, total: Floats, a0: int, a1: int, b0: int, b1: int, moved: Floats, result: Floats
 ) -> None:
     """Covariance (d, d) that the odometry adds between two closures, in place; see `Displacements.apart`."""
-    d, sign_a, sign_b = len(result), 1.0 if a1 >= a0 else -1.0, 1.0 if b1 >= b0 else -1.0
+    d, sign_a, sign_b = len(after), 1.0 if a1 >= a0 else -1.0, 1.0 if b1 >= b0 else -1.0
     for i in range(d):
         for j in range(d):
             moved[i, j] = 0.0
@@ -202,15 +250,18 @@ def _odometry_noise(
                 result[i, j] += moved[i, k] * after[j, k]
 
 
-@numba.njit(cache=True, nogil=True)
-def _log_normal(error: Floats, covariance: Floats, root: Floats, most: float) -> float:
-    """Log density of a normal error (d,). It is -700 if half the chi-square is surely more than `most`, or if the
-    covariance is not positive definite.
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _log_normal(covariance: Floats, root: Floats, most: float) -> float:
+    """Log density of the normal error in the last column of `root` (d, d + 2).
 
-    `root` (d, d + 1) is room for the Cholesky factor and, in its last column, the whitened error.
+    It is -700 if half the chi-square is surely more than `most`, or if the covariance is not positive definite. The
+    covariance's Cholesky factor is written to `root`, and the whitened error to its last column but one.
     """
-    d, value = len(error), 0.0
-    if 0.5 * (error**2).sum() > most * np.trace(covariance):
+    d, value, square, trace = len(root), 0.0, 0.0, 0.0
+    for i in range(d):
+        square += root[i, d + 1] ** 2
+        trace += covariance[i, i]
+    if 0.5 * square > most * trace:
         return -700.0
     for i in range(d):
         for j in range(i + 1):
@@ -223,7 +274,7 @@ def _log_normal(error: Floats, covariance: Floats, root: Floats, most: float) ->
                 root[i, i] = math.sqrt(rest)
             else:
                 return -700.0
-        white = error[i]
+        white = root[i, d + 1]
         for k in range(i):
             white -= root[i, k] * root[k, d]
         root[i, d] = white / root[i, i]
