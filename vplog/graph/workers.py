@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from typing import Any
-
-import numpy as np
 
 from vplog.execution.cores import allowed
 
@@ -30,9 +27,3 @@ class Workers:
             return [work(*task) for task in tasks]
         self._pool = self._pool or ThreadPoolExecutor(self.count)
         return [future.result() for future in [self._pool.submit(work, *task) for task in tasks]]
-
-    def ranges(self, low: int, high: int, at_least: int, by_thread: int = 1) -> list[tuple[int, int]]:
-        """low:high in about equal ranges, some for each thread, none shorter than `at_least` unless it is all."""
-        count = max(min((high - low) // at_least, self.count * by_thread), 1)
-        ends = np.linspace(low, high, count + 1).astype(int).tolist()
-        return list(pairwise(ends))

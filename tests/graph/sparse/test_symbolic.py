@@ -83,7 +83,7 @@ def test_solutions_and_inverses_are_those_of_the_dense_matrix(nodes: int, chords
 
 
 def test_any_number_of_threads_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(normal, "_LEAST_SHARE", 16)
+    monkeypatch.setattr(normal, "_EDGES_AT_ONCE", 16)
     # closures all over it, so that its fronts are large
     random, graph, more = np.random.default_rng(0), GRAPHS["drives"], 400
     a, b = random.integers(0, 599, more), random.integers(1, 300, more)
