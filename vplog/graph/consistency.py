@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
-import numba
 import numpy as np
 from scipy.special import chdtri
 
@@ -116,22 +116,24 @@ def odometry_chain(graph: PoseGraph) -> tuple[Floats, Ints]:
     step = graph.a_from_b[leads]
     back = (leads >= 0) & (graph.a[leads] > graph.b[leads])
     step[back] = se3.inverse(step[back])
-    poses = np.array(graph.world_from_body)
-    _chain(poses, step, leads)
-    return poses, leads
+    return _chained(np.where((leads >= 0)[:, None, None], step, graph.world_from_body), leads < 0), leads
 
 
-@numba.njit(cache=True, nogil=True)
-def _chain(poses: Floats, step: Floats, leads: Ints) -> None:
-    """Each pose from the one before it and its step, all (N, 4, 4), in place, where an edge leads to it."""
-    for node in range(1, len(poses)):
-        if leads[node] >= 0:
-            for i in range(3):
-                for j in range(4):
-                    total = poses[node - 1, i, 3] if j == 3 else 0.0
-                    for k in range(3):
-                        total += poses[node - 1, i, k] * step[node, k, j]
-                    poses[node, i, j] = total
+def _chained(step: Floats, begins: Bools) -> Floats:
+    """Return the running products (N, 4, 4) of the steps, which start again where a chain `begins` (N,).
+
+    Rows of about sqrt(N) poses are multiplied side by side, then each row by the last pose of the row before it.
+    """
+    length = math.isqrt(len(step)) + 1
+    missing = length * length - len(step)
+    rows = np.concatenate([step, np.tile(np.eye(4), (missing, 1, 1))]).reshape(length, length, 4, 4)
+    follows = ~np.append(begins, np.zeros(missing, bool)).reshape(length, length)
+    for k in range(1, length):
+        rows[:, k] = np.where(follows[:, k, None, None], rows[:, k - 1] @ rows[:, k], rows[:, k])
+    joined = np.logical_and.accumulate(follows, axis=1)
+    for k in range(1, length):
+        rows[k, joined[k]] = rows[k - 1, -1] @ rows[k, joined[k]]
+    return rows.reshape(-1, 4, 4)[: len(step)]
 
 
 def runs(graph: PoseGraph, loops: Ints) -> Iterator[Ints]:
