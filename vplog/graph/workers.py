@@ -1,4 +1,4 @@
-"""Threads for compiled code that releases the GIL. The results never depend on how many there are."""
+"""Threads for NumPy code that releases the GIL. The results never depend on how many there are."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Factors R^T R of large sparse symmetric matrices in blocks, and what solves with them.
 
 The reason for linear algebra of our own is the selected inverse (`inverse_blocks`): for 850 poses and 125 closures
-it takes 9.8 ms, where GTSAM's marginals take 460 ms. To linearise and solve takes 0.2 to 0.4 times the CPU time
-of native GTSAM on planar graphs of 1,000 to 10,000 poses, and 1.1 to 1.3 times on sphere2500 and torus3D. Without
+it takes 9.8 ms, where GTSAM's marginals take 460 ms. To linearise and solve takes 0.4 to 0.5 times the CPU time
+of native GTSAM on planar graphs of 1,000 to 10,000 poses, and 1.1 to 1.4 times on sphere2500 and torus3D. Without
 supernodes, factorising sphere2500, torus3D and city10000 takes 2.0 to 2.4 times as long.
 `python -m tests.benchmarks sparse` measures the times.
 """
