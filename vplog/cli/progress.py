@@ -19,6 +19,8 @@ from vplog.errors import ResultError, VplogError, was_interrupted
 from vplog.storage.urls import without_secrets
 
 if TYPE_CHECKING:
+    from rich.progress import Progress as Bars
+
     from vplog.batch.worker import DriveState
 
 LINE_EVERY_S = 60.0
@@ -105,6 +107,18 @@ class _Stage:
         return (self.total - self.done) / self.rate() if self.done > self.known and self.total > 1 else None
 
 
+def _bars() -> Bars:
+    """Return bars on stderr, a terminal. Rich loads here, which takes 0.1 s."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import TimeRemainingColumn as Eta
+
+    return Progress(
+        TextColumn("{task.description:<18}", markup=False),
+        BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), Eta(), console=Console(file=sys.stderr),
+    )  # fmt: skip
+
+
 class Progress:
     """Progress on a terminal or as JSON lines: called with (stage, items done, items in all), from any thread, within
     `with`."""
@@ -114,10 +128,6 @@ class Progress:
     ) -> None:
         """`stages` are those that are known beforehand, in order; `earlier` is a folder beside which earlier runs are
         looked for, by whose stages the time to the end is estimated."""
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-        from rich.progress import TimeRemainingColumn as Eta
-
         self._events: Events = arguments.events if isinstance(arguments.events, Events) else Events(None)
         self._known, self._earlier = stages, _earlier_seconds(earlier) if earlier is not None else {}
         if stages and self._earlier:  # the first of them lasts while steps that not every run has are computed
@@ -127,32 +137,34 @@ class Progress:
         self._tasks: dict[str, Any] = {}
         self._lock, self._end = threading.Lock(), threading.Event()
         self._line_by_line = not (arguments.json or sys.stderr.isatty())
-        self._bars = Progress(
-            TextColumn("{task.description:<18}", markup=False),
-            BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), Eta(),
-            console=Console(file=sys.stderr), disable=arguments.json or not sys.stderr.isatty(),
-        )  # fmt: skip
+        self._bars = _bars() if sys.stderr.isatty() and not arguments.json else None
 
     def __enter__(self) -> Progress:
-        self._bars.start()
+        if self._bars is not None:
+            self._bars.start()
         threading.Thread(target=self._heartbeat, daemon=True).start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._end.set()
-        self._bars.stop()
+        if self._bars is not None:
+            self._bars.stop()
         if error is None:
             with self._lock:
                 self._finish_steps()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         with self._lock:
-            if stage not in self._tasks:
-                number, of = self._number(stage)
-                label = f"{number}/{of} {stage}" if number is not None else stage
-                self._tasks[stage] = self._bars.add_task(label, total=total)
-            self._bars.update(self._tasks[stage], completed=done, total=total)
+            if self._bars is not None:
+                self._draw(self._bars, stage, done, total)
             self._follow(stage, done, total)
+
+    def _draw(self, bars: Bars, stage: str, done: int, total: int) -> None:
+        if stage not in self._tasks:
+            number, of = self._number(stage)
+            label = f"{number}/{of} {stage}" if number is not None else stage
+            self._tasks[stage] = bars.add_task(label, total=total)
+        bars.update(self._tasks[stage], completed=done, total=total)
 
     def _follow(self, name: str, done: int, total: int) -> None:
         stage, step = self._stages.get(name), name in self._known
