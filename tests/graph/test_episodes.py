@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.graph.drive import ring
 from tests.graph.test_search import late_revisit
+from vplog.data import EdgeKind
 from vplog.geometry import se3
 from vplog.graph.consistency import OdometryChain, is_loop
-from vplog.graph.episodes import EPISODE, REPEATED, SHARES, Episodes
+from vplog.graph.episodes import EPISODE, REPEATED, SCATTERED, SHARES, Episodes
 
-VOLUME = 9.0
-"""Log of the volume of false closures."""
+VOLUME, VIEW = 9.0, 5.0
+"""Logs of the volumes of false closures between any poses, and between given ones."""
 
 
 def episodes_of(loops: int, seed: int = 0, log_odds: float | None = None) -> Episodes:
     graph = ring(120, loops, seed=seed).graph
     edges = np.flatnonzero(is_loop(graph))
     odds = None if log_odds is None else np.full(len(graph.a), log_odds)
-    return Episodes.of(graph, edges, OdometryChain.of(graph), VOLUME, odds)
+    return Episodes.of(graph, edges, OdometryChain.of(graph), (VOLUME, VIEW), odds)
 
 
 def test_a_single_closure_is_true_or_anywhere_in_the_volume() -> None:
@@ -44,7 +46,8 @@ def test_two_false_closures_continue_repeat_or_are_independent() -> None:
     log_normal = -0.5 * (se3.mahalanobis2(error, covariance)[0] + np.linalg.slogdet(2.0 * np.pi * covariance[0])[1])
     stays, alone = episodes.continues[1], (1.0 - REPEATED) * math.exp(-VOLUME)
     begins = (1.0 - stays) * SHARES
-    second = stays * math.exp(log_normal) + begins * (REPEATED * math.exp(log_normal) + alone)
+    second = stays * ((1.0 - SCATTERED) * math.exp(log_normal) + SCATTERED * math.exp(-VIEW))
+    second += begins * (REPEATED * math.exp(log_normal) + alone)
     expected = math.log(np.mean(SHARES * alone * second))
     assert episodes.log_density(np.array([True, True]))[0] == pytest.approx(expected, rel=1e-6)
 
@@ -61,7 +64,7 @@ def test_false_closures_that_claim_one_displacement_are_one_family() -> None:
     """True ones all claim that the world has not moved, so they are one family, too."""
     drive = ring(120, loops=30, false=20, seed=1)
     edges = np.flatnonzero(is_loop(drive.graph))
-    episodes = Episodes.of(drive.graph, edges, OdometryChain.of(drive.graph), VOLUME, None)
+    episodes = Episodes.of(drive.graph, edges, OdometryChain.of(drive.graph), (VOLUME, VIEW), None)
     largest = episodes.families == np.bincount(episodes.families).argmax()
     assert largest[~drive.false[episodes.edges]].mean() > 0.9
     assert largest[drive.false[episodes.edges]].mean() < 0.2
@@ -74,7 +77,26 @@ def test_a_false_displacement_becomes_unlikely_with_the_path_that_it_covers() ->
     for spacing in (1, 3, 9):
         graph = late_revisit(spacing, 1e-6, 0, 2)
         edges = np.flatnonzero(is_loop(graph))[:11]
-        episodes = Episodes.of(graph, edges, OdometryChain.of(graph), VOLUME, None)
+        episodes = Episodes.of(graph, edges, OdometryChain.of(graph), (VOLUME, VIEW), None)
         true, false = (episodes.log_density(np.full(11, state))[0] for state in (False, True))
         odds.append(true - false)
     assert odds[0] + 3.0 < odds[1] < odds[2] - 1.0
+
+
+def test_false_closures_are_compared_on_corrected_poses() -> None:
+    """The odometry turns between two false closures; poses without that error show that they claim the same."""
+    graph = ring(60, 0, seed=2).graph
+    shift, ends = se3.exp(np.array([[0.0, 0, 0.3, 8.0, 3.0, 0.0]]))[0], [(5, 40), (25, 55)]
+    true = graph.world_from_body
+    measured = np.array([se3.inverse(true[a]) @ shift @ true[b] for a, b in ends])
+    odometry = graph.a_from_b.copy()
+    odometry[45] = odometry[45] @ se3.exp(np.array([[0.0, 0, 1.0, 0, 0, 0]]))[0]
+    graph = replace(
+        graph, a=np.append(graph.a, [5, 25]).astype(np.int32), b=np.append(graph.b, [40, 55]).astype(np.int32),
+        a_from_b=np.concatenate([odometry, measured]), kind=[*graph.kind, EdgeKind.LOOP, EdgeKind.LOOP],
+        information=1e4 * np.concatenate([graph.information, graph.information[:2]]),
+    )  # fmt: skip
+    episodes = Episodes.of(graph, np.array([59, 60]), OdometryChain.of(graph), (VOLUME, VIEW), None)
+    both = np.array([True, True])
+    assert episodes.log_density(both)[1].tolist() == [0, 1]
+    assert episodes.log_density(both, true)[1].tolist() == [0, 0]

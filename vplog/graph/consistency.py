@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.special import chdtri
@@ -63,31 +63,40 @@ def residual_before(graph: PoseGraph, chain: OdometryChain | None = None) -> Flo
 
 @dataclass(frozen=True, eq=False)
 class OdometryChain:
-    """Poses by the odometry alone, and its covariance between any two of them."""
+    """Poses by the odometry alone, and its covariance between any two of them.
+
+    With `poses` replaced, the covariance is that of the odometry along those.
+    """
 
     poses: Floats
     """(N, 4, 4)."""
     part: Ints
     """(N,) number of the unbroken piece of odometry that a pose is on."""
-    total: Floats
-    """(N, d, d) covariance summed from the first pose on, about the first pose; d = 6, or 3 in the plane."""
+    step: Floats
+    """(N, d, d) covariance of the step to each pose, in the frame of that pose; d = 6, or 3 in the plane."""
     axes: list[int]
 
     @classmethod
     def of(cls, graph: PoseGraph) -> OdometryChain:
         poses, leads = odometry_chain(graph)
         axes = AXES[graph.dimension]
-        step = np.linalg.inv(informed(graph, leads))
+        step = np.asarray(np.linalg.inv(informed(graph, leads)), np.float64)
         # noise is in the frame of an edge's b: moved to the later pose where that is a
         back = np.flatnonzero((leads >= 0) & (graph.a[leads] > graph.b[leads]))
         if len(back):
             turned = se3.adjoint(graph.a_from_b[leads[back]])[:, axes][:, :, axes]
             step[back] = turned @ step[back] @ np.swapaxes(turned, 1, 2)
         step[leads < 0] = 0.0
-        # about the first pose, so that the sums stay small where the odometry's frame is far away, as UTM is
-        moved = se3.adjoint(se3.between(poses[:1], poses))[:, axes][:, :, axes]
-        total = np.cumsum(moved @ step @ np.swapaxes(moved, 1, 2), axis=0)
-        return cls(poses, np.cumsum(leads < 0).astype(np.int64), total, axes)
+        return cls(poses, np.cumsum(leads < 0).astype(np.int64), step, axes)
+
+    @cached_property
+    def total(self) -> Floats:
+        """(N, d, d) covariance summed from the first pose on, about the first pose.
+
+        About that pose the sums stay small even if the odometry's frame is far away, as UTM is.
+        """
+        moved = se3.adjoint(se3.between(self.poses[:1], self.poses))[:, self.axes][:, :, self.axes]
+        return np.cumsum(moved @ self.step @ np.swapaxes(moved, 1, 2), axis=0)
 
     def distance(self, loops: Ints, graph: PoseGraph) -> Floats:
         """(K,) sigma of the edges `loops` to the odometry, the noise of both together; NaN where it does not lead."""

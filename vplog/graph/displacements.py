@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from copy import copy
+from dataclasses import replace
+
 import numpy as np
 
 from vplog.data import Floats, Ints, PoseGraph
@@ -11,7 +14,7 @@ from vplog.graph.consistency import OdometryChain
 
 
 class Displacements:
-    """Displacements D = X_a z X_b^-1 of the world that K closures z claim; X are the odometry poses, a before b.
+    """Displacements D = X_a z X_b^-1 of the world that K closures z claim; X are the poses of a chain, a before b.
 
     Two closures agree if D_i^-1 D_j is the identity within the noise of both and of the odometry from a_i to a_j and
     from b_i to b_j (Mangelson et al., Pairwise Consistent Measurement Set Maximization, ICRA 2018, eq. 3).
@@ -20,18 +23,28 @@ class Displacements:
     def __init__(self, graph: PoseGraph, loops: Ints, chain: OdometryChain) -> None:
         """Take the edges `loops` (K,) of the graph; `chain` is the graph's odometry."""
         back = (graph.a[loops] > graph.b[loops])[:, None, None]
-        self.chain, self.axes = chain, AXES[graph.dimension]
+        self.axes = AXES[graph.dimension]
         self.a = np.minimum(graph.a[loops], graph.b[loops]).astype(np.int64)
         self.b = np.maximum(graph.a[loops], graph.b[loops]).astype(np.int64)
         noise = np.linalg.inv(informed(graph, loops))
         Ad = self._adjoint(graph.a_from_b[loops])
-        noise = np.where(back, Ad @ noise @ np.swapaxes(Ad, 1, 2), noise)  # in the frame of the later pose
-        measured = np.where(back, se3.inverse(graph.a_from_b[loops]), graph.a_from_b[loops])
+        self._noise = np.where(back, Ad @ noise @ np.swapaxes(Ad, 1, 2), noise)  # in the frame of the later pose
+        self._measured = np.where(back, se3.inverse(graph.a_from_b[loops]), graph.a_from_b[loops])
+        self._place(chain)
+
+    def on(self, poses: Floats) -> Displacements:
+        """Return the displacements that the closures claim if these are the poses (N, 4, 4)."""
+        result = copy(self)
+        result._place(replace(self.chain, poses=poses))
+        return result
+
+    def _place(self, chain: OdometryChain) -> None:
+        self.chain = chain
         at_a, at_b = (se3.between(chain.poses[:1], chain.poses[end]) for end in (self.a, self.b))
-        self.displaced = at_a @ measured @ se3.inverse(at_b)
+        self.displaced = at_a @ self._measured @ se3.inverse(at_b)
         """(K, 4, 4) about the first pose."""
         Ad = self._adjoint(at_b)
-        self.own = np.ascontiguousarray(Ad @ noise @ np.swapaxes(Ad, 1, 2))
+        self.own = np.ascontiguousarray(Ad @ self._noise @ np.swapaxes(Ad, 1, 2))
         """(K, d, d) covariance of the closure's own noise, about the first pose."""
         self.after = np.ascontiguousarray(self._adjoint(se3.inverse(self.displaced)))
         """(K, d, d) moves the odometry's noise at a into the frame of the displacement."""

@@ -2,9 +2,11 @@
 
 Neighbouring keyframes look alike, so closures come in episodes. An episode has one cause: the place is revisited, or it
 is mistaken for another one. Between a closure and its nearest earlier one, l keyframes away, the episode continues with
-probability exp(-l / EPISODE); otherwise a new one begins, which is false with probability phi. All closures of a false
+probability exp(-l / EPISODE); otherwise a new one begins, which is false with probability phi. The closures of a false
 episode claim one displacement of the world between the two visits (`Displacements`). It is uniform over the volume of
-false closures (`log_false_volume`), or with probability REPEATED that of an earlier false episode, as in equal aisles.
+false closures (`log_false_volumes`), or with probability REPEATED that of an earlier false episode, as in equal aisles.
+With probability SCATTERED a closure in the middle of a false episode claims another displacement, in that volume for
+given poses.
 `docs/how-it-works.md` states the whole model.
 """
 
@@ -27,6 +29,9 @@ of aliasing rarely covers a longer path."""
 REPEATED = 0.3
 """Prior probability that a false episode repeats the displacement of an earlier one, as in a row of equal aisles. Late
 revisits of a simulated lap are all kept from 0.1 to 0.7. At 0.1 a drive was accepted whose closures are all false."""
+SCATTERED = 0.1
+"""Prior probability that a closure of a false episode does not agree with the one before: matches between two places
+that only look alike may fit several poses."""
 SHARES = np.linspace(0.05, 0.95, 10)
 """Values of phi, equally likely, if recognition does not tell how likely a closure is false."""
 _FAMILIES = 50
@@ -50,14 +55,21 @@ class Episodes:
     """(K, S) probability that an episode that begins here is false, for S equally likely values."""
     log_volume: float
     """Log of the volume over which displacements of false closures are spread."""
+    log_view: float
+    """The same for given poses."""
     claims: Displacements
 
     @classmethod
     def of(
-        cls, graph: PoseGraph, loops: Ints, chain: OdometryChain, log_volume: float, log_odds: Floats | None
+        cls,
+        graph: PoseGraph,
+        loops: Ints,
+        chain: OdometryChain,
+        log_volumes: tuple[float, float],
+        log_odds: Floats | None,
     ) -> Episodes:
         """Prepare the edges `loops` (K,). `log_odds` (E,) are the log odds that an edge is false by recognition, None
-        or all 0 if these are unknown; `chain` is the graph's odometry."""
+        or all 0 if these are unknown; `chain` is the graph's odometry, `log_volumes` as `log_false_volumes` returns."""
         ends = np.sort(np.stack([graph.a[loops], graph.b[loops]]).astype(np.int64), axis=0)
         edges = loops[np.lexsort(ends)]
         claims = Displacements(graph, edges, chain)
@@ -67,21 +79,23 @@ class Episodes:
         else:
             share = 1.0 / (1.0 + np.exp(-log_odds[edges, None]))
         continues = np.exp(-np.maximum(gap, 1.0) / EPISODE)  # two closures of one pair of keyframes may differ, too
-        return cls(edges, nearest, continues, share, log_volume, claims)
+        return cls(edges, nearest, continues, share, *log_volumes, claims)
 
-    def log_density(self, is_false: Bools) -> tuple[float, Ints]:
+    def log_density(self, is_false: Bools, poses: Floats | None = None) -> tuple[float, Ints]:
         """Return log P(states) + log p(false closures) if `is_false` (K,) are false, and the family of each (K,).
 
-        Closures of one family claim one displacement; -1 stands for a true closure.
+        Closures of one family claim one displacement; -1 stands for a true closure. Displacements are those on `poses`
+        (N, 4, 4), which true closures may have corrected; by default those of the odometry.
         """
-        claims, K, d = self.claims, len(self.edges), len(self.claims.axes)
+        claims = self.claims if poses is None or not is_false.any() else self.claims.on(poses)
+        K, d = len(self.edges), len(claims.axes)
         family, (first, last, size) = np.full(K, -1), np.zeros((3, K), np.int64)
         continued, repeated = np.zeros((2, K))
         stays = np.where(self.nearest >= 0, self.continues, 0.0)[:, None]
         begins = (1.0 - stays) * self.false_share
-        alone = (1.0 - REPEATED) * math.exp(-self.log_volume)
+        alone, scattered = (1.0 - REPEATED) * math.exp(-self.log_volume), SCATTERED * math.exp(-self.log_view)
         _track(
-            np.flatnonzero(is_false), self.nearest, self.continues, begins[:, begins.shape[1] // 2], alone,
+            np.flatnonzero(is_false), self.nearest, self.continues, begins[:, begins.shape[1] // 2], alone, scattered,
             self.log_volume + _FAR, claims.a, claims.b, claims.chain.part, np.array(claims.axes), claims.displaced,
             claims.own, claims.after, claims.chain.total, np.zeros((K, d)), claims.own.copy(),
             np.empty((4, d, d + 2)), first, last, size, family, continued, repeated,
@@ -116,7 +130,7 @@ def _nearest_before(a: Ints, b: Ints, part: Ints) -> tuple[Ints, Floats]:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _track(
-    false: Ints, nearest: Ints, continues: Floats, begins: Floats, alone: float, most: float,
+    false: Ints, nearest: Ints, continues: Floats, begins: Floats, alone: float, scattered: float, most: float,
     a: Ints, b: Ints, part: Ints, axes: Ints, displaced: Floats, own: Floats, after: Floats, total: Floats,
     mean: Floats, covariance: Floats, room: Floats,
     first: Ints, last: Ints, size: Ints, family: Ints, continued: Floats, repeated: Floats,
@@ -133,7 +147,8 @@ def _track(
         stay, before = 0.0, -1
         if nearest[k] >= 0:
             stay, before = continues[k], family[nearest[k]]
-        chosen, best, slot = count, begins[k] * alone, 0
+        continued[k] = stay * scattered if before >= 0 else 0.0
+        chosen, best, slot = count, begins[k] * alone + continued[k], 0
         begin = max(0, count - _FAMILIES)
         members = 0
         for f in range(begin, count):
@@ -152,7 +167,8 @@ def _track(
             density = math.exp(_log_normal(spread, root, most))
             joint = 0.0
             if f == before:
-                continued[k] = joint = density * stay
+                joint = density * stay * (1.0 - SCATTERED)
+                continued[k] += joint
             if at >= begin:
                 density *= size[f] / members
                 repeated[k] += density

@@ -1,4 +1,4 @@
-"""The volume of relative poses over which false closures are spread."""
+"""The volumes over which false closures are spread."""
 
 from __future__ import annotations
 
@@ -27,11 +27,12 @@ _VIEW_M = 0.5
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
-def log_false_volume(graph: PoseGraph, places: Floats) -> float:
-    """Return the log of the volume, in m^d rad^d, over which a false closure of this graph is spread.
+def log_false_volumes(graph: PoseGraph, places: Floats) -> tuple[float, float]:
+    """Return the logs of the volumes, in m^d rad^d, over which a false closure of this graph is spread: if it may pair
+    any two poses, and if its poses are given.
 
     A false closure pairs any two of the poses `places` (N, 4, 4), a true one two that see the same place. Its relative
-    pose is distributed like those of the other closures, because verification accepts nothing else. The volume is at
+    pose is distributed like those of the other closures, because verification accepts nothing else. Both volumes are at
     most the box of positions times the volume of all rotations (8 pi^2, or 2 pi in the plane).
     """
     side = 2.0 * np.ptp(places[:, :3, 3], axis=0)[: graph.dimension]
@@ -40,12 +41,13 @@ def log_false_volume(graph: PoseGraph, places: Floats) -> float:
     loops = np.flatnonzero(is_loop(graph))
     axes = np.array(AXES[graph.dimension])
     if len(loops) <= 2 * len(axes):
-        return box
+        return box, box
     covariance, gap = _view_covariance(graph, loops, places), _smallest_gap(graph, loops)
     entropy = 0.5 * (len(axes) * (_LOG_2PI + 1.0) + float(np.linalg.slogdet(covariance)[1]))  # of a Gaussian
     variance = np.array([np.diag(covariance)[axes < 3].mean(), np.diag(covariance)[axes >= 3].mean()])
     pairs = len(places) ** 2 / 2.0
-    return min(box, math.log(pairs / max(len(loops), pairs * _share_near(places, variance, gap))) + entropy)
+    log_pairs = math.log(pairs / max(len(loops), pairs * _share_near(places, variance, gap)))
+    return min(box, log_pairs + entropy), min(box, entropy)
 
 
 def _smallest_gap(graph: PoseGraph, loops: Ints) -> int:

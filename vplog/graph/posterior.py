@@ -17,7 +17,7 @@ from vplog.graph.build import informed
 from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, odometry_chain, residual_sigma
 from vplog.graph.episodes import Episodes
 from vplog.graph.factors import Factors
-from vplog.graph.false_volume import log_false_volume
+from vplog.graph.false_volume import log_false_volumes
 from vplog.graph.least_squares import GAUGE_SIGMA, Objective, descend
 from vplog.graph.leave_one_out import distance, tension
 from vplog.graph.slips import Slipping
@@ -57,10 +57,12 @@ class Posterior:
     ) -> Posterior:
         """Prepare the graph `claimed` with its noise multiplied by `sigmas`; `log_odds` as in `Episodes.of`."""
         slipping = slipping or Slipping.nowhere(claimed.graph)
-        sound, graph = (claimed_times(one, sigmas) for one in (claimed.graph, slipping.applied(claimed.graph, sigmas)))
-        chain, loops = OdometryChain.of(graph), np.flatnonzero(is_loop(graph))
-        log_volume = log_false_volume(sound, odometry_chain(sound)[0])  # one volume for all states of the odometry
-        episodes = Episodes.of(graph, loops, chain, log_volume, log_odds)
+        slipped = slipping.applied(claimed.graph, sigmas)
+        sound, graph = claimed_times(claimed.graph, sigmas), claimed_times(slipped, sigmas)
+        of_false = claimed_times(slipped, Sigmas(*sigmas[:2]))  # the noise of true closures is not that of false ones
+        log_volumes = log_false_volumes(sound, odometry_chain(sound)[0])  # the same for all states of the odometry
+        loops, chain = np.flatnonzero(is_loop(graph)), OdometryChain.of(graph)
+        episodes = Episodes.of(of_false, loops, chain, log_volumes, log_odds)
         return cls(sigmas, replace(claimed, graph=graph), episodes, slipping)
 
     def hypothesis(self, weight: Floats, poses: Floats) -> Hypothesis:
@@ -71,7 +73,7 @@ class Posterior:
 
     def log_density(self, weight: Floats, poses: Floats) -> float:
         """Return the log of the posterior density; `poses` are the least squares of the edges of weight (E,) 1."""
-        density, _ = self.episodes.log_density(weight[self.episodes.edges] == 0)
+        density, _ = self.episodes.log_density(weight[self.episodes.edges] == 0, poses)
         true = np.flatnonzero(~self.factors.graph.odometry & (weight > 0))
         density += self.sigmas.log_prior() + self.slipping.log_prior
         return density + (self._log_true(weight, poses, true) if len(true) else 0.0)

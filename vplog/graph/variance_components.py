@@ -19,18 +19,18 @@ from vplog.graph.consistency import degrees_of_freedom, residual_twists
 from vplog.graph.least_squares import Objective
 from vplog.graph.marginals import edge_covariances
 
-_SPREAD = 2.0 * math.log(4.0)
-"""Sigma of the logarithm of a variance factor before anything was measured: drivers claim sigmas that are off by four
-and, now and then, by ten."""
+_SPREAD = 2.0 * math.log(2.0)
+"""Sigma of the logarithm of a variance factor before anything was measured: drivers claim sigmas that are off by two to
+four and, now and then, by ten."""
 _LEAST_CLOSURES = 0.5
 """Closures are not taken for much better than they claim: those of neighbouring keyframes share landmarks, so they
 agree with each other more than they are right."""
 _LEAST_OF_ODOMETRY = 2.0
 """Nor for better than so many times what the odometry is, where that is less than a quarter of its claim: what is left
 of closures whose noise is too large would be taken from the odometry's, down to nothing."""
-_LEAST, _MOST = 2.0**-14, 2.0**10
+_LEAST, _MOST = 2.0**-14, 2.0**20
 """Variance factors beyond which a claim is no longer one: sigmas 128 times too large, as of a log that tells none and
-of odometry far better than the model, or 32 times too small."""
+of odometry far better than the model, or 1000 times too small."""
 _MOST_NOISE = 0.5
 """Sigma of odometry over its motion from one keyframe to the next."""
 _STEPS = 30
@@ -60,10 +60,6 @@ class Sigmas(NamedTuple):
     def at_bound(self) -> bool:
         """Whether claims are so far too small that the noise may be larger still."""
         return max(self) ** 2 >= _MOST * (1.0 - _STILL)
-
-    def times(self, other: Sigmas) -> Sigmas:
-        """Factors of both, one after the other."""
-        return Sigmas(*(one * two for one, two in zip(self, other, strict=True)))
 
     def log_prior(self) -> float:
         """Log of the prior density but for a constant: normal in the logarithm of each variance."""
