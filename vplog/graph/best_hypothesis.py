@@ -31,7 +31,7 @@ from vplog.graph.search import (
     true_runs,
 )
 from vplog.graph.slips import Slipping, Slips
-from vplog.graph.variance_components import Sigmas, claimed_times
+from vplog.graph.variance_components import Sigmas
 
 _GROUPS = 20
 """Number of groups that are tried in a row. If none is accepted, no more closures are added."""
@@ -48,11 +48,6 @@ def best_hypothesis(
     claimed, loops = Factors.of(bounded(graph)), is_loop(graph)
     search = Search(claimed, propose, log_odds, Slipping.nowhere(graph))
     found = search.hypotheses()
-    best = max((one for one in found if one.weight[loops].any()), key=log_density, default=found[0])
-    if best.sigmas.at_bound:  # the noise may be larger still: true closures are lost beyond the bound
-        more = Factors.of(bounded(claimed_times(graph, best.sigmas)))
-        again = Search(more, propose, log_odds, Slipping.nowhere(graph)).hypotheses()
-        found += [_in_claims(one, best.sigmas) for one in again]
     found += _WithSlips(search, Slips(claimed.graph)).hypotheses(found)
 
     def less_cost(one: Hypothesis) -> float:
@@ -63,12 +58,6 @@ def best_hypothesis(
 
     likeliest = max(found, key=less_cost)
     return likeliest if likeliest.weight[loops].any() else found[0]  # nothing but true closures shows a slip
-
-
-def _in_claims(one: Hypothesis, by: Sigmas) -> Hypothesis:
-    """Return a hypothesis found with the claimed noise multiplied `by` these factors, relative to the claims."""
-    sigmas = by.times(one.sigmas)
-    return replace(one, sigmas=sigmas, log_density=one.log_density - one.sigmas.log_prior() + sigmas.log_prior())
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +71,8 @@ class _WithSlips:
         """Return likely hypotheses with slips, and those `found` without slips with the noise of these."""
         best, result = max(found, key=log_density), list[Hypothesis]()
         for start in self._starts(best):
-            with_slips = [one for one in self._improved(self._grown(start)) if one.slipping.state.any()]
+            grown = [one for at_once in (True, False) for one in self._improved(self._grown(start, at_once))]
+            with_slips = [one for one in grown if one.slipping.state.any()]
             result += [self._pruned(one) if one.log_density > best.log_density else one for one in with_slips]
         for one in list(result):
             for weight in (found[0].weight, best.weight):
@@ -104,7 +94,7 @@ class _WithSlips:
         kept, _ = self.sound.propose(self.sound.claimed, np.ones(len(loops), bool))
         annealed = replace(best, weight=np.where(loops, kept, 1.0), poses=chain.poses)
         implied = self._settled(slipping, noisier)
-        return implied + self._with_implied(replace(annealed, sigmas=noise if best.sigmas.at_bound else Sigmas()))
+        return implied + self._with_implied(replace(annealed, sigmas=Sigmas()))
 
     def _rejected(self, one: Hypothesis) -> list[Ints]:
         """Groups of rejected closures that may show a slip, those that span the shortest path first."""
@@ -156,19 +146,22 @@ class _WithSlips:
     def _improved(self, one: Hypothesis) -> list[Hypothesis]:
         return self.sound.with_slips(one.slipping).improved_from(one)
 
-    def _grown(self, best: Hypothesis) -> Hypothesis:
-        """Add groups of closures that gain more than the slips that they imply cost, in the order of `_rejected`."""
+    def _grown(self, best: Hypothesis, at_once: bool) -> Hypothesis:
+        """Add groups of closures that gain more than the slips that they imply cost: the first of `_rejected` that
+        gains if `at_once`, or the one that gains most."""
         best, tried = self.sound.with_slips(best.slipping).improved(best), set[bytes]()
         for _ in range(TURNS):
             posterior, before = self.sound.with_slips(best.slipping).at(best.sigmas), best
             new = [group for group in self._rejected(best) if group.tobytes() not in tried]
             for group in new[:_GROUPS]:
-                tried.add(group.tobytes())
-                weight = np.array(best.weight)
+                weight = np.array(before.weight)
                 weight[posterior.episodes.edges[group]] = 1.0
-                least = best.slipping.log_prior - posterior.most_gain(best, group)
-                best = max([best, *self._with_implied(replace(best, weight=weight), least)], key=log_density)
-                if best is not before:
+                least = before.slipping.log_prior - posterior.most_gain(before, group)
+                found = self._with_implied(replace(before, weight=weight), least)
+                if not (found and found[0].log_density > before.log_density):
+                    tried.add(group.tobytes())
+                best = max([best, *found], key=log_density)
+                if at_once and best is not before:
                     break
             if best is before:
                 break

@@ -34,12 +34,14 @@ _MOST_INFORMATION = 1e4
 """Largest information of a closure as a multiple of the median one, so that none outweighs a hundred others."""
 _KNOWN = 10.0
 """Information of an axis that a closure knows, as a multiple of what is known of any."""
+_CLAIMS = (1.0, 10.0, 100.0)
+"""Factors of the claimed noise at which graduated non-convexity is tried: no closure agrees with claims far too small."""
 STEADY = 0.05
 """Change of a noise factor, as a share, below which it is settled."""
 _LEAST_NOISE = Sigmas(0.25, 0.25, 1.0, 1.0)
 """Smallest noise factors of a decision. Neighbouring closures share landmarks, and odometry has biases: both agree with
 themselves better than they are right. An estimate from that agreement would reject the closures that show the error. A
-quarter of the odometry's claim is one standard deviation of the prior."""
+quarter of the odometry's claim is two standard deviations of the prior."""
 ROUNDS = 4
 """Largest number of rounds of two estimates that depend on each other, such as poses and noise. Two are usual."""
 _SHARES = (1.0, 0.25, 0.0625)
@@ -49,7 +51,7 @@ LEAST_GROUP = 3
 _FAMILIES = 2
 """Number of families that are proposed at each share."""
 _TRIED = 8
-"""Largest number of flips that are solved in one turn; the most promising ones come first."""
+"""Largest number of groups between pieces that are tried in one turn; the largest ones come first."""
 TURNS = 30
 """Number of changes after which an improvement ends."""
 
@@ -112,10 +114,12 @@ class Search:
         loops, chain = is_loop(self.claimed.graph), OdometryChain.of(posterior.factors.graph)
         none = posterior.hypothesis(np.where(loops, 0.0, 1.0), chain.poses)
         found = [none]
-        annealed = attempted(lambda: self.refit(*self.annealed(Sigmas()), Sigmas()))
-        if not (annealed and annealed[0].weight.all()):  # claims may be too small for any closure to agree with them
-            annealed += attempted(lambda: self.refit(np.ones(len(loops)), chain.poses, Sigmas()))
-        found += [self.improved(one) for one in annealed]
+        for factor in _CLAIMS:
+            noise = Sigmas(*[factor] * 4)
+            annealed = attempted(lambda noise=noise: self.refit(*self.annealed(noise), noise))
+            found += [self.improved(one) for one in annealed]
+            if annealed and annealed[0].weight.all():
+                break
         best = max(found, key=log_density)
         starts = [none]
         for weight in self._families(best, loops):
@@ -172,7 +176,7 @@ class Search:
     def _flipped(self, posterior: Posterior, best: Hypothesis) -> list[Hypothesis]:
         """A likelier hypothesis after one flip; none if no flip that is tried makes it likelier.
 
-        First groups that join pieces are tried, then all promising flips together, then the most promising ones alone.
+        First groups that join pieces are tried, then all promising flips together, then each of them.
         What a flip of a group gains is foreseen from its median closure, because the others of a group follow from one
         of them, true or false.
         """
@@ -191,7 +195,7 @@ class Search:
         promising.sort(key=lambda one: -one[0])
         together = [group for gain, group in promising if gain > 0]
         tried += [(np.unique(np.concatenate(together)), best.poses)] if len(together) > 1 else []
-        tried += [(group, best.poses) for gain, group in promising[:_TRIED] if gain > 0]
+        tried += [(group, best.poses) for gain, group in promising if gain > 0]
         for group, poses in tried:
             weight = np.array(best.weight)
             weight[episodes.edges[group]] = 1.0 - weight[episodes.edges[group]]
