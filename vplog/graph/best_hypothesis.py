@@ -33,9 +33,6 @@ from vplog.graph.search import (
 from vplog.graph.slips import Slipping, Slips
 from vplog.graph.variance_components import Sigmas
 
-_GROUPS = 20
-"""Number of groups that are tried in a row. If none is accepted, no more closures are added."""
-
 
 def best_hypothesis(
     graph: PoseGraph, propose: Proposal, cost: Cost | None = None, log_odds: Floats | None = None
@@ -153,7 +150,7 @@ class _WithSlips:
         for _ in range(TURNS):
             posterior, before = self.sound.with_slips(best.slipping).at(best.sigmas), best
             new = [group for group in self._rejected(best) if group.tobytes() not in tried]
-            for group in new[:_GROUPS]:
+            for group in new:
                 weight = np.array(before.weight)
                 weight[posterior.episodes.edges[group]] = 1.0
                 least = before.slipping.log_prior - posterior.most_gain(before, group)

@@ -35,7 +35,7 @@ _MOST_INFORMATION = 1e4
 _KNOWN = 10.0
 """Information of an axis that a closure knows, as a multiple of what is known of any."""
 _CLAIMS = (1.0, 10.0, 100.0)
-"""Factors of the claimed noise at which graduated non-convexity is tried: no closure agrees with claims far too small."""
+"""Factors of the claimed noise with which graduated non-convexity is tried: claims may be far too small."""
 STEADY = 0.05
 """Change of a noise factor, as a share, below which it is settled."""
 _LEAST_NOISE = Sigmas(0.25, 0.25, 1.0, 1.0)
@@ -50,8 +50,6 @@ LEAST_GROUP = 3
 """Smallest number of closures in a family that is proposed, and in a group that may show a slip."""
 _FAMILIES = 2
 """Number of families that are proposed at each share."""
-_TRIED = 8
-"""Largest number of groups between pieces that are tried in one turn; the largest ones come first."""
 TURNS = 30
 """Number of changes after which an improvement ends."""
 
@@ -186,7 +184,7 @@ class Search:
             log_predictive = posterior.log_predictive(best)
         except (GraphError, np.linalg.LinAlgError):
             return []
-        tried = _joining(posterior, best)[:_TRIED]
+        tried = _joining(posterior, best)
         promising: list[tuple[float, Ints]] = []
         for group in groups(episodes, is_false):
             share = float(episodes.false_share[group].mean())

@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import wrightomega
 
 from vplog.data import Bools, Floats, PoseGraph
 from vplog.errors import GraphError
@@ -33,14 +34,6 @@ _LEAST, _MOST = 2.0**-14, 2.0**20
 of odometry far better than the model, or 1000 times too small."""
 _MOST_NOISE = 0.5
 """Sigma of odometry over its motion from one keyframe to the next."""
-_STEPS = 30
-"""Most Newton steps in one dimension; 5 are usual."""
-_STILL = 1e-3
-"""Step of a logarithm below which an estimate stands still."""
-_MOST_RATIO = 0.8
-"""Largest ratio of two steps that is extrapolated: to five times the second one."""
-_FURTHEST = math.log(2.0)
-"""Furthest extrapolation of a logarithm."""
 
 
 class Sigmas(NamedTuple):
@@ -56,11 +49,6 @@ class Sigmas(NamedTuple):
         """Factor of the closures' sigma along a mean axis."""
         return math.sqrt(self.closure_rotation * self.closure_translation)
 
-    @property
-    def at_bound(self) -> bool:
-        """Whether claims are so far too small that the noise may be larger still."""
-        return max(self) ** 2 >= _MOST * (1.0 - _STILL)
-
     def log_prior(self) -> float:
         """Log of the prior density but for a constant: normal in the logarithm of each variance."""
         return -sum((2.0 * math.log(sigma) / _SPREAD) ** 2 for sigma in self) / 2.0
@@ -73,16 +61,12 @@ class Sigmas(NamedTuple):
 def most_likely_variance(chi2: float, redundancy: float) -> float:
     """The variance factor of greatest posterior density for this chi-square by the claims.
 
-    It maximises -r u / 2 - chi2 exp(-u) / 2 - u^2 / (2 _SPREAD^2) over u = log variance, which is concave.
+    It maximises -r u / 2 - chi2 exp(-u) / 2 - u^2 / (2 _SPREAD^2) over u = log variance; Wright's omega function solves
+    that in closed form.
     """
-    u = 0.0
-    for _ in range(_STEPS):
-        pull = 0.5 * chi2 * math.exp(-u)
-        step = (pull - 0.5 * redundancy - u / _SPREAD**2) / (pull + 1.0 / _SPREAD**2)
-        u += min(max(step, -1.0), 3.0)
-        if abs(step) < 1e-6:
-            break
-    return min(max(math.exp(u), _LEAST), _MOST)
+    expected = 0.5 * redundancy * _SPREAD**2
+    u = float(wrightomega(math.log(0.5 * chi2 * _SPREAD**2 + 1e-300) + expected)) - expected
+    return math.exp(min(max(u, math.log(_LEAST)), math.log(_MOST)))
 
 
 def claimed_times(graph: PoseGraph, sigmas: Sigmas) -> PoseGraph:
@@ -135,15 +119,6 @@ def _most_factors(graph: PoseGraph) -> list[float]:
         share = math.sqrt(float(chi2.mean()) / int(part.sum())) if len(edges) else math.inf
         found.append(_MOST_NOISE * share)
     return found
-
-
-def extrapolated(first: Sigmas, second: Sigmas, third: Sigmas) -> Sigmas:
-    """Limit that three successive estimates lead to: Aitken's delta-squared process in their logarithms, bounded."""
-    steps = np.diff(np.log(np.array([first, second, third])), axis=0)
-    ratio = np.divide(steps[1], steps[0], out=np.zeros(len(first)), where=np.abs(steps[0]) > _STILL)
-    ratio = np.clip(ratio, 0.0, _MOST_RATIO)
-    ahead = np.clip(steps[1] * ratio / (1.0 - ratio), -_FURTHEST, _FURTHEST)
-    return Sigmas(*(np.array(third) * np.exp(ahead)).tolist())
 
 
 def _of_parts(objective: Objective, poses: Floats, kinds: list[Bools]) -> list[tuple[Floats, Floats]]:

@@ -13,7 +13,7 @@ from vplog.graph.factors import Factors
 from vplog.graph.least_squares import Objective, minimised
 from vplog.graph.lm import half_chi2
 from vplog.graph.marginals import SharedScale, positions_redundancy
-from vplog.graph.variance_components import Sigmas, claimed_times, estimate, extrapolated
+from vplog.graph.variance_components import Sigmas, claimed_times, estimate
 from vplog.refinement.gps_factors import Fixes, inlier_fixes, with_fixes, with_noise_of, world_from_enu
 from vplog.settings import Settings
 
@@ -158,7 +158,7 @@ def refine(
         refined = _refined(rescaled(graph, [], sigmas), solution, poses, sigmas, [], fixes, inlier)
         return replace(refined, unknown=_unknown(of_odometry, loops, left, settings))
 
-    scales, trail = scales if settings.scale else [], [sigmas]
+    scales = scales if settings.scale else []
     measured = _Measurements(graph, weight, fixes, inlier)
     for _ in range(settings.max_rounds):
         objective = measured.objective(scales, sigmas, poses)
@@ -166,10 +166,6 @@ def refine(
         before, factor = sigmas, 1.0
         if settings.noise:
             sigmas = estimate(objective, poses, sigmas)
-            trail.append(sigmas)
-            if len(trail) >= 3 and sigmas.differ(before, _STEADY):
-                sigmas = extrapolated(*trail[-3:])
-                trail = [sigmas]
         moved = [_scale_step(measured, scales, number, sigmas, poses) for number in range(len(scales))]
         left |= {one.of: sigma / one.witnesses**0.5 for one, (_, sigma) in zip(scales, moved, strict=True)}
         if fixes is not None:
