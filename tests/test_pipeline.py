@@ -28,7 +28,7 @@ from vplog.results import tables
 from vplog.results.run_record import read_run_json
 from vplog.run.reference_library import build_library
 from vplog.run.run_folder import CacheOptions
-from vplog.verbs.evaluate_run import evaluate
+from vplog.verbs.evaluate_run import TruthOptions, evaluate, evaluate_poses, relative_to_references
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -78,6 +78,21 @@ def test_a_run_says_how_sure_it_is(finished: Path) -> None:
     covariance = tables.read_keyframe_covariance(finished / "keyframes.parquet")
     assert not covariance[0].any()
     assert (np.linalg.eigvalsh(covariance[1:]) > 0).all()
+    _, poses = tables.read_keyframes(finished / "keyframes.parquet")
+    references, covariances = relative_to_references(finished, record_of(finished), poses)
+    assert references[0] == 0
+    np.testing.assert_allclose(next(covariances), covariance, atol=1e-8)
+
+
+def test_a_run_of_before_shared_errors_were_recorded_has_no_nees(finished: Path, drive: Demo) -> None:
+    record, truth = record_of(finished), str(drive.truth)
+    score = evaluate_poses(finished, record, truth, TruthOptions()).record["poses"]
+    assert score["nees"] > 0
+    assert score["reason"] == ""
+    del record["covariance"]
+    score = evaluate_poses(finished, record, truth, TruthOptions()).record["poses"]
+    assert score["nees"] is None
+    assert "older vplog" in score["reason"]
 
 
 def test_run_json_says_what_was_run_and_how_it_went(finished: Path, drive: Demo) -> None:

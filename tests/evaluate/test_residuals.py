@@ -60,23 +60,43 @@ def test_nothing_accepted_is_no_figure() -> None:
 
 @pytest.mark.parametrize("claimed", [0.5, 1.0, 4.0])
 def test_nees_is_one_where_poses_are_off_by_what_they_claim(claimed: float) -> None:
-    """In the frame of the truth, wherever the first keyframe is by either."""
+    """In the frame of the truth, wherever the reference keyframe is by either."""
     keyframes, _, truth = drive()
-    poses = truth.trajectory.world_from_body
+    poses, reference = truth.trajectory.world_from_body, 30
     error = np.random.default_rng(1).normal(size=(2 * LAP, 6)) * SIGMA
-    error[0] = 0.0
+    error[reference] = 0.0
     elsewhere = se3.exp(np.array([[0.2, -0.1, 2.0, 30.0, -7.0, 4.0]]))
     covariance = np.tile(np.diag((claimed * SIGMA) ** 2), (2 * LAP, 1, 1))
     covariance[7] = np.nan
-    found = score_poses(keyframes, elsewhere @ poses @ se3.exp(error), covariance, truth)
+    found = score_poses(keyframes.stamp_ns, elsewhere @ poses @ se3.exp(error), [reference], [covariance], truth)
     assert found.keyframes == 2 * LAP - 2
     assert found.nees == pytest.approx(claimed**-2, rel=0.1)
     assert found.median_sigma_m == pytest.approx(claimed * 0.05 * np.sqrt(3))
 
 
+def test_a_wrong_truth_of_the_first_keyframes_does_not_decide_the_nees() -> None:
+    """The first five true poses are 1 m too high, which is 20 standard deviations of a pose."""
+    keyframes, _, truth = drive()
+    stamps, poses, references = keyframes.stamp_ns, truth.trajectory.world_from_body, list(range(0, 2 * LAP, 10))
+    turned = [se3.adjoint(se3.between(poses, poses[[reference]])) for reference in references]
+    own = np.diag(SIGMA**2)  # the errors of two poses are independent
+    covariances = [own + Ad @ own @ np.swapaxes(Ad, 1, 2) for Ad in turned]
+    wrong = poses.copy()
+    wrong[:5, 2, 3] += 1.0
+    too_high = BodyTruth(Trajectory(stamps, wrong))
+    error = np.random.default_rng(1).normal(size=(2 * LAP, 6)) * SIGMA
+    for factor in (1.0, 2.0):
+        solved, expected = poses @ se3.exp(factor * error), pytest.approx(factor**2, rel=0.25)
+        assert score_poses(stamps, solved, references, covariances, truth).nees == expected
+        assert score_poses(stamps, solved, references, covariances, too_high).nees == expected
+    by_first = score_poses(stamps, poses @ se3.exp(error), references[:1], covariances[:1], too_high).nees
+    assert by_first is not None
+    assert by_first > 2.0
+
+
 def test_poses_without_covariance_or_orientation_have_no_nees() -> None:
     keyframes, _, truth = drive()
-    poses = truth.trajectory.world_from_body
-    unknown, none = np.full((2 * LAP, 6, 6), np.nan), PoseScore(0, None, None)
-    assert score_poses(keyframes, poses, unknown, truth) == none
-    assert score_poses(keyframes, poses, np.tile(np.eye(6), (2 * LAP, 1, 1)), replace(truth, oriented=False)) == none
+    stamps, poses = keyframes.stamp_ns, truth.trajectory.world_from_body
+    none, covariance = PoseScore(0, None, None), np.tile(np.eye(6), (2 * LAP, 1, 1))
+    assert score_poses(stamps, poses, [0], [covariance * np.nan], truth) == none
+    assert score_poses(stamps, poses, [0], [covariance], replace(truth, oriented=False)) == none

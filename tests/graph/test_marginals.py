@@ -14,14 +14,15 @@ from tests.graph.gtsam_graph import as_values, weighted
 from vplog.geometry import se3
 from vplog.graph.factors import Factors
 from vplog.graph.least_squares import Objective, Positions, minimised
-from vplog.graph.marginals import SharedScale, pose_covariances
+from vplog.graph.marginals import SharedScale, pose_covariances, relative_covariances
 
 WORLDS = 200
 
 
 @pytest.mark.parametrize("shared", [(), (0.02, 0.05), (0.02, 0.05, 0.03)])
 def test_mean_nees_over_many_worlds_is_within_its_interval(shared: tuple[float, ...]) -> None:
-    """One keyframe of each, so that they are independent: their sum is chi-square distributed with 6 degrees each.
+    """One keyframe of each, relative to another one. The worlds are independent, so that their sum is chi-square
+    distributed with 6 degrees of freedom each.
 
     The metric scales of the odometry and of the closures have these standard deviations, as the odometry's turns do.
     """
@@ -42,12 +43,35 @@ def test_mean_nees_over_many_worlds_is_within_its_interval(shared: tuple[float, 
         graph = replace(drive.graph, a_from_b=a_from_b)
         objective = Objective(Factors.of(graph), np.ones(len(graph.a)))
         poses = minimised(objective, graph.world_from_body, 20, 1e-9).world_from_body
-        row = int(random.integers(1, 14))
-        first_from = [se3.between(one[:1], one[row : row + 1]) for one in (poses, drive.true)]
-        covariance = pose_covariances(objective, poses, scales)[row : row + 1]
-        total += float(se3.mahalanobis2(se3.log(se3.between(*first_from)), covariance)[0])
+        reference, row = random.choice(14, 2, replace=False)
+        both = [se3.between(one[[reference]], one[[row]]) for one in (poses, drive.true)]
+        [covariance] = relative_covariances(objective, poses, [reference], scales)
+        total += float(se3.mahalanobis2(se3.log(se3.between(*both)), covariance[[row]])[0])
     low, high = chdtri(6 * WORLDS, [0.995, 0.005]) / (6 * WORLDS)
     assert low < total / (6 * WORLDS) < high
+
+
+def test_covariances_relative_to_a_pose_are_those_of_a_graph_that_starts_there() -> None:
+    drive = ring(30, 6, seed=1)
+    graph, odometry, weight = drive.graph, drive.graph.odometry, np.ones(len(drive.graph.a))
+    scales = [SharedScale(odometry, 0.02), SharedScale(~odometry, 0.05), SharedScale(odometry, 0.03, True)]
+    swapped = np.arange(30)
+    swapped[[0, 17]] = 17, 0
+    a, b = (swapped[ends].astype(np.int32) for ends in (graph.a, graph.b))
+    started = replace(graph, world_from_body=graph.world_from_body[swapped], a=a, b=b)
+    expected = pose_covariances(Objective(Factors.of(started), weight), drive.true[swapped], scales)[swapped]
+    objective = Objective(Factors.of(graph), weight)
+    first, found = relative_covariances(objective, drive.true, [0, 17], scales)
+    np.testing.assert_allclose(found, expected, atol=1e-8)
+    np.testing.assert_allclose(first, pose_covariances(objective, drive.true, scales), atol=1e-8)
+
+
+def test_shared_scales_come_back_from_their_records() -> None:
+    for edges in ([True, True, False, True, False], [False, False, True], [True], []):
+        scale = SharedScale(np.array(edges, bool), 0.02, True)
+        found = SharedScale.of(scale.record(), len(edges))
+        np.testing.assert_array_equal(found.edges, edges)
+        assert found[1:] == scale[1:]
 
 
 def test_covariances_are_those_of_gtsam() -> None:

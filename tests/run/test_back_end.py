@@ -102,7 +102,7 @@ def test_covariances_hold_for_a_gyroscope_with_a_wrong_scale() -> None:
         own = keyframe_covariances(result)
         assert own is not None
         truth = BodyTruth(Trajectory(keyframes.stamp_ns, drive.true))
-        nees = score_poses(keyframes, result.refined.solution.world_from_body, own, truth).nees
+        nees = score_poses(keyframes.stamp_ns, result.refined.solution.world_from_body, [0], [own], truth).nees
         assert nees is not None
         found.append(nees)
     assert 0.5 < np.mean(found) < 2.0, found

@@ -232,10 +232,7 @@ def print_evaluation(found: dict[str, Any]) -> None:
             f"median {residuals['to_truth']:.2f} sigma to the truth{near} (consistent with their covariance: about 1)"
         )
         print_line("residuals", text)
-    poses = found.get("poses")
-    if poses and poses["nees"] is not None:
-        text = f"NEES {poses['nees']:.2f} per degree of freedom (consistent with their covariance: about 1), "
-        print_line("poses", f"{text}median sigma {poses['median_sigma_m']:.3g} m from the first keyframe")
+    _print_pose_score(found.get("poses"))
     for when in ("before", "after"):
         ate, rpe, drift = found[f"ate_{when}"], found.get(f"rpe_{when}"), found.get(f"drift_{when}")
         scale = f", scale {ate['scale']:.4f}" if ate["alignment"] == "Sim(3)" else ""
@@ -247,6 +244,14 @@ def print_evaluation(found: dict[str, Any]) -> None:
             ends = f"{drift['lengths_m'][0]:g} to {drift['lengths_m'][-1]:g} m"
             what = f"drift {drift['translation_m']:.2f} m, {drift['rotation_deg']:.2f} deg per 100 m"
             print_line("", f"{what} (mean of {drift['segments']} segments of {ends} of path)")
+
+
+def _print_pose_score(poses: dict[str, Any] | None) -> None:
+    if poses and poses["nees"] is not None:
+        text = f"NEES {poses['nees']:.2f} per degree of freedom (consistent with their covariance: about 1), "
+        print_line("poses", f"{text}median sigma {poses['median_sigma_m']:.3g} m relative to another keyframe")
+    elif poses and poses["reason"]:
+        print_line("poses", f"no NEES: {poses['reason']}")
 
 
 def print_evaluated_map(found: dict[str, Any]) -> None:

@@ -6,7 +6,7 @@ between the true poses, as in `vplog compare`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from typing import Any
@@ -334,27 +334,44 @@ def score_residuals(keyframes: Keyframes, closures: Closures, truth: BodyTruth) 
 
 @dataclass(frozen=True)
 class PoseScore:
-    """Errors of the keyframes' poses, normalised by their covariances, both relative to the first keyframe."""
+    """Errors of the keyframes' poses relative to reference keyframes, normalised by their covariances.
+
+    Each figure is the median over the references.
+    """
 
     keyframes: int
-    """Keyframes with a covariance and a truth."""
+    """Number of keyframes with a covariance and a truth, without the reference."""
     nees: float | None
-    """Mean of e' C^-1 e / 6: about 1 for honest covariances. Neighbours share their errors, so that one drive alone is
-    within a factor of 2 or 3 of it."""
+    """Mean of e' C^-1 e / 6 over the keyframes, about 1 for honest covariances. Neighbours share their errors, so that
+    one drive alone is within a factor of 2 or 3 of 1."""
     median_sigma_m: float | None
-    """Median of the standard deviation of the position: the root of the covariance's trace."""
+    """Median over the keyframes of the standard deviation of the position: the root of the covariance's trace."""
+    reason: str = ""
+    """Why the covariances are not known, empty if they are."""
 
 
-def score_poses(keyframes: Keyframes, world_from_body: Floats, covariance: Floats, truth: BodyTruth) -> PoseScore:
-    """Score solved keyframes (N, 4, 4) by their covariances (N, 6, 6), NaN where unknown."""
-    at = truth.at(keyframes.stamp_ns)
-    rows = np.flatnonzero(at.known & truth.oriented & at.known[:1] & np.isfinite(covariance).all((1, 2)))
-    rows = rows[rows > 0]
-    if not len(rows):
+def score_poses(
+    stamp_ns: Ints, world_from_body: Floats, references: Sequence[int], covariances: Iterable[Floats], truth: BodyTruth
+) -> PoseScore:
+    """Score keyframes (N, 4, 4) by their covariances (N, 6, 6) relative to each of `references`, NaN if unknown.
+
+    An error of the truth at a reference is in the errors of all keyframes relative to it. The median over the
+    references is robust to such errors. Covariances that are too small show at every reference.
+    """
+    at, scores = truth.at(stamp_ns), list[tuple[int, float, np.floating]]()
+    known = at.known & truth.oriented
+    for reference, covariance in zip(references, covariances, strict=True):
+        rows = np.flatnonzero(known & known[reference] & np.isfinite(covariance).all((1, 2)))
+        rows = rows[rows != reference]
+        if len(rows):
+            expected, found = (se3.between(p[[reference]], p[rows]) for p in (at.world_from_body, world_from_body))
+            nees = float((_normalised(expected, found, covariance[rows]) ** 2).mean())
+            sigma_m = np.median(np.sqrt(np.trace(covariance[rows, 3:, 3:], axis1=1, axis2=2)))
+            scores.append((len(rows), nees, sigma_m))
+    if not scores:
         return PoseScore(0, None, None)
-    expected, found = (se3.between(poses[:1], poses[rows]) for poses in (at.world_from_body, world_from_body))
-    nees = float((_normalised(expected, found, covariance[rows]) ** 2).mean())
-    return PoseScore(len(rows), nees, float(np.median(np.sqrt(np.trace(covariance[rows, 3:, 3:], axis1=1, axis2=2)))))
+    keyframes, nees, sigma_m = np.median(np.array(scores), axis=0).tolist()
+    return PoseScore(int(keyframes), nees, sigma_m)
 
 
 def _neighbours(query: Ints, match: Ints) -> tuple[Ints, Ints]:

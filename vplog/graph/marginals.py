@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,17 @@ class SharedScale(NamedTuple):
     sigma: float
     """Standard deviation."""
     of_rotation: bool = False
+
+    def record(self) -> dict[str, Any]:
+        """Return plain values for JSON. `changes` has the edges that differ in membership from the edge before them."""
+        changes = np.flatnonzero(np.diff(self.edges, prepend=False)).tolist()
+        return {"sigma": self.sigma, "of_rotation": self.of_rotation, "changes": changes}
+
+    @classmethod
+    def of(cls, record: dict[str, Any], count: int) -> SharedScale:
+        """Return the scale of a `record` for a graph with `count` edges."""
+        edges = np.searchsorted(record["changes"], np.arange(count), side="right") % 2 == 1
+        return cls(edges, record["sigma"], record["of_rotation"])
 
 
 def edge_covariances(objective: Objective, poses: Floats, edges: Ints) -> Floats:
@@ -65,6 +76,23 @@ def pose_covariances(objective: Objective, poses: Floats, scales: Sequence[Share
     if objective.positions is None:
         result[0] = 0.0
     return result
+
+
+def relative_covariances(
+    objective: Objective, poses: Floats, references: Sequence[int], scales: Sequence[SharedScale] = ()
+) -> Iterator[Floats]:
+    """Yield the covariance (N, d, d) of reference_from_body of every pose, for each of the poses `references`.
+
+    The covariances are in the frame of the body. Errors of `scales`, NaN and GraphError are as in `pose_covariances`.
+    """
+    axes, information = AXES[objective.factors.graph.dimension], objective.information(poses)
+    own, shift = pose_covariances(objective, poses, scales), information.solve(_by_scales(objective, poses, scales))
+    for reference in references:
+        unit = np.zeros_like(own)
+        unit[reference] = np.eye(len(axes))
+        Ad = se3.adjoint(se3.between(poses, poses[[reference]]))[:, axes][:, :, axes]
+        mixed = (information.solve(unit) + shift @ shift[reference].T) @ np.swapaxes(Ad, 1, 2)
+        yield own - mixed - np.swapaxes(mixed, 1, 2) + Ad @ own[reference] @ np.swapaxes(Ad, 1, 2)
 
 
 def _by_scales(objective: Objective, poses: Floats, scales: Sequence[SharedScale]) -> Floats:

@@ -72,6 +72,15 @@ class BackEndResult:
     pieces: int = 1
     """Pieces of the trajectory that nothing relates to each other."""
 
+    @property
+    def caution(self) -> Sigmas:
+        """Factors of the sigmas of `refined.graph` in the covariance of the keyframes.
+
+        Estimated factors below 1 show agreement between measurements. If these share calibration and landmarks, as
+        visual odometry and closures do, they share errors too. Agreement then is not accuracy, and claims are kept.
+        """
+        return Sigmas(*(1.0 / min(factor, 1.0) for factor in self.refined.sigmas[:2])) if self.of_images else Sigmas()
+
 
 @step("solve")
 def solve(
@@ -183,14 +192,19 @@ def about_gps(solved: BackEndResult) -> dict[str, Any] | None:
     }
 
 
+def about_covariance(solved: BackEndResult) -> dict[str, Any]:
+    """Return field `covariance` of run.json, with which edges.parquet gives the covariance of the keyframes."""
+    return {"sigma_factors": solved.caution, "shared_scales": [scale.record() for scale in solved.refined.unknown]}
+
+
 def keyframe_covariances(solved: BackEndResult) -> Floats | None:
-    """(N, 6, 6) of the keyframes as the graph has them in the end, with the noise as estimated, the GPS fixes kept and
-    the scales that are not known; None where edges and fixes do not determine them. Closures do not show odometry of
-    the same images to be better than it claims: what calibration makes wrong is wrong alike in both."""
+    """Return the covariance (N, 6, 6) of the keyframes, or None if edges and fixes do not determine the poses.
+
+    The solved graph has its estimated noise times `BackEndResult.caution`. The inlier GPS fixes and the unknown scales
+    are included.
+    """
     refined, fixes = solved.refined, solved.refined.fixes
-    graph, sigmas = refined.graph, refined.sigmas
-    if solved.of_images:
-        graph = claimed_times(graph, Sigmas(*(1.0 / min(one, 1.0) for one in sigmas[:2])))
+    graph = claimed_times(refined.graph, solved.caution)
     factors, poses, weight = Factors.of(graph), refined.solution.world_from_body, refined.solution.weight
     objective = Objective(factors, weight)
     if fixes is not None and refined.inlier.any():

@@ -30,7 +30,7 @@ from vplog.results import g2o, mcap, run_record, tables
 from vplog.results.previews import thumbnail
 from vplog.results.report.page import Pictures, ReportContent
 from vplog.run import provenance
-from vplog.run.back_end import BackEndResult, about_gps, keyframe_covariances
+from vplog.run.back_end import BackEndResult, about_covariance, about_gps, keyframe_covariances
 from vplog.run.cache.steps import Steps, step
 from vplog.run.figures.run_figures import (
     ClosureInputs,
@@ -258,4 +258,5 @@ def _results_record(run: Run, spacing: int) -> dict[str, Any]:
         "certificate": certify(run.graph, solution.weight, solution.world_from_body).record(),
         "odometry": about_odometry(refined),
         "gps": about_gps(run.solved),
+        "covariance": about_covariance(run.solved),
     }

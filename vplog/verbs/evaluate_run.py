@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 
 from vplog import logs
 from vplog.data import Closures, Floats, Gps, Keyframes, Trajectory
-from vplog.errors import ResultError, SettingsError, TruthError
+from vplog.errors import GraphError, ResultError, SettingsError, TruthError
 from vplog.evaluate import closures, trajectory
 from vplog.evaluate.body_truth import BodyTruth, TruthAt, body_truth
 from vplog.evaluate.closure_pose import pose_bounds
@@ -38,6 +38,8 @@ _FIGURES = {
 }
 FIGURES = tuple(_FIGURES)
 """Names of the figures of a run against the truth."""
+_MAX_REFERENCES = 100
+"""Maximum number of reference keyframes of the NEES. Each costs a solve, and a median of more changes little."""
 _BESIDE = {"odometry_file", "calibration_file", "masks"}
 _OWN_FIXES = "The satellite fixes are in this run's trajectory: that it is near them says little of its error."
 _AGAIN = "Say where it is: --log LOG. Or give a truth file: --truth FILE.tum."
@@ -190,14 +192,14 @@ def evaluate_poses(
         odometry = replace(odometry, odom_from_body=se3.stretched(odometry.odom_from_body, scale, mount))
     before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
-    covariance = tables.read_keyframe_covariance(folder / "keyframes.parquet")
     ledger = tables.read_closures(folder / "closures.parquet")
     settings = run_record.recorded(record, folder / "run.json", dict, "settings", "propose")
     stops = candidate_stops(keyframes, ProposeSettings.read(settings, f"{folder}/run.json"))
+    solved, units = world_from_body, np.eye(6)
     if mount is not None:
-        keyframes, world_from_body, covariance, ledger = _stretched(
-            keyframes, world_from_body, covariance, ledger, scale, mount
-        )
+        units = se3.adjoint(mount) @ np.diag([1.0, 1.0, 1.0, *[scale] * 3]) @ se3.adjoint(se3.inverse(mount))
+        keyframes, ledger = _stretched(keyframes, ledger, units, scale, mount)
+        world_from_body = se3.stretched(solved, scale, mount)
     cameras = _cameras(folder)
     of_body = body_truth(known, before, next(iter(cameras), None))
     score, judged = closures.score_closures(keyframes, ledger, of_body, stops, options, cameras)
@@ -217,27 +219,53 @@ def evaluate_poses(
         "residuals": asdict(closures.score_residuals(keyframes, ledger, of_body)),
     }
     if record.get("gps") is None:  # with GPS they are relative to earth, where the truth need not be
-        found["poses"] = asdict(closures.score_poses(keyframes, world_from_body, covariance, of_body))
+        try:
+            references, covariances = relative_to_references(folder, record, solved)
+            in_metres = (units @ covariance @ units.T for covariance in covariances)
+            poses = closures.score_poses(keyframes.stamp_ns, world_from_body, references, in_metres, of_body)
+        except GraphError as error:
+            poses = closures.PoseScore(0, None, None, str(error))
+        found["poses"] = asdict(poses)
     found["warnings"] = [*truth_warnings(found), *run_record.piece_warnings(record)]
     matched = trajectory.matched_poses(trajectory.at_truth(after, known)[0], known)
     shared = SharedTruth(frame, matched, of_body.at(keyframes.stamp_ns), of_body.oriented, cameras)
     return RunEvaluation(found, shared, keyframes, of_body, judged)
 
 
+def relative_to_references(
+    folder: Path, record: dict[str, Any], world_from_body: Floats
+) -> tuple[list[int], Iterator[Floats]]:
+    """Return reference keyframes, spread evenly over a run, and the covariances (N, 6, 6) of all keyframes relative to
+    each. Raises GraphError if the run has no record of shared errors or its edges do not determine the poses."""
+    from vplog.graph.factors import Factors
+    from vplog.graph.least_squares import Objective
+    from vplog.graph.marginals import SharedScale, relative_covariances
+    from vplog.graph.variance_components import Sigmas, claimed_times
+
+    shared, count = record.get("covariance"), len(world_from_body)
+    if shared is None:
+        raise GraphError("an older vplog wrote this run without the errors that edges share. Run `vplog run` again.")
+    references = np.unique(np.linspace(0, count - 1, min(count, _MAX_REFERENCES)).astype(np.int64)).tolist()
+    graph, weight, _ = tables.read_edges(folder / "edges.parquet", world_from_body)
+    graph = claimed_times(graph, Sigmas(*shared["sigma_factors"]))
+    scales = [SharedScale.of(scale, len(weight)) for scale in shared["shared_scales"]]
+    return references, relative_covariances(Objective(Factors.of(graph), weight), world_from_body, references, scales)
+
+
 def _stretched(
-    keyframes: Keyframes, world_from_body: Floats, covariance: Floats, ledger: Closures, scale: float, mount: Floats
-) -> tuple[Keyframes, Floats, Floats, Closures]:
-    """A run in units of its own as one in which the lengths of the path of the camera at `mount` are multiplied."""
-    units = se3.adjoint(mount) @ np.diag([1.0, 1.0, 1.0, scale, scale, scale]) @ se3.adjoint(se3.inverse(mount))
+    keyframes: Keyframes, ledger: Closures, units: Floats, scale: float, mount: Floats
+) -> tuple[Keyframes, Closures]:
+    """A run in units of its own as one in which the lengths of the path of the camera at `mount` are multiplied.
+
+    `units` (6, 6) multiplies twists of the body.
+    """
     back = np.linalg.inv(units)
     ledger = replace(
         ledger,
         match_from_query=se3.stretched(ledger.match_from_query, scale, mount),
         information=back.T @ ledger.information @ back,
     )
-    keyframes = replace(keyframes, odom_from_body=se3.stretched(keyframes.odom_from_body, scale, mount))
-    covariance = units @ covariance @ units.T
-    return keyframes, se3.stretched(world_from_body, scale, mount), covariance, ledger
+    return replace(keyframes, odom_from_body=se3.stretched(keyframes.odom_from_body, scale, mount)), ledger
 
 
 def _shifted(known: Trajectory, options: TruthOptions) -> Trajectory:

@@ -66,7 +66,7 @@ class Cholesky:
         """x (n, d, c) of R^T R x = right (n, d, c)."""
         moved = np.empty((right.shape[2], *right.shape[:2]))
         moved[:, self.shape.place] = right.transpose(2, 0, 1)
-        x = moved.reshape(right.shape[2], -1)
+        x = moved.reshape(len(moved), right.shape[0] * right.shape[1])
         for forward in (True, False):
             kernels.substitute(self.shape.panels, self.size, self.values, x, forward)
         return x.reshape(right.shape[2], *right.shape[:2]).transpose(1, 2, 0)[self.shape.place]
