@@ -89,10 +89,10 @@ def test_a_run_of_before_shared_errors_were_recorded_has_no_nees(finished: Path,
     score = evaluate_poses(finished, record, truth, TruthOptions()).record["poses"]
     assert score["nees"] > 0
     assert score["reason"] == ""
-    del record["covariance"]
-    score = evaluate_poses(finished, record, truth, TruthOptions()).record["poses"]
-    assert score["nees"] is None
-    assert "older vplog" in score["reason"]
+    for covariance in (None, {"sigma_factors": "?"}, {"sigma_factors": [1.0] * 4, "shared_scales": [{}]}):
+        score = evaluate_poses(finished, record | {"covariance": covariance}, truth, TruthOptions()).record["poses"]
+        assert score["nees"] is None
+        assert "lacks the errors" in score["reason"]
 
 
 def test_run_json_says_what_was_run_and_how_it_went(finished: Path, drive: Demo) -> None:

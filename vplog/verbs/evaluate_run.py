@@ -242,13 +242,15 @@ def relative_to_references(
     from vplog.graph.marginals import SharedScale, relative_covariances
     from vplog.graph.variance_components import Sigmas, claimed_times
 
-    shared, count = record.get("covariance"), len(world_from_body)
-    if shared is None:
-        raise GraphError("an older vplog wrote this run without the errors that edges share. Run `vplog run` again.")
+    count = len(world_from_body)
     references = np.unique(np.linspace(0, count - 1, min(count, _MAX_REFERENCES)).astype(np.int64)).tolist()
     graph, weight, _ = tables.read_edges(folder / "edges.parquet", world_from_body)
-    graph = claimed_times(graph, Sigmas(*shared["sigma_factors"]))
-    scales = [SharedScale.of(scale, len(weight)) for scale in shared["shared_scales"]]
+    try:
+        shared = record["covariance"]
+        graph = claimed_times(graph, Sigmas(*shared["sigma_factors"]))
+        scales = [SharedScale.of(scale, len(weight)) for scale in shared["shared_scales"]]
+    except (KeyError, TypeError, ValueError) as error:  # such as a run of an older vplog
+        raise GraphError("run.json lacks the errors that edges share. Run `vplog run` again.") from error
     return references, relative_covariances(Objective(Factors.of(graph), weight), world_from_body, references, scales)
 
 
