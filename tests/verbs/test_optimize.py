@@ -198,7 +198,7 @@ def test_noise_that_is_not_as_claimed_is_said_and_the_least_squares_are_the_file
     done = optimize(tmp_path / "in.g2o", tmp_path / "out.g2o")
     assert any("not as the information claims" in text for text in done.record["warnings"]) == warned
     [sigmas] = done.record["sigmas"]
-    assert sigmas["translation"] * claimed == pytest.approx(1.0, rel=0.4)
+    assert sigmas["rotation"] * claimed == pytest.approx(1.0, rel=0.4)
     weight, poses = done.solution.weight, done.solution.world_from_body
     assert done.record["error_after"] == pytest.approx(lm.half_chi2(done.file.graph, weight, poses))
 
