@@ -102,7 +102,8 @@ def _residual(graph: PoseGraph, edges: Ints, poses: Floats) -> tuple[Floats, Flo
 
 
 def _curve(angle2: Floats) -> Floats:
-    """Return (1 - h cot h) / angle^2 with h = angle / 2, from the squared angle."""
+    """Return the factor of [omega]^2 in the inverse of the left Jacobian of SO(3), (1 - h cot h) / angle^2 with
+    h = angle / 2, for squared angles (E,)."""
     large = np.where(angle2 > 1e-2, angle2, 1.0)
     half = np.sqrt(large) / 2.0
     series = 1.0 / 12.0 + angle2 / 720.0 + angle2**2 / 30240.0 + angle2**3 / 1209600.0

@@ -35,7 +35,8 @@ _MOST_INFORMATION = 1e4
 _KNOWN = 10.0
 """Information of an axis that a closure knows, as a multiple of what is known of any."""
 _CLAIMS = (1.0, 10.0, 100.0)
-"""Factors of the claimed noise with which graduated non-convexity is tried: claims may be far too small."""
+"""Factors by which the claimed noise is multiplied in the proposals of graduated non-convexity. If claims are far too
+small, it rejects all closures with the claims themselves."""
 STEADY = 0.05
 """Change of a noise factor, as a share, below which it is settled."""
 _LEAST_NOISE = Sigmas(0.25, 0.25, 1.0, 1.0)

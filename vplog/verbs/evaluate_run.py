@@ -235,8 +235,11 @@ def evaluate_poses(
 def relative_to_references(
     folder: Path, record: dict[str, Any], world_from_body: Floats
 ) -> tuple[list[int], Iterator[Floats]]:
-    """Return reference keyframes, spread evenly over a run, and the covariances (N, 6, 6) of all keyframes relative to
-    each. Raises GraphError if the run has no record of shared errors or its edges do not determine the poses."""
+    """Return the rows of reference keyframes, and for each the covariances (N, 6, 6) of all keyframes relative to it.
+
+    The references are spread evenly over the run. Raises GraphError if run.json has no record of shared errors, or if
+    the edges do not determine the poses.
+    """
     from vplog.graph.factors import Factors
     from vplog.graph.least_squares import Objective
     from vplog.graph.marginals import SharedScale, relative_covariances
