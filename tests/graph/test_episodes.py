@@ -1,4 +1,4 @@
-"""The prior of closures and the likelihood of false ones, against densities that are written out."""
+"""The prior of closures and of families of false ones, against probabilities that are written out."""
 
 from __future__ import annotations
 
@@ -26,30 +26,33 @@ def episodes_of(loops: int, seed: int = 0, log_odds: float | None = None) -> Epi
     return Episodes.of(graph, edges, OdometryChain.of(graph), (VOLUME, VIEW), odds)
 
 
+def prior(episodes: Episodes, *is_false: bool) -> float:
+    states = np.array(is_false)
+    return episodes.log_prior(states, episodes.family(states))
+
+
 def test_a_single_closure_is_true_or_anywhere_in_the_volume() -> None:
     episodes = episodes_of(1)
-    assert episodes.log_density(np.array([False]))[0] == pytest.approx(math.log(np.mean(1.0 - SHARES)))
-    expected = math.log(np.mean(SHARES) * (1.0 - REPEATED)) - VOLUME
-    assert episodes.log_density(np.array([True]))[0] == pytest.approx(expected)
+    assert prior(episodes, False) == pytest.approx(math.log(np.mean(1.0 - SHARES)))
+    assert prior(episodes, True) == pytest.approx(math.log(np.mean(SHARES) * (1.0 - REPEATED)) - VOLUME)
 
 
 def test_recognition_gives_the_prior_of_an_episode() -> None:
     for p_false in (0.01, 0.3):
         episodes = episodes_of(1, log_odds=math.log(p_false / (1.0 - p_false)))
-        assert episodes.log_density(np.array([False]))[0] == pytest.approx(math.log(1.0 - p_false))
+        assert prior(episodes, False) == pytest.approx(math.log(1.0 - p_false))
 
 
 def test_two_false_closures_continue_repeat_or_are_independent() -> None:
-    """Against the density of the second displacement given the first, written out."""
     episodes = episodes_of(2, seed=3)
-    error, covariance = episodes.claims.apart(np.array([0]), np.array([1]))
-    log_normal = -0.5 * (se3.mahalanobis2(error, covariance)[0] + np.linalg.slogdet(2.0 * np.pi * covariance[0])[1])
-    stays, alone = episodes.continues[1], (1.0 - REPEATED) * math.exp(-VOLUME)
+    stays, alone, both = episodes.continues[1], (1.0 - REPEATED) * math.exp(-VOLUME), np.array([True, True])
     begins = (1.0 - stays) * SHARES
-    second = stays * ((1.0 - SCATTERED) * math.exp(log_normal) + SCATTERED * math.exp(-VIEW))
-    second += begins * (REPEATED * math.exp(log_normal) + alone)
-    expected = math.log(np.mean(SHARES * alone * second))
-    assert episodes.log_density(np.array([True, True]))[0] == pytest.approx(expected, rel=1e-6)
+    for family, second in (
+        ([0, 0], stays * (1.0 - SCATTERED) + begins * REPEATED),
+        ([0, 1], stays * SCATTERED * math.exp(-VIEW) + begins * alone),
+    ):
+        expected = math.log(np.mean(SHARES * alone * second))
+        assert episodes.log_prior(both, np.array(family)) == pytest.approx(expected)
 
 
 def test_the_distance_of_episodes_is_that_of_the_nearest_earlier_closure() -> None:
@@ -78,7 +81,7 @@ def test_a_false_displacement_becomes_unlikely_with_the_path_that_it_covers() ->
         graph = late_revisit(spacing, 1e-6, 0, 2)
         edges = np.flatnonzero(is_loop(graph))[:11]
         episodes = Episodes.of(graph, edges, OdometryChain.of(graph), (VOLUME, VIEW), None)
-        true, false = (episodes.log_density(np.full(11, state))[0] for state in (False, True))
+        true, false = (prior(episodes, *[state] * 11) for state in (False, True))
         odds.append(true - false)
     assert odds[0] + 3.0 < odds[1] < odds[2] - 1.0
 
@@ -98,5 +101,5 @@ def test_false_closures_are_compared_on_corrected_poses() -> None:
     )  # fmt: skip
     episodes = Episodes.of(graph, np.array([59, 60]), OdometryChain.of(graph), (VOLUME, VIEW), None)
     both = np.array([True, True])
-    assert episodes.log_density(both)[1].tolist() == [0, 1]
-    assert episodes.log_density(both, true)[1].tolist() == [0, 0]
+    assert episodes.family(both).tolist() == [0, 1]
+    assert episodes.family(both, true).tolist() == [0, 0]

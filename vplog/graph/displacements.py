@@ -23,13 +23,13 @@ class Displacements:
     def __init__(self, graph: PoseGraph, loops: Ints, chain: OdometryChain) -> None:
         """Take the edges `loops` (K,) of the graph; `chain` is the graph's odometry."""
         back = (graph.a[loops] > graph.b[loops])[:, None, None]
-        self.axes = AXES[graph.dimension]
+        self.edges, self.axes = loops, AXES[graph.dimension]
         self.a = np.minimum(graph.a[loops], graph.b[loops]).astype(np.int64)
         self.b = np.maximum(graph.a[loops], graph.b[loops]).astype(np.int64)
         noise = np.linalg.inv(informed(graph, loops))
-        Ad = self._adjoint(graph.a_from_b[loops])
-        self._noise = np.where(back, Ad @ noise @ np.swapaxes(Ad, 1, 2), noise)  # in the frame of the later pose
-        self._measured = np.where(back, se3.inverse(graph.a_from_b[loops]), graph.a_from_b[loops])
+        Ad = self.adjoint(graph.a_from_b[loops])
+        self.noise = np.where(back, Ad @ noise @ np.swapaxes(Ad, 1, 2), noise)  # in the frame of the later pose
+        self.measured = np.where(back, se3.inverse(graph.a_from_b[loops]), graph.a_from_b[loops])
         self._place(chain)
 
     def on(self, poses: Floats) -> Displacements:
@@ -40,16 +40,16 @@ class Displacements:
 
     def _place(self, chain: OdometryChain) -> None:
         self.chain = chain
-        at_a, at_b = (se3.between(chain.poses[:1], chain.poses[end]) for end in (self.a, self.b))
-        self.displaced = at_a @ self._measured @ se3.inverse(at_b)
+        self.at_a, self.at_b = (se3.between(chain.poses[:1], chain.poses[end]) for end in (self.a, self.b))
+        self.displaced = self.at_a @ self.measured @ se3.inverse(self.at_b)
         """(K, 4, 4) about the first pose."""
-        Ad = self._adjoint(at_b)
-        self.own = np.ascontiguousarray(Ad @ self._noise @ np.swapaxes(Ad, 1, 2))
+        Ad = self.adjoint(self.at_b)
+        self.own = np.ascontiguousarray(Ad @ self.noise @ np.swapaxes(Ad, 1, 2))
         """(K, d, d) covariance of the closure's own noise, about the first pose."""
-        self.after = np.ascontiguousarray(self._adjoint(se3.inverse(self.displaced)))
+        self.after = np.ascontiguousarray(self.adjoint(se3.inverse(self.displaced)))
         """(K, d, d) moves the odometry's noise at a into the frame of the displacement."""
 
-    def _adjoint(self, poses: Floats) -> Floats:
+    def adjoint(self, poses: Floats) -> Floats:
         return se3.adjoint(poses)[:, self.axes][:, :, self.axes]
 
     def apart(self, first: Ints, second: Ints) -> tuple[Floats, Floats]:

@@ -1,4 +1,4 @@
-"""Prior of which closures are true, and likelihood of the false ones: episodes along the path.
+"""Prior of which closures are true and which false ones belong together: episodes along the path.
 
 Neighbouring keyframes look alike, so closures come in episodes. An episode has one cause: the place is revisited, or it
 is mistaken for another one. Between a closure and its nearest earlier one, l keyframes away, the episode continues with
@@ -34,8 +34,9 @@ SCATTERED = 0.1
 that only look alike may fit several poses."""
 SHARES = np.linspace(0.05, 0.95, 10)
 """Values of phi, equally likely, if recognition does not tell how likely a closure is false."""
-_FAMILIES = 50
-"""Number of latest families that a new false episode may repeat; bounds the work for thousands of false closures."""
+MOST_FAMILIES = 50
+"""Number of latest families that a new false episode may repeat, and of families with a displacement of their own. It
+bounds the work for thousands of false closures."""
 _FAR = 40.0
 """Half the chi-square, above the log of the volume, from which a displacement surely belongs to another family."""
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -81,36 +82,60 @@ class Episodes:
         continues = np.exp(-np.maximum(gap, 1.0) / EPISODE)  # two closures of one pair of keyframes may differ, too
         return cls(edges, nearest, continues, share, *log_volumes, claims)
 
-    def log_density(self, is_false: Bools, poses: Floats | None = None) -> tuple[float, Ints]:
-        """Return log P(states) + log p(false closures) if `is_false` (K,) are false, and the family of each (K,).
+    def family(self, is_false: Bools, poses: Floats | None = None, resolution: float = 1.0) -> Ints:
+        """Return the number of the family of each closure (K,) if `is_false` (K,) are false; -1 for true ones.
 
-        Closures of one family claim one displacement; -1 stands for a true closure. Displacements are those on `poses`
-        (N, 4, 4), which true closures may have corrected; by default those of the odometry.
+        Closures of one family claim one displacement on `poses` (N, 4, 4), which true closures may have corrected; by
+        default on those of the odometry. `resolution` multiplies the odometry's noise.
         """
         claims = self.claims if poses is None or not is_false.any() else self.claims.on(poses)
         K, d = len(self.edges), len(claims.axes)
         family, (first, last, size) = np.full(K, -1), np.zeros((3, K), np.int64)
-        continued, repeated = np.zeros((2, K))
-        stays = np.where(self.nearest >= 0, self.continues, 0.0)[:, None]
-        begins = (1.0 - stays) * self.false_share
+        begins = (1.0 - self._stays) * self.false_share[:, self.false_share.shape[1] // 2]
         alone, scattered = (1.0 - REPEATED) * math.exp(-self.log_volume), SCATTERED * math.exp(-self.log_view)
         _track(
-            np.flatnonzero(is_false), self.nearest, self.continues, begins[:, begins.shape[1] // 2], alone, scattered,
+            np.flatnonzero(is_false), self.nearest, self.continues, begins, alone, scattered,
             self.log_volume + _FAR, claims.a, claims.b, claims.chain.part, np.array(claims.axes), claims.displaced,
-            claims.own, claims.after, claims.chain.total, np.zeros((K, d)), claims.own.copy(),
-            np.empty((4, d, d + 2)), first, last, size, family, continued, repeated,
+            claims.own, claims.after, resolution**2 * claims.chain.total, np.zeros((K, d)), claims.own.copy(),
+            np.empty((4, d, d + 2)), first, last, size, family,
         )  # fmt: skip
-        goes_on = np.where((family[self.nearest] == -1)[:, None], stays, 0.0)
-        if_true = goes_on + (1.0 - stays) * (1.0 - self.false_share)
-        if_false = continued[:, None] + begins * (alone + REPEATED * repeated[:, None])
-        of_share = np.log(np.where(is_false[:, None], if_false, if_true) + 1e-300).sum(0)
+        small = np.flatnonzero(is_false & (np.argsort(np.argsort(-size, kind="stable"))[family] >= MOST_FAMILIES))
+        family[small] = K + np.arange(len(small))  # each by itself
+        return family
+
+    def log_prior(self, is_false: Bools, family: Ints) -> float:
+        """Return log P(states, families), with the density of the first displacement of each family.
+
+        `is_false` (K,) are the false closures, and `family` (K,) is as `self.family` returns it.
+        """
+        false = np.flatnonzero(is_false)
+        earlier, members = np.zeros((2, len(is_false)))  # earlier false closures, and those of the same family
+        earlier[false] = np.arange(len(false))
+        by_family = false[np.argsort(family[false], kind="stable")]
+        begin = np.searchsorted(family[by_family], family[by_family])
+        members[by_family] = np.arange(len(by_family)) - begin
+        follows = is_false[self.nearest] & (self.nearest >= 0)
+        same = follows & (family[self.nearest] == family)
+        # if the episode of the nearest earlier closure continues, and if another one begins
+        new = SCATTERED * math.exp(-self.log_view) * (members == 0)
+        continues = np.where(is_false, np.where(same, 1.0 - SCATTERED, new) * follows, ~follows)
+        repeats = REPEATED * members / np.maximum(earlier, 1.0)
+        alone = (1.0 - REPEATED) * math.exp(-self.log_volume)
+        begins = np.where(is_false, np.where(members > 0, repeats, alone), 1.0)[:, None]
+        begins = begins * np.where(is_false[:, None], self.false_share, 1.0 - self.false_share)
+        stays = self._stays[:, None]
+        of_share = np.log(stays * continues[:, None] + (1.0 - stays) * begins + 1e-300).sum(0)
         most = of_share.max()
-        return float(most + np.log(np.exp(of_share - most).mean())), family
+        return float(most + np.log(np.exp(of_share - most).mean()))
+
+    @property
+    def _stays(self) -> Floats:
+        return np.where(self.nearest >= 0, self.continues, 0.0)
 
     @cached_property
     def families(self) -> Ints:
         """(K,) number of the family that each closure is of if all are false."""
-        return self.log_density(np.ones(len(self.edges), bool))[1]
+        return self.family(np.ones(len(self.edges), bool))
 
 
 def _nearest_before(a: Ints, b: Ints, part: Ints) -> tuple[Ints, Floats]:
@@ -133,7 +158,7 @@ def _track(
     false: Ints, nearest: Ints, continues: Floats, begins: Floats, alone: float, scattered: float, most: float,
     a: Ints, b: Ints, part: Ints, axes: Ints, displaced: Floats, own: Floats, after: Floats, total: Floats,
     mean: Floats, covariance: Floats, room: Floats,
-    first: Ints, last: Ints, size: Ints, family: Ints, continued: Floats, repeated: Floats,
+    first: Ints, last: Ints, size: Ints, family: Ints,
 ) -> None:  # fmt: skip
     """Write the family (K,) of the closures `false`, and the densities (K,) if each continues or repeats a family.
 
@@ -147,9 +172,8 @@ def _track(
         stay, before = 0.0, -1
         if nearest[k] >= 0:
             stay, before = continues[k], family[nearest[k]]
-        continued[k] = stay * scattered if before >= 0 else 0.0
-        chosen, best, slot = count, begins[k] * alone + continued[k], 0
-        begin = max(0, count - _FAMILIES)
+        chosen, best, slot = count, begins[k] * alone + (stay * scattered if before >= 0 else 0.0), 0
+        begin = max(0, count - MOST_FAMILIES)
         members = 0
         for f in range(begin, count):
             members += size[f]
@@ -168,11 +192,8 @@ def _track(
             joint = 0.0
             if f == before:
                 joint = density * stay * (1.0 - SCATTERED)
-                continued[k] += joint
             if at >= begin:
-                density *= size[f] / members
-                repeated[k] += density
-                joint = max(joint, density * begins[k] * REPEATED)
+                joint += density * begins[k] * REPEATED * size[f] / members
             if joint > best:
                 chosen, best, slot = f, joint, 1 - slot
         if chosen == count:

@@ -26,6 +26,7 @@ _DAMPING = 1e-5
 _DAMPING_CHANGE = 10.0
 _MOST_DAMPING = 1e5
 """Damping at which it gives up, as in GTSAM."""
+_NONE = np.empty(0, np.int64)
 _ROWS = 1 << 14
 """Poses that a thread moves at once, some megabytes."""
 
@@ -129,14 +130,18 @@ class Objective:
     def _measured(self) -> list[Positions]:
         return [one for one in (self.positions, self.verticals) if one is not None]
 
-    def factorised(self, matrix: Blocks, damping: float) -> Cholesky:
-        """Pose 0 is held, and the first pose of each part that no edge of positive weight joins to it."""
+    def factorised(self, matrix: Blocks, damping: float, others: Ints = _NONE) -> Cholesky:
+        """Factorise a matrix that has blocks of the edges of positive weight and of `others`.
+
+        Pose 0 is held, and the first pose of each part that no edge of positive weight joins to it."""
         diagonal, axes = matrix.diagonal.copy(), np.arange(matrix.diagonal.shape[1])
         held = np.concatenate([[0], self.factors.loose(self.weight)]).astype(np.int64)
         diagonal[:, axes, axes] += damping
         sigma = GAUGE_SIGMA if self.positions is None else _FREE_SIGMA
         diagonal[held[:, None], axes, axes] += 1.0 / sigma**2
-        return Cholesky.of(self.factors.elimination(self.weight > 0), matrix._replace(diagonal=diagonal))
+        on = self.weight > 0
+        on[others] = True
+        return Cholesky.of(self.factors.elimination(on), matrix._replace(diagonal=diagonal))
 
     def information(self, poses: Floats) -> Cholesky:
         """The information matrix at `poses` (N, 4, 4). Raises GraphError where these are not determined."""

@@ -1,30 +1,37 @@
 """Posterior density of a set of true closures: the objective of the decision.
 
-log p(T, s | z) = log p(z_T | odometry, s) + log p(z_F) + log P(T) + log p(s), up to a constant. T are the true closures
-and F the false ones, s the factors of the claimed noise (`Sigmas`). The first term integrates over the poses (Laplace's
-approximation, exact for a linear graph). `Episodes` has the second and the third term.
+log p(T, f, s, u | z) = log p(z | T, f, o, s, u) + log P(T, f) + log p(s) + log P(u), up to a constant. T are the true
+closures, f the families of the false ones, o the odometry, s the factors of the claimed noise (`Sigmas`), and u the
+states of the odometry's steps (`Slipping`). `Likelihood` has the first term and `Episodes` the second one.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vplog.data import Floats, Ints
+from vplog.data import Bools, Floats, Ints
 from vplog.graph.build import informed
-from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, odometry_chain, residual_sigma
+from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, odometry_chain
 from vplog.graph.episodes import Episodes
 from vplog.graph.factors import Factors
+from vplog.graph.false_families import Explained, Likelihood
 from vplog.graph.false_volume import log_false_volumes
-from vplog.graph.least_squares import GAUGE_SIGMA, Objective, descend
+from vplog.graph.least_squares import descend
 from vplog.graph.leave_one_out import distance, tension
 from vplog.graph.slips import Slipping
-from vplog.graph.variance_components import Sigmas, claimed_times
+from vplog.graph.variance_components import Sigmas, claimed_times, likeliest
 
 STEPS, TOLERANCE = 100, 1e-4
 """Limits of the least squares that compare hypotheses."""
+LEAST_GROUP = 3
+"""Smallest number of closures in a family that is proposed, and in a group that may show a slip."""
+RESOLUTIONS = (4.0, 1.0, 0.25)
+"""Factors of the odometry's noise at which families are told apart at first: where much noise makes displacements
+vague, or little noise makes them differ, more families begin. Families that agree are merged, none is divided."""
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
@@ -37,8 +44,12 @@ class Hypothesis:
     poses: Floats
     """(N, 4, 4)."""
     sigmas: Sigmas
-    log_density: float
     slipping: Slipping
+    resolution: float
+    """The one of RESOLUTIONS that told its false families apart."""
+    log_density: float
+    family: Ints
+    """(K,) number of the false family of each closure of the episodes, -1 for true ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,47 +70,59 @@ class Posterior:
         slipping = slipping or Slipping.nowhere(claimed.graph)
         slipped = slipping.applied(claimed.graph, sigmas)
         sound, graph = claimed_times(claimed.graph, sigmas), claimed_times(slipped, sigmas)
-        of_false = claimed_times(slipped, Sigmas(*sigmas[:2]))  # the noise of true closures is not that of false ones
         log_volumes = log_false_volumes(sound, odometry_chain(sound)[0])  # the same for all states of the odometry
         loops, chain = np.flatnonzero(is_loop(graph)), OdometryChain.of(graph)
-        episodes = Episodes.of(of_false, loops, chain, log_volumes, log_odds)
+        episodes = Episodes.of(graph, loops, chain, log_volumes, log_odds)
         return cls(sigmas, replace(claimed, graph=graph), episodes, slipping)
 
-    def hypothesis(self, weight: Floats, poses: Floats) -> Hypothesis:
-        """Solve the edges of weight (E,) 1 from `poses`. Raises GraphError if these are not determined."""
+    def hypothesis(self, weight: Floats, poses: Floats, resolutions: Sequence[float] = RESOLUTIONS) -> Hypothesis:
+        """Solve the edges of weight (E,) 1 from `poses`, and find the likeliest false families at the `resolutions`.
+
+        Raises GraphError if the poses are not determined.
+        """
         if (weight[~self.factors.graph.odometry] > 0).any():
             poses = descend(self.factors, weight, poses, STEPS, TOLERANCE).world_from_body
-        return Hypothesis(weight, poses, self.sigmas, self.log_density(weight, poses), self.slipping)
+        is_false, claims = weight[self.episodes.edges] == 0, self.episodes.claims.on(poses)
+        likelihood, found = Likelihood(self.factors, weight, poses), dict[bytes, Hypothesis]()
+        for resolution in resolutions:
+            family = self.episodes.family(is_false, poses, resolution)
+            if family.tobytes() not in found:
+                best = self._merged(weight, is_false, likelihood.explained(claims, family))
+                found[family.tobytes()] = Hypothesis(weight, poses, self.sigmas, self.slipping, resolution, *best)
+        return max(found.values(), key=lambda one: one.log_density)
 
-    def log_density(self, weight: Floats, poses: Floats) -> float:
-        """Return the log of the posterior density; `poses` are the least squares of the edges of weight (E,) 1."""
-        density, _ = self.episodes.log_density(weight[self.episodes.edges] == 0, poses)
-        true = np.flatnonzero(~self.factors.graph.odometry & (weight > 0))
-        density += self.sigmas.log_prior() + self.slipping.log_prior
-        return density + (self._log_true(weight, poses, true) if len(true) else 0.0)
+    def _merged(self, weight: Floats, is_false: Bools, explained: Explained | None) -> tuple[float, Ints]:
+        """Merge families as long as that raises the log density. Return it and the family (K,) of each closure."""
+        best = -math.inf, np.empty(0, np.int64)
+        while explained is not None:
+            log_density = self._prior(weight, is_false, explained.family) + explained.log_density
+            if log_density <= best[0]:
+                break
+            best, explained = (log_density, explained.family), explained.merged()
+        return best
 
-    def _log_true(self, weight: Floats, poses: Floats, true: Ints) -> float:
-        """Log density of the true closures under the odometry: N(0, A C A^T + R) by the matrix determinant lemma."""
-        factors, graph = self.factors, self.factors.graph
-        d = degrees_of_freedom(graph)
-        loose = len(factors.loose(weight))
-        held = (1 + loose) * d * -2.0 * math.log(GAUGE_SIGMA)
-        joined = int(factors.piece.max()) - loose  # pieces of odometry that only closures join may be anywhere
-        determinant = Objective(factors, weight).information(poses).log_determinant() - held
-        known = np.linalg.slogdet(informed(graph, weight > 0))[1].sum()
-        chi2 = weight * residual_sigma(graph, poses) ** 2
-        normal = 0.5 * (known - determinant - chi2.sum()) - 0.5 * _LOG_2PI * d * (len(true) - joined)
-        return float(normal) - joined * self.episodes.log_volume
+    def noise(self, one: Hypothesis) -> Sigmas:
+        """Return the likeliest noise factors if the hypothesis is right."""
+        likelihood, claims = Likelihood(self.factors, one.weight, one.poses), self.episodes.claims.on(one.poses)
+        residuals, closures = likelihood.residuals(claims, one.family)
+        graph = self.factors.graph
+        return likeliest(graph, residuals, float(degrees_of_freedom(graph) * closures), 0.0, self.sigmas)
+
+    def _prior(self, weight: Floats, is_false: Bools, family: Ints) -> float:
+        joined = int(self.factors.piece.max()) - len(self.factors.loose(weight))
+        of_states = self.episodes.log_prior(is_false, family) - joined * self.episodes.log_volume
+        return of_states + self.sigmas.log_prior() + self.slipping.log_prior
 
     def most_gain(self, one: Hypothesis, group: Ints) -> float:
         """Return the most by which the log density can rise if the false closures `group` of the episodes are true: if
         all others predict them exactly."""
-        is_false = one.weight[self.episodes.edges] == 0
-        changed = np.array(is_false)
-        changed[group] = False
-        states = self.episodes.log_density(changed)[0] - self.episodes.log_density(is_false)[0]
-        known = np.linalg.slogdet(informed(self.factors.graph, self.episodes.edges[group]))[1].sum()
-        return states + float(0.5 * (known - len(group) * degrees_of_freedom(self.factors.graph) * _LOG_2PI))
+        is_false, family = one.weight[self.episodes.edges] == 0, np.array(one.family)
+        is_false[group], family[group] = False, -1
+        graph, edges = self.factors.graph, self.episodes.edges[group]
+        exact = 0.5 * np.linalg.slogdet(informed(graph, edges) / (2.0 * math.pi))[1].sum()
+        likelihood, claims = Likelihood(self.factors, one.weight, one.poses), self.episodes.claims.on(one.poses)
+        rest = likelihood.explained(claims, family).log_density
+        return self._prior(one.weight, is_false, family) + rest + float(exact) - one.log_density
 
     def log_predictive(self, one: Hypothesis) -> Floats:
         """Return the log density (K,) of each closure given the true ones without it, in the order of the episodes."""
@@ -113,3 +136,11 @@ class Posterior:
             result[true] = -0.5 * found.cost
             result[true] -= np.minimum(found.log_spread + 0.5 * d * _LOG_2PI, self.episodes.log_volume)
         return result
+
+    def log_undisplaced(self, one: Hypothesis, groups: list[Ints]) -> Iterator[float]:
+        """Yield the log density that each group of true closures has no displacement, as a false one would have.
+
+        Closures of a false group predict each other, so that no single one of them is unlikely.
+        """
+        claims, likelihood = self.episodes.claims.on(one.poses), Likelihood(self.factors, one.weight, one.poses)
+        return (likelihood.log_undisplaced(claims, group) for group in groups)
