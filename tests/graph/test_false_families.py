@@ -24,13 +24,13 @@ FALSE = np.array([0, 0, 0, 1, 1, 1])
 LOG_2PI = float(np.log(2.0 * np.pi))
 
 
-def displaced_graph(seed: int, family: np.ndarray, noise: float = 1.0) -> PoseGraph:
+def displaced_graph(seed: int, family: np.ndarray) -> PoseGraph:
     """A ring with four true closures and families (6,) of false ones."""
     graph, random = ring(60, 4, seed=seed).graph, np.random.default_rng(seed)
     shifts = se3.exp(np.array([[0.0, 0, 0.3, 8.0, 3.0, 0.0], [0.0, 0, -0.2, -6.0, 5.0, 0.0]]))
     true, sigma = graph.world_from_body, 1.0 / np.sqrt(np.diagonal(graph.information[-1]))
     measured = np.array([
-        se3.inverse(true[a]) @ shifts[number] @ true[b] @ se3.exp(noise * (sigma * random.normal(size=6))[None])[0]
+        se3.inverse(true[a]) @ shifts[number] @ true[b] @ se3.exp((sigma * random.normal(size=6))[None])[0]
         for (a, b), number in zip(PAIRS, family, strict=True)
     ])  # fmt: skip
     a, b = np.array(PAIRS, np.int32).T
@@ -115,18 +115,3 @@ def test_merged_families_are_as_likely_as_one_family() -> None:
     assert merged.displacement == pytest.approx(one.displacement, abs=0.02)
     assert merged.covariance == pytest.approx(one.covariance, rel=0.05, abs=1e-3)
     assert merged.merged() is None
-
-
-def test_false_families_show_the_noise_of_closures() -> None:
-    """With noise three times as large as claimed, the mean square residual of closures is nine times its redundancy."""
-    ratios = []
-    for seed in range(20):
-        likelihood, claims, _, _ = explained(displaced_graph(seed, FALSE, noise=3.0))
-        residuals, closures = likelihood.residuals(claims, FALSE)
-        assert closures == 4 + len(PAIRS) - 2
-        false = np.arange(len(residuals.error)) >= len(residuals.error) - len(PAIRS)
-        chi2 = se3.mahalanobis2(residuals.error, residuals.claimed)[false].sum()
-        trusted = np.einsum("nij,nji->n", np.linalg.inv(residuals.claimed), residuals.predicted)[false]
-        ratios.append((chi2, (6.0 - trusted).sum()))
-    chi2, redundancy = np.sum(ratios, axis=0)
-    assert 4.0 < chi2 / redundancy < 12.0

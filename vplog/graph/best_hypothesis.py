@@ -135,6 +135,8 @@ class _WithSlips:
 
     def _refit(self, slipping: Slipping, one: Hypothesis) -> list[Hypothesis]:
         """The closures of a hypothesis with other states of the steps and the noise that they imply."""
+        if not one.weight[is_loop(self.sound.claimed.graph)].any():
+            return self._solved(slipping, one)
         search = self.sound.with_slips(slipping)
         return attempted(lambda: search.refit(one.weight, one.poses, one.sigmas))
 

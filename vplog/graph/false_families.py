@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -17,12 +16,11 @@ import numpy as np
 from vplog.data import Floats, Ints
 from vplog.geometry import se3
 from vplog.graph.build import informed
-from vplog.graph.consistency import degrees_of_freedom, residual_sigma, residual_twists
+from vplog.graph.consistency import degrees_of_freedom, residual_sigma
 from vplog.graph.displacements import Displacements
 from vplog.graph.factors import Factors
 from vplog.graph.least_squares import GAUGE_SIGMA, Objective
-from vplog.graph.sparse.cholesky import Blocks, Cholesky, inverse_blocks
-from vplog.graph.variance_components import Residuals
+from vplog.graph.sparse.cholesky import Blocks, Cholesky
 
 _LOG_2PI = math.log(2.0 * math.pi)
 
@@ -59,57 +57,6 @@ class Likelihood:
         numbers = np.unique(family[false.members])
         displacement = _displaced(false.displacement, step, claims.axes)
         return Explained(log_density, family, numbers, displacement, covariance, claims.axes)
-
-    def residuals(self, claims: Displacements, family: Ints) -> tuple[Residuals, int]:
-        """Return the residuals of the edges of weight 1 and of the closures in false families.
-
-        The second value is the number of true closures and of those in families, less one for each family. Arguments
-        are those of `explained`.
-        """
-        graph, axes, poses = self._objective.factors.graph, claims.axes, claims.chain.poses
-        edges, false = np.flatnonzero(self._objective.weight), _Families.of(claims, family)
-        factor, normal = self._eliminated(false)
-        covariance, F, d = np.linalg.inv(normal.information), len(false.displacement), len(axes)
-        step = -covariance @ normal.pull
-        moved = -(normal.by_error + normal.by_displacement @ step)[:, :, None]
-
-        def predicted(a: Ints, b: Ints, by_a: Floats, by_displacement: Floats) -> tuple[Floats, Floats]:
-            """Change (K, d) and covariance (K, d, d) of by_a x_a + x_b + by_displacement D."""
-            along = by_displacement - by_a @ normal.by_displacement[a] - normal.by_displacement[b]
-            aa, ab, bb = inverse_blocks(factor, a, b)
-            spread = bb + by_a @ ab + np.swapaxes(by_a @ ab, 1, 2) + by_a @ aa @ np.swapaxes(by_a, 1, 2)
-            change = by_a @ moved[a] + moved[b] + by_displacement @ step[:, None]
-            return change[:, :, 0], spread + along @ covariance @ np.swapaxes(along, 1, 2)
-
-        a, b = graph.a[edges].astype(np.int64), graph.b[edges].astype(np.int64)
-        by_a = -se3.adjoint(se3.between(poses[b], poses[a]))[:, axes][:, :, axes]
-        change, spread = predicted(a, b, by_a, np.zeros((len(a), d, F * d)))
-        error, claimed = residual_twists(graph, poses, edges)[:, axes] + change, np.linalg.inv(informed(graph, edges))
-        if F:
-            by_displacement = np.zeros((len(false.members), d, F, d))
-            by_displacement[np.arange(len(false.members)), :, false.family] = false.by_displacement
-            by_displacement = by_displacement.reshape(len(false.members), d, F * d)
-            change, of_false = predicted(false.a, false.b, false.by_a, by_displacement)
-            error, spread = np.concatenate([error, false.error + change]), np.concatenate([spread, of_false])
-            claimed = np.concatenate([claimed, claims.noise[false.members]])
-        is_odometry = np.append(graph.odometry[edges], np.zeros(len(false.members), bool))
-        closures = int(np.count_nonzero(~is_odometry)) - F
-        return Residuals(is_odometry, np.ones(len(error)), error, np.asarray(claimed, np.float64), spread), closures
-
-    def log_undisplaced(self, claims: Displacements, group: Ints) -> float:
-        """Return the log density that true closures `group` (n,) have no displacement.
-
-        It is that of the displacement that they would have as a false family, at 0 (a score test).
-        """
-        family = _Families.about(claims, group, np.zeros(len(group), np.int64), np.eye(4)[None])
-        information = family.eliminated(self._factor).information
-        pull = family.pull()[0]  # the poses are least squares, so that nothing else pulls
-        chi2 = float(pull @ np.linalg.solve(information, pull))
-        return 0.5 * (float(np.linalg.slogdet(information)[1]) - chi2 - len(pull) * _LOG_2PI)
-
-    @cached_property
-    def _factor(self) -> Cholesky:
-        return self._objective.factorised(self._matrix, 0.0)
 
     def _eliminated(self, false: _Families) -> tuple[Cholesky, _Normal]:
         """The information of the poses with the families, and what is left without the poses."""
@@ -178,10 +125,6 @@ class _Normal(NamedTuple):
     """(F d,) derivative of half the chi-square."""
     gain: float
     """By how much the poses lower chi-square."""
-    by_displacement: Floats
-    """(N, d, F d) by how much the poses move against the displacements."""
-    by_error: Floats
-    """(N, d) by how much the poses move against the errors of the closures."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +169,7 @@ class _Families:
         """Return the same about the least squares of the closures' own noise."""
         if not len(self.displacement):
             return self
-        step = np.asarray(-np.linalg.solve(self._own(), self.pull()[:, :, None]), np.float64)
+        step = np.asarray(-np.linalg.solve(self._own(), self._pull()[:, :, None]), np.float64)
         displacement = _displaced(self.displacement, step, self.claims.axes)
         return self.about(self.claims, self.members, self.family, displacement)
 
@@ -242,8 +185,8 @@ class _Families:
     def chi2(self) -> float:
         return float(np.einsum("mi,mij,mj->", self.error, self.information, self.error))
 
-    def pull(self) -> Floats:
-        """Return the derivative (F, d) of half the chi-square by the displacements."""
+    def _pull(self) -> Floats:
+        """Derivative (F, d) of half the chi-square by the displacements."""
         by_error = self.information @ self.error[:, :, None]
         return self._summed(np.swapaxes(self.by_displacement, 1, 2) @ by_error)[:, :, 0]
 
@@ -271,23 +214,19 @@ class _Families:
         F, d, a, b, N = len(self.displacement), len(self.claims.axes), self.a, self.b, len(self.claims.chain.poses)
         weighted = self.information @ np.concatenate([self.by_displacement, self.error[:, :, None]], axis=2)
 
-        def solved(rows: Ints, pulls: Floats) -> Floats:
+        def seen(rows: Ints, pulls: Floats) -> Floats:
+            """By how much all closures see the poses move if these pull."""
             right = np.zeros((N, d, pulls.shape[2]))
             np.add.at(right, a[rows], np.swapaxes(self.by_a[rows], 1, 2) @ pulls)
             np.add.at(right, b[rows], pulls)
-            return factor.solve(right)
+            moved = factor.solve(right)
+            return np.swapaxes(weighted, 1, 2) @ (self.by_a @ moved[a] + moved[b])
 
-        moved, information = np.zeros((N, d, F, d)), np.zeros((F, d, F, d))
+        information = np.zeros((F, d, F, d))
         for family in range(F):
             rows = np.flatnonzero(self.family == family)
-            moved[:, :, family] = solved(rows, weighted[rows, :, :d])
-            seen = self.by_a @ moved[a, :, family] + moved[b, :, family]
-            information[:, :, family] = -self._summed(np.swapaxes(weighted[:, :, :d], 1, 2) @ seen)
+            information[:, :, family] = -self._summed(seen(rows, weighted[rows, :, :d])[:, :d])
         information[np.arange(F), :, np.arange(F)] += self._own()
-        by_error = solved(np.arange(len(a)), weighted[:, :, d:]) if F else np.zeros((N, d, 1))
-        seen = np.swapaxes(weighted, 1, 2) @ (self.by_a @ by_error[a] + by_error[b])
-        pull = (self.pull() - self._summed(seen[:, :d, 0])).ravel()
-        return _Normal(
-            information.reshape(F * d, F * d), pull, float(seen[:, d].sum()), moved.reshape(N, d, F * d),
-            by_error[:, :, 0],
-        )  # fmt: skip
+        by_error = seen(np.arange(len(a)), weighted[:, :, d:])[:, :, 0] if F else np.zeros((0, d + 1))
+        pull = self._pull() - self._summed(by_error[:, :d])
+        return _Normal(information.reshape(F * d, F * d), pull.ravel(), float(by_error[:, d].sum()))

@@ -8,7 +8,7 @@ states of the odometry's steps (`Slipping`). `Likelihood` has the first term and
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,15 +23,13 @@ from vplog.graph.false_volume import log_false_volumes
 from vplog.graph.least_squares import descend
 from vplog.graph.leave_one_out import distance, tension
 from vplog.graph.slips import Slipping
-from vplog.graph.variance_components import Sigmas, claimed_times, likeliest
+from vplog.graph.variance_components import Sigmas, claimed_times
 
 STEPS, TOLERANCE = 100, 1e-4
 """Limits of the least squares that compare hypotheses."""
-LEAST_GROUP = 3
-"""Smallest number of closures in a family that is proposed, and in a group that may show a slip."""
-RESOLUTIONS = (4.0, 1.0, 0.25)
-"""Factors of the odometry's noise at which families are told apart at first: where much noise makes displacements
-vague, or little noise makes them differ, more families begin. Families that agree are merged, none is divided."""
+RESOLUTIONS = (1.0, 0.25, 0.0625)
+"""Shares of the odometry's noise at which false families are told apart: the finer, the better the odometry or the more
+true closures correct it."""
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
@@ -101,13 +99,6 @@ class Posterior:
             best, explained = (log_density, explained.family), explained.merged()
         return best
 
-    def noise(self, one: Hypothesis) -> Sigmas:
-        """Return the likeliest noise factors if the hypothesis is right."""
-        likelihood, claims = Likelihood(self.factors, one.weight, one.poses), self.episodes.claims.on(one.poses)
-        residuals, closures = likelihood.residuals(claims, one.family)
-        graph = self.factors.graph
-        return likeliest(graph, residuals, float(degrees_of_freedom(graph) * closures), 0.0, self.sigmas)
-
     def _prior(self, weight: Floats, is_false: Bools, family: Ints) -> float:
         joined = int(self.factors.piece.max()) - len(self.factors.loose(weight))
         of_states = self.episodes.log_prior(is_false, family) - joined * self.episodes.log_volume
@@ -136,11 +127,3 @@ class Posterior:
             result[true] = -0.5 * found.cost
             result[true] -= np.minimum(found.log_spread + 0.5 * d * _LOG_2PI, self.episodes.log_volume)
         return result
-
-    def log_undisplaced(self, one: Hypothesis, groups: list[Ints]) -> Iterator[float]:
-        """Yield the log density that each group of true closures has no displacement, as a false one would have.
-
-        Closures of a false group predict each other, so that no single one of them is unlikely.
-        """
-        claims, likelihood = self.episodes.claims.on(one.poses), Likelihood(self.factors, one.weight, one.poses)
-        return (likelihood.log_undisplaced(claims, group) for group in groups)

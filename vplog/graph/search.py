@@ -18,11 +18,12 @@ from vplog.errors import GraphError
 from vplog.geometry import se3
 from vplog.graph.build import informed, parts, weakest_information
 from vplog.graph.consistency import OdometryChain, is_loop
-from vplog.graph.episodes import MOST_FAMILIES, Episodes
+from vplog.graph.episodes import Episodes
 from vplog.graph.factors import Factors
-from vplog.graph.posterior import LEAST_GROUP, RESOLUTIONS, Hypothesis, Posterior
+from vplog.graph.least_squares import Objective, descend
+from vplog.graph.posterior import RESOLUTIONS, STEPS, TOLERANCE, Hypothesis, Posterior
 from vplog.graph.slips import Slipping
-from vplog.graph.variance_components import Sigmas
+from vplog.graph.variance_components import Sigmas, claimed_times, estimate
 
 Cost = Callable[[Factors, Floats, Floats], float]
 """By how much the log likelihood of other measurements falls with factors, weights (E,) and poses (N, 4, 4)."""
@@ -44,6 +45,8 @@ themselves better than they are right. An estimate from that agreement would rej
 quarter of the odometry's claim is two standard deviations of the prior."""
 ROUNDS = 4
 """Largest number of rounds of two estimates that depend on each other, such as poses and noise. Two are usual."""
+LEAST_GROUP = 3
+"""Smallest number of closures in a family that is proposed, and in a group that may show a slip."""
 _FAMILIES = 2
 """Number of families that are proposed at each share."""
 TURNS = 30
@@ -103,30 +106,28 @@ class Search:
         return self.propose(self.at(sigmas).factors, is_loop(self.claimed.graph))
 
     def hypotheses(self) -> list[Hypothesis]:
-        """Return likely hypotheses. In the first, no closure is true."""
-        loops, chain = is_loop(self.claimed.graph), OdometryChain.of(self.at(Sigmas()).factors.graph)
-        found = list[Hypothesis]()
+        """Return likely hypotheses. In the first, no closure is true, with the likeliest noise of those found."""
+        posterior = self.at(Sigmas())
+        loops, chain = is_loop(self.claimed.graph), OdometryChain.of(posterior.factors.graph)
+        nothing, found = np.where(loops, 0.0, 1.0), list[Hypothesis]()
         for factor in _CLAIMS:
             noise = Sigmas(*[factor] * 4)
             annealed = attempted(lambda noise=noise: self.refit(*self.annealed(noise), noise))
             found += [self.improved(one) for one in annealed]
             if annealed and annealed[0].weight.all():
                 break
-        nothing = np.where(loops, 0.0, 1.0)
-        best = max(found, key=log_density, default=None)
-        if best is not None and best.weight.all():  # all agree, so that another set must be likelier as it is
-            posterior = self.at(best.sigmas)
-            none = posterior.hypothesis(nothing, chain.poses, RESOLUTIONS[:1])
-            starts = [none]
-            for weight in self._families(best, loops):
-                starts += attempted(lambda weight=weight: posterior.hypothesis(weight, chain.poses, RESOLUTIONS[:1]))
+        agree = bool(found) and max(found, key=log_density).weight.all()
+        resolutions = RESOLUTIONS[:1] if agree else RESOLUTIONS  # if all agree, it is clear that not all are false
+        none = posterior.hypothesis(nothing, chain.poses, resolutions)
+        best, starts = max([none, *found], key=log_density), [none]
+        for weight in self._families(best, loops):
+            starts += attempted(lambda weight=weight: self.refit(weight, chain.poses, Sigmas()))
+        if best.weight.all():  # it agrees as a whole, so no set that is less likely leads to a better one
             starts = [one for one in starts if one.log_density > best.log_density]
-        else:
-            none = self.refit(nothing, chain.poses, Sigmas())
-            starts = [none]
-            for weight in self._families(best or none, loops):
-                starts += attempted(lambda weight=weight: self.refit(weight, chain.poses, Sigmas()))
-        return [none, *found, *(self.improved(one) for one in starts)]
+        found += [self.improved(one) for one in starts]
+        others = dict.fromkeys(one.sigmas for one in found)  # nothing else tells the noise if no closure is true
+        none_at = [self.at(sigmas).hypothesis(nothing, chain.poses, resolutions) for sigmas in others]
+        return [max([none, *none_at], key=log_density), *found]
 
     def _families(self, best: Hypothesis, loops: Bools) -> Iterator[Floats]:
         """Weights (E,) of the largest families that may be true in place of the best set: those with a closure that it
@@ -146,15 +147,15 @@ class Search:
 
     def refit(self, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
         """Solve the edges of weight (E,) 1 and estimate the noise, in turns."""
-        resolutions = RESOLUTIONS
         for _ in range(ROUNDS):
-            posterior = self.at(sigmas)
-            one = posterior.hypothesis(weight, poses, resolutions)
-            noise = Sigmas(*np.maximum(posterior.noise(one), _LEAST_NOISE).tolist())
-            if not noise.differ(sigmas, STEADY):
-                return one
-            poses, sigmas, resolutions = one.poses, noise, (one.resolution,)
-        return self.at(sigmas).hypothesis(weight, poses, resolutions)
+            slipping = self.slipping.applied(self.claimed.graph, sigmas)
+            factors = replace(self.claimed, graph=claimed_times(slipping, sigmas))
+            poses = descend(factors, weight, poses, STEPS, TOLERANCE).world_from_body
+            before, sigmas = sigmas, estimate(Objective(factors, weight), poses, sigmas)
+            sigmas = Sigmas(*np.maximum(sigmas, _LEAST_NOISE).tolist())
+            if not sigmas.differ(before, STEADY):
+                break
+        return self.at(sigmas).hypothesis(weight, poses)
 
     def improved(self, best: Hypothesis) -> Hypothesis:
         """Flip closures, runs and families as long as the posterior rises; estimate the noise after each flip."""
@@ -164,39 +165,34 @@ class Search:
             if not flipped:
                 break
             best = flipped[0]
-            for again in attempted(lambda best=best: self.refit(best.weight, best.poses, best.sigmas)):
-                if again.log_density > best.log_density:
-                    best, posterior = again, self.at(again.sigmas)
+            if best.weight[is_loop(self.claimed.graph)].any():
+                for again in attempted(lambda best=best: self.refit(best.weight, best.poses, best.sigmas)):
+                    if again.log_density > best.log_density:
+                        best, posterior = again, self.at(again.sigmas)
         return best
 
     def _flipped(self, posterior: Posterior, best: Hypothesis) -> list[Hypothesis]:
         """A likelier hypothesis after one flip; none if no flip that is tried makes it likelier.
 
         First groups that join pieces are tried, then all promising flips together, then each of them.
-        What the flip of a large true group gains is foreseen from the displacement that it would have. Any other gain
-        is foreseen from the median closure of the group, because the others follow from one of them.
+        What a flip of a group gains is foreseen from its median closure, because the others of a group follow from one
+        of them, true or false.
         """
         episodes = posterior.episodes
         is_false = best.weight[episodes.edges] == 0
-        tried, flips = _joining(posterior, best), groups(episodes, is_false)
-        large = [k for k, group in enumerate(flips) if len(group) >= LEAST_GROUP and not is_false[group[0]]]
-        large = sorted(large, key=lambda k: -len(flips[k]))[:MOST_FAMILIES]
         try:
             log_predictive = posterior.log_predictive(best)
-            likely = [float(np.median(log_predictive[group])) for group in flips]
-            undisplaced = posterior.log_undisplaced(best, [flips[k] for k in large])
-            for k, value in zip(large, undisplaced, strict=True):
-                likely[k] = value
         except (GraphError, np.linalg.LinAlgError):
             return []
+        tried = _joining(posterior, best)
         promising: list[tuple[float, Ints]] = []
-        for log_true, group in zip(likely, flips, strict=True):
+        for group in groups(episodes, is_false):
             share = float(episodes.false_share[group].mean())
-            gain = log_true + episodes.log_volume + math.log((1.0 - share) / share)
+            gain = float(np.median(log_predictive[group])) + episodes.log_volume + math.log((1.0 - share) / share)
             promising.append((gain if is_false[group[0]] else -gain, group))
         promising.sort(key=lambda one: -one[0])
-        at_once = [group for gain, group in promising if gain > 0]
-        tried += [(np.unique(np.concatenate(at_once)), best.poses)] if len(at_once) > 1 else []
+        together = [group for gain, group in promising if gain > 0]
+        tried += [(np.unique(np.concatenate(together)), best.poses)] if len(together) > 1 else []
         tried += [(group, best.poses) for gain, group in promising if gain > 0]
         for group, poses in tried:
             weight = np.array(best.weight)

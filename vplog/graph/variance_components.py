@@ -76,21 +76,6 @@ def claimed_times(graph: PoseGraph, sigmas: Sigmas) -> PoseGraph:
     return replace(graph, information=graph.information / (factor[:, :, None] * factor[:, None, :]))
 
 
-class Residuals(NamedTuple):
-    """Residuals of K edges at the solution."""
-
-    is_odometry: Bools
-    """(K,)."""
-    weight: Floats
-    """(K,)."""
-    error: Floats
-    """(K, d)."""
-    claimed: Floats
-    """(K, d, d) covariance that is claimed."""
-    predicted: Floats
-    """(K, d, d) covariance of what the solution, which has these edges, predicts."""
-
-
 def estimate(objective: Objective, poses: Floats, present: Sigmas) -> Sigmas:
     """The sigmas of greatest posterior density at the least squares `poses` under the `present` ones.
 
@@ -99,40 +84,26 @@ def estimate(objective: Objective, poses: Floats, present: Sigmas) -> Sigmas:
     """
     graph, weight = objective.factors.graph, objective.weight
     loops = ~graph.odometry & (weight > 0)
-    edges = np.flatnonzero(graph.odometry | loops)
-    claimed = np.asarray(np.linalg.inv(informed(graph, edges)), np.float64)
-    try:
-        predicted = edge_covariances(objective, poses, edges)
-    except GraphError:  # noise so large that rounding decides
-        predicted = np.zeros_like(claimed)
-    error = residual_twists(graph, poses, edges)[:, AXES[graph.dimension]]
-    residuals = Residuals(graph.odometry[edges], weight[edges], error, claimed, predicted)
-    fixes = 0 if objective.positions is None else np.count_nonzero(objective.positions.Omega.any((1, 2)))
-    return likeliest(graph, residuals, degrees_of_freedom(graph) * float(weight[loops].sum()), 3.0 * fixes, present)
-
-
-def likeliest(graph: PoseGraph, residuals: Residuals, of_closures: float, of_fixes: float, present: Sigmas) -> Sigmas:
-    """Return the sigmas of greatest posterior density for these residuals under the `present` ones.
-
-    `of_closures` and `of_fixes` are the degrees of freedom with which closures and fixes check the odometry.
-    """
-    most = of_closures + of_fixes
-    (chi2, checks), (closures, own) = _of_parts(residuals, np.array(AXES[graph.dimension]) < 3)
+    closures_dof = float(degrees_of_freedom(graph) * weight[loops].sum())
+    most = closures_dof
+    if objective.positions is not None:
+        most += 3.0 * np.count_nonzero(objective.positions.Omega.any((1, 2)))
+    (chi2, checks), (closures, own) = _of_parts(objective, poses, [graph.odometry, loops])
     checks *= min(1.0, most / max(checks.sum(), 1e-12))
-    rest = of_closures * (1.0 - checks.sum() / max(most, 1.0))
+    rest = closures_dof * (1.0 - checks.sum() / max(most, 1.0))
     own = np.array([min(own[0], rest), max(rest - own[0], 0.0)])  # that of translations drowns in rounding
     odometry = [  # the claim itself is always possible
         min(math.sqrt(most_likely_variance(chi2[part] * factor**2, checks[part])), max(factor * most, 1.0))
         for part, (factor, most) in enumerate(zip(present[:2], _most_factors(graph), strict=True))
     ]
-    closure = (
+    of_closures = (
         max(
             math.sqrt(most_likely_variance(chi2 * factor**2, redundancy)),
             min(_LEAST_OF_ODOMETRY * noise, _LEAST_CLOSURES),
         )
         for chi2, redundancy, factor, noise in zip(closures, own, present[2:], odometry, strict=True)
     )
-    return Sigmas(*odometry, *closure)
+    return Sigmas(*odometry, *of_closures)
 
 
 def _most_factors(graph: PoseGraph) -> list[float]:
@@ -150,21 +121,30 @@ def _most_factors(graph: PoseGraph) -> list[float]:
     return found
 
 
-def _of_parts(residuals: Residuals, of_rotation: Bools) -> list[tuple[Floats, Floats]]:
-    """Weighted chi-square and redundancy of odometry and of closures: (2,) each, of rotations and of translations.
-
-    `of_rotation` (d,) are the axes of rotations.
-    """
-    _, weight, error, claimed, predicted = residuals
-    parts, found = (of_rotation, ~of_rotation), list[tuple[Floats, Floats]]()
-    chi2, trusted = np.zeros((2, len(error))), np.zeros((2, len(error)))
+def _of_parts(objective: Objective, poses: Floats, kinds: list[Bools]) -> list[tuple[Floats, Floats]]:
+    """Weighted chi-square and redundancy of the rotations and of the translations of each kind of edges (E,), (2,)
+    each."""
+    graph = objective.factors.graph
+    axes = np.array(AXES[graph.dimension])
+    edges = np.flatnonzero(np.logical_or.reduce(kinds))
+    weight = objective.weight[edges]
+    claimed = np.linalg.inv(informed(graph, edges))
+    error = residual_twists(graph, poses, edges)
+    chi2, trusted = np.zeros((2, len(edges))), np.zeros((2, len(edges)))
+    try:
+        solved = edge_covariances(objective, poses, edges)
+    except GraphError:  # noise so large that rounding decides
+        solved = np.zeros_like(claimed)
+    parts = axes < 3, axes >= 3
     for number, part in enumerate(parts):  # of correlated noise, the marginal of each
         Omega = np.linalg.inv(claimed[:, part][:, :, part])
-        chi2[number] = np.einsum("ni,nij,nj->n", error[:, part], Omega, error[:, part])
-        trusted[number] = np.einsum("nij,nji->n", Omega, predicted[:, part][:, :, part])
+        e = error[:, axes[part]]
+        chi2[number] = np.einsum("ni,nij,nj->n", e, Omega, e)
+        trusted[number] = np.einsum("nij,nji->n", Omega, solved[:, part][:, :, part])
     size = np.array([int(part.sum()) for part in parts])
-    for kind in (residuals.is_odometry, ~residuals.is_odometry):
-        own = kind * weight
+    found = []
+    for kind in kinds:
+        own = kind[edges] * weight
         checked = own.sum() * size - (own * trusted).sum(1)
         found.append(((own * chi2).sum(1), np.maximum(checked, 0.0)))
     return found
