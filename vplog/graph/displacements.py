@@ -28,8 +28,10 @@ class Displacements:
         self.b = np.maximum(graph.a[loops], graph.b[loops]).astype(np.int64)
         noise = np.linalg.inv(informed(graph, loops))
         Ad = self.adjoint(graph.a_from_b[loops])
-        self.noise = np.where(back, Ad @ noise @ np.swapaxes(Ad, 1, 2), noise)  # in the frame of the later pose
+        self.noise = np.where(back, Ad @ noise @ np.swapaxes(Ad, 1, 2), noise)
+        """(K, d, d) covariance of the measured motion, in the frame of the later pose."""
         self.measured = np.where(back, se3.inverse(graph.a_from_b[loops]), graph.a_from_b[loops])
+        """(K, 4, 4) measured motion, earlier_from_later."""
         self._place(chain)
 
     def on(self, poses: Floats) -> Displacements:
@@ -50,6 +52,7 @@ class Displacements:
         """(K, d, d) moves the odometry's noise at a into the frame of the displacement."""
 
     def adjoint(self, poses: Floats) -> Floats:
+        """Return the adjoints (K, d, d) of poses (K, 4, 4) on the axes of the graph."""
         return se3.adjoint(poses)[:, self.axes][:, :, self.axes]
 
     def apart(self, first: Ints, second: Ints) -> tuple[Floats, Floats]:

@@ -46,7 +46,8 @@ class Likelihood:
         none. Displacements have density 1, and so have pieces of odometry that no true closure joins.
         """
         false = _Families.of(claims, family)
-        factor, normal = self._eliminated(false)
+        factor = self._objective.factorised(false.added_to(self._matrix), 0.0, claims.edges[false.members])
+        normal = false.eliminated(factor)
         covariance = np.asarray(np.linalg.inv(normal.information), np.float64)
         step = -covariance @ normal.pull
         log_determinant = factor.log_determinant() + float(np.linalg.slogdet(normal.information)[1])
@@ -57,11 +58,6 @@ class Likelihood:
         numbers = np.unique(family[false.members])
         displacement = _displaced(false.displacement, step, claims.axes)
         return Explained(log_density, family, numbers, displacement, covariance, claims.axes)
-
-    def _eliminated(self, false: _Families) -> tuple[Cholesky, _Normal]:
-        """The information of the poses with the families, and what is left without the poses."""
-        factor = self._objective.factorised(false.added_to(self._matrix), 0.0, false.claims.edges[false.members])
-        return factor, false.eliminated(factor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +145,7 @@ class _Families:
 
     @classmethod
     def of(cls, claims: Displacements, family: Ints) -> _Families:
-        """Take the families (K,) with more than one closure, because the displacement of a single one explains it."""
+        """Take the families (K,) with more than one closure, because a displacement explains a single one exactly."""
         numbers, first, row, size = np.unique(family, return_index=True, return_inverse=True, return_counts=True)
         shared = (size > 1) & (numbers >= 0)
         members, index = np.flatnonzero(shared[row]), np.cumsum(shared) - 1

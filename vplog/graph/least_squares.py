@@ -133,7 +133,8 @@ class Objective:
     def factorised(self, matrix: Blocks, damping: float, others: Ints = _NONE) -> Cholesky:
         """Factorise a matrix that has blocks of the edges of positive weight and of `others`.
 
-        Pose 0 is held, and the first pose of each part that no edge of positive weight joins to it."""
+        Pose 0 is held, and the first pose of each part that no edge of positive weight joins to it.
+        """
         diagonal, axes = matrix.diagonal.copy(), np.arange(matrix.diagonal.shape[1])
         held = np.concatenate([[0], self.factors.loose(self.weight)]).astype(np.int64)
         diagonal[:, axes, axes] += damping
