@@ -102,4 +102,4 @@ def test_false_closures_are_compared_on_corrected_poses() -> None:
     episodes = Episodes.of(graph, np.array([59, 60]), OdometryChain.of(graph), (VOLUME, VIEW), None)
     both = np.array([True, True])
     assert episodes.family(both).tolist() == [0, 1]
-    assert episodes.family(both, true).tolist() == [0, 0]
+    assert episodes.family(both, episodes.claims.on(true)).tolist() == [0, 0]

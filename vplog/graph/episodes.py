@@ -34,7 +34,7 @@ SCATTERED = 0.1
 that only look alike may fit several poses."""
 SHARES = np.linspace(0.05, 0.95, 10)
 """Values of phi, equally likely, if recognition does not tell how likely a closure is false."""
-MOST_FAMILIES = 50
+_MOST_FAMILIES = 50
 """Number of latest families that a new false episode may repeat, and of families with a displacement of their own. It
 bounds the work for thousands of false closures."""
 _FAR = 40.0
@@ -82,13 +82,13 @@ class Episodes:
         continues = np.exp(-np.maximum(gap, 1.0) / EPISODE)  # two closures of one pair of keyframes may differ, too
         return cls(edges, nearest, continues, share, *log_volumes, claims)
 
-    def family(self, is_false: Bools, poses: Floats | None = None, resolution: float = 1.0) -> Ints:
-        """Return the number of the family of each closure (K,) if `is_false` (K,) are false; -1 for true ones.
+    def family(self, is_false: Bools, claims: Displacements | None = None, resolution: float = 1.0) -> Ints:
+        """Return the number of the false family of each closure (K,), -1 for true ones; `is_false` (K,) are false.
 
-        Closures of one family claim one displacement on `poses` (N, 4, 4), which true closures may have corrected; by
-        default on those of the odometry. `resolution` multiplies the odometry's noise.
+        The closures of a family claim about the same displacement. `claims` are the displacements on poses that true
+        closures have corrected; by default on those of the odometry. `resolution` multiplies the odometry's noise.
         """
-        claims = self.claims if poses is None or not is_false.any() else self.claims.on(poses)
+        claims = claims or self.claims
         K, d = len(self.edges), len(claims.axes)
         family, (first, last, size) = np.full(K, -1), np.zeros((3, K), np.int64)
         begins = (1.0 - self._stays) * self.false_share[:, self.false_share.shape[1] // 2]
@@ -99,7 +99,7 @@ class Episodes:
             claims.own, claims.after, resolution**2 * claims.chain.total, np.zeros((K, d)), claims.own.copy(),
             np.empty((4, d, d + 2)), first, last, size, family,
         )  # fmt: skip
-        small = np.flatnonzero(is_false & (np.argsort(np.argsort(-size, kind="stable"))[family] >= MOST_FAMILIES))
+        small = np.flatnonzero(is_false & (np.argsort(np.argsort(-size, kind="stable"))[family] >= _MOST_FAMILIES))
         family[small] = K + np.arange(len(small))  # each by itself
         return family
 
@@ -173,7 +173,7 @@ def _track(
         if nearest[k] >= 0:
             stay, before = continues[k], family[nearest[k]]
         chosen, best, slot = count, begins[k] * alone + (stay * scattered if before >= 0 else 0.0), 0
-        begin = max(0, count - MOST_FAMILIES)
+        begin = max(0, count - _MOST_FAMILIES)
         members = 0
         for f in range(begin, count):
             members += size[f]

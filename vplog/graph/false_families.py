@@ -26,7 +26,7 @@ _LOG_2PI = math.log(2.0 * math.pi)
 
 
 class Likelihood:
-    """Likelihood of a graph with one set of true closures and any families of false ones."""
+    """Likelihood of one set of true closures, together with the odometry and with families of false closures."""
 
     def __init__(self, factors: Factors, weight: Floats, poses: Floats) -> None:
         """Linearise the edges of weight (E,) 1 at their least squares `poses` (N, 4, 4)."""
@@ -36,7 +36,9 @@ class Likelihood:
         chi2 = float((weight * residual_sigma(graph, poses) ** 2).sum())
         known = float(np.linalg.slogdet(informed(graph, weight > 0))[1].sum())
         held = (1 + loose) * d * -2.0 * math.log(GAUGE_SIGMA)
-        measured = np.count_nonzero(~graph.odometry & (weight > 0)) - int(factors.piece.max()) + loose
+        self.joined = int(factors.piece.max()) - loose
+        """Number of pieces of odometry that only true closures join."""
+        measured = np.count_nonzero(~graph.odometry & (weight > 0)) - self.joined
         self._of_true = 0.5 * (known + held - chi2 - _LOG_2PI * d * measured)
 
     def explained(self, claims: Displacements, family: Ints) -> Explained:
@@ -162,7 +164,7 @@ class _Families:
         )  # fmt: skip
 
     def settled(self) -> _Families:
-        """Return the same about the least squares of the closures' own noise."""
+        """Move the displacements to the least squares of the closures for given poses, and linearise again."""
         if not len(self.displacement):
             return self
         step = np.asarray(-np.linalg.solve(self._own(), self._pull()[:, :, None]), np.float64)
@@ -197,7 +199,7 @@ class _Families:
         return result
 
     def added_to(self, matrix: Blocks) -> Blocks:
-        """Return the information matrix of the poses with these closures for given displacements."""
+        """Add the information of these closures, at given displacements, to that of the poses."""
         ab, edges = np.swapaxes(self.by_a, 1, 2) @ self.information, self.claims.edges[self.members]
         diagonal, other = matrix.diagonal.copy(), matrix.other.copy()
         np.add.at(diagonal, self.a, ab @ self.by_a)

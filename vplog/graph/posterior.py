@@ -83,24 +83,23 @@ class Posterior:
         is_false, claims = weight[self.episodes.edges] == 0, self.episodes.claims.on(poses)
         likelihood, found = Likelihood(self.factors, weight, poses), dict[bytes, Hypothesis]()
         for resolution in resolutions:
-            family = self.episodes.family(is_false, poses, resolution)
+            family = self.episodes.family(is_false, claims, resolution)
             if family.tobytes() not in found:
-                best = self._merged(weight, is_false, likelihood.explained(claims, family))
+                best = self._merged(is_false, likelihood.explained(claims, family), likelihood.joined)
                 found[family.tobytes()] = Hypothesis(weight, poses, self.sigmas, self.slipping, resolution, *best)
         return max(found.values(), key=lambda one: one.log_density)
 
-    def _merged(self, weight: Floats, is_false: Bools, explained: Explained | None) -> tuple[float, Ints]:
+    def _merged(self, is_false: Bools, explained: Explained | None, joined: int) -> tuple[float, Ints]:
         """Merge families as long as that raises the log density. Return it and the family (K,) of each closure."""
         best = -math.inf, np.empty(0, np.int64)
         while explained is not None:
-            log_density = self._prior(weight, is_false, explained.family) + explained.log_density
+            log_density = self._prior(is_false, explained.family, joined) + explained.log_density
             if log_density <= best[0]:
                 break
             best, explained = (log_density, explained.family), explained.merged()
         return best
 
-    def _prior(self, weight: Floats, is_false: Bools, family: Ints) -> float:
-        joined = int(self.factors.piece.max()) - len(self.factors.loose(weight))
+    def _prior(self, is_false: Bools, family: Ints, joined: int) -> float:
         of_states = self.episodes.log_prior(is_false, family) - joined * self.episodes.log_volume
         return of_states + self.sigmas.log_prior() + self.slipping.log_prior
 
@@ -113,7 +112,7 @@ class Posterior:
         exact = 0.5 * np.linalg.slogdet(informed(graph, edges) / (2.0 * math.pi))[1].sum()
         likelihood, claims = Likelihood(self.factors, one.weight, one.poses), self.episodes.claims.on(one.poses)
         rest = likelihood.explained(claims, family).log_density
-        return self._prior(one.weight, is_false, family) + rest + float(exact) - one.log_density
+        return self._prior(is_false, family, likelihood.joined) + rest + float(exact) - one.log_density
 
     def log_predictive(self, one: Hypothesis) -> Floats:
         """Return the log density (K,) of each closure given the true ones without it, in the order of the episodes."""
