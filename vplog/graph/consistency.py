@@ -15,6 +15,7 @@ from vplog.geometry import se3
 from vplog.graph.build import AXES, informed, parts
 from vplog.graph.normal_equations import edge_costs
 
+LOG_2PI = math.log(2.0 * math.pi)
 _BESIDE = 3
 """Keyframes between neighbours of a run, at both ends: they see the same things."""
 _LONGEST_RUN = 20

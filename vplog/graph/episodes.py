@@ -20,7 +20,7 @@ import numba
 import numpy as np
 
 from vplog.data import Bools, Floats, Ints, PoseGraph
-from vplog.graph.consistency import OdometryChain
+from vplog.graph.consistency import LOG_2PI, OdometryChain
 from vplog.graph.displacements import Displacements
 
 EPISODE = 3.0
@@ -39,7 +39,6 @@ _MOST_FAMILIES = 50
 bounds the work for thousands of false closures."""
 _FAR = 40.0
 """Half the chi-square, above the log of the volume, from which a displacement surely belongs to another family."""
-_LOG_2PI = math.log(2.0 * math.pi)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +159,7 @@ def _track(
     mean: Floats, covariance: Floats, room: Floats,
     first: Ints, last: Ints, size: Ints, family: Ints,
 ) -> None:  # fmt: skip
-    """Write the family (K,) of the closures `false`, and the densities (K,) if each continues or repeats a family.
+    """Write the family (K,) of the closures `false`.
 
     The displacement of each family is tracked by a Kalman filter, about that of its first member: the odometry between
     two members is its process noise. A closure joins the family that it most likely belongs to. The `first` and `last`
@@ -315,5 +314,5 @@ def _log_normal(covariance: Floats, root: Floats, most: float) -> float:
         for k in range(i):
             white -= root[i, k] * root[k, d]
         root[i, d] = white / root[i, i]
-        value -= math.log(root[i, i]) + 0.5 * root[i, d] ** 2 + 0.5 * _LOG_2PI
+        value -= math.log(root[i, i]) + 0.5 * root[i, d] ** 2 + 0.5 * LOG_2PI
     return max(value, -700.0)

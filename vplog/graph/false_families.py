@@ -16,13 +16,11 @@ import numpy as np
 from vplog.data import Floats, Ints
 from vplog.geometry import se3
 from vplog.graph.build import informed
-from vplog.graph.consistency import degrees_of_freedom, residual_sigma
+from vplog.graph.consistency import LOG_2PI, degrees_of_freedom, residual_sigma
 from vplog.graph.displacements import Displacements
 from vplog.graph.factors import Factors
 from vplog.graph.least_squares import GAUGE_SIGMA, Objective
 from vplog.graph.sparse.cholesky import Blocks, Cholesky
-
-_LOG_2PI = math.log(2.0 * math.pi)
 
 
 class Likelihood:
@@ -39,7 +37,7 @@ class Likelihood:
         self.joined = int(factors.piece.max()) - loose
         """Number of pieces of odometry that only true closures join."""
         measured = np.count_nonzero(~graph.odometry & (weight > 0)) - self.joined
-        self._of_true = 0.5 * (known + held - chi2 - _LOG_2PI * d * measured)
+        self._of_true = 0.5 * (known + held - chi2 - LOG_2PI * d * measured)
 
     def explained(self, claims: Displacements, family: Ints) -> Explained:
         """Return the log density if K closures are in these families.
@@ -56,7 +54,7 @@ class Likelihood:
         known = float(np.linalg.slogdet(false.information)[1].sum())
         measured = len(claims.axes) * (len(false.members) - len(false.displacement))
         chi2 = false.chi2 - normal.gain + float(normal.pull @ step)
-        log_density = self._of_true + 0.5 * (known - log_determinant - chi2 - _LOG_2PI * measured)
+        log_density = self._of_true + 0.5 * (known - log_determinant - chi2 - LOG_2PI * measured)
         numbers = np.unique(family[false.members])
         displacement = _displaced(false.displacement, step, claims.axes)
         return Explained(log_density, family, numbers, displacement, covariance, claims.axes)
@@ -90,7 +88,7 @@ class Explained:
         apart = se3.log(self.displacement[second] @ se3.inverse(self.displacement[first]))[:, self.axes]
         C = self.covariance.reshape(F, d, F, d).transpose(0, 2, 1, 3)
         spread = C[first, first] + C[second, second] - C[first, second] - C[second, first]
-        log_normal = -0.5 * (se3.mahalanobis2(apart, spread) + np.linalg.slogdet(spread)[1] + d * _LOG_2PI)
+        log_normal = -0.5 * (se3.mahalanobis2(apart, spread) + np.linalg.slogdet(spread)[1] + d * LOG_2PI)
         best = int(np.argmax(log_normal))
         kept, dropped = int(first[best]), int(second[best])
         gain = self.covariance[:, kept * d : kept * d + d] - self.covariance[:, dropped * d : dropped * d + d]

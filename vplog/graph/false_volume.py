@@ -9,7 +9,7 @@ import numpy as np
 from vplog.data import Floats, Ints, PoseGraph
 from vplog.geometry import se3
 from vplog.graph.build import AXES, informed
-from vplog.graph.consistency import is_loop
+from vplog.graph.consistency import LOG_2PI, is_loop
 
 _REACH = 3
 """Keyframes over which views see the same things."""
@@ -24,7 +24,6 @@ _LEAST_SIDE_M = 5.0
 _VIEW_RAD = 0.2
 _VIEW_M = 0.5
 """Rotation and translation that SIFT features tolerate."""
-_LOG_2PI = math.log(2.0 * math.pi)
 
 
 def log_false_volumes(graph: PoseGraph, places: Floats) -> tuple[float, float]:
@@ -43,7 +42,7 @@ def log_false_volumes(graph: PoseGraph, places: Floats) -> tuple[float, float]:
     if len(loops) <= 2 * len(axes):
         return box, box
     covariance, gap = _view_covariance(graph, loops, places), _smallest_gap(graph, loops)
-    entropy = 0.5 * (len(axes) * (_LOG_2PI + 1.0) + float(np.linalg.slogdet(covariance)[1]))  # of a Gaussian
+    entropy = 0.5 * (len(axes) * (LOG_2PI + 1.0) + float(np.linalg.slogdet(covariance)[1]))  # of a Gaussian
     variance = np.array([np.diag(covariance)[axes < 3].mean(), np.diag(covariance)[axes >= 3].mean()])
     pairs = len(places) ** 2 / 2.0
     log_pairs = math.log(pairs / max(len(loops), pairs * _share_near(places, variance, gap)))

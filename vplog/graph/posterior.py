@@ -15,7 +15,7 @@ import numpy as np
 
 from vplog.data import Bools, Floats, Ints
 from vplog.graph.build import informed
-from vplog.graph.consistency import OdometryChain, degrees_of_freedom, is_loop, odometry_chain
+from vplog.graph.consistency import LOG_2PI, OdometryChain, degrees_of_freedom, is_loop, odometry_chain
 from vplog.graph.episodes import Episodes
 from vplog.graph.factors import Factors
 from vplog.graph.false_families import Explained, Likelihood
@@ -30,7 +30,6 @@ STEPS, TOLERANCE = 100, 1e-4
 RESOLUTIONS = (1.0, 0.25, 0.0625)
 """Shares of the odometry's noise at which false families are told apart: the finer, the better the odometry or the more
 true closures correct it."""
-_LOG_2PI = math.log(2.0 * math.pi)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,9 +119,9 @@ class Posterior:
         result, true = np.empty(len(edges)), one.weight[edges] > 0
         if not true.all():
             cost, log_spread = distance(self.factors, one.weight, one.poses, edges[~true])
-            result[~true] = -0.5 * cost - np.minimum(log_spread + 0.5 * d * _LOG_2PI, self.episodes.log_volume)
+            result[~true] = -0.5 * cost - np.minimum(log_spread + 0.5 * d * LOG_2PI, self.episodes.log_volume)
         if true.any():
             found = tension(self.factors, one.weight, one.poses, edges[true])
             result[true] = -0.5 * found.cost
-            result[true] -= np.minimum(found.log_spread + 0.5 * d * _LOG_2PI, self.episodes.log_volume)
+            result[true] -= np.minimum(found.log_spread + 0.5 * d * LOG_2PI, self.episodes.log_volume)
         return result
