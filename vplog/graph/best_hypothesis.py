@@ -19,7 +19,6 @@ from vplog.graph.search import (
     LEAST_GROUP,
     ROUNDS,
     STEADY,
-    TURNS,
     Cost,
     Proposal,
     Search,
@@ -147,7 +146,7 @@ class _WithSlips:
         """Add groups of closures that gain more than the slips that they imply cost: the first of `_rejected` that
         gains if `at_once`, or the one that gains most."""
         best, tried = self.sound.with_slips(best.slipping).improved(best), set[bytes]()
-        for _ in range(TURNS):
+        while True:
             posterior, before = self.sound.with_slips(best.slipping).at(best.sigmas), best
             new = [group for group in self._rejected(best) if group.tobytes() not in tried]
             for group in new:

@@ -37,8 +37,6 @@ SHARES = np.linspace(0.05, 0.95, 10)
 _MOST_FAMILIES = 50
 """Number of latest families that a new false episode may repeat, and of families with a displacement of their own. It
 bounds the work for thousands of false closures."""
-_FAR = 40.0
-"""Half the chi-square, above the log of the volume, from which a displacement surely belongs to another family."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +92,7 @@ class Episodes:
         alone, scattered = (1.0 - REPEATED) * math.exp(-self.log_volume), SCATTERED * math.exp(-self.log_view)
         _track(
             np.flatnonzero(is_false), self.nearest, self.continues, begins, alone, scattered,
-            self.log_volume + _FAR, claims.a, claims.b, claims.chain.part, np.array(claims.axes), claims.displaced,
+            claims.a, claims.b, claims.chain.part, np.array(claims.axes), claims.displaced,
             claims.own, claims.after, resolution**2 * claims.chain.total, np.zeros((K, d)), claims.own.copy(),
             np.empty((4, d, d + 2)), first, last, size, family,
         )  # fmt: skip
@@ -154,7 +152,7 @@ def _nearest_before(a: Ints, b: Ints, part: Ints) -> tuple[Ints, Floats]:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _track(
-    false: Ints, nearest: Ints, continues: Floats, begins: Floats, alone: float, scattered: float, most: float,
+    false: Ints, nearest: Ints, continues: Floats, begins: Floats, alone: float, scattered: float,
     a: Ints, b: Ints, part: Ints, axes: Ints, displaced: Floats, own: Floats, after: Floats, total: Floats,
     mean: Floats, covariance: Floats, room: Floats,
     first: Ints, last: Ints, size: Ints, family: Ints,
@@ -187,7 +185,7 @@ def _track(
                 root[i, d + 1] -= mean[first[f], i]
                 for j in range(d):
                     spread[i, j] += covariance[first[f], i, j] + own[k, i, j]
-            density = math.exp(_log_normal(spread, root, most))
+            density = math.exp(_log_normal(spread, root))
             joint = 0.0
             if f == before:
                 joint = density * stay * (1.0 - SCATTERED)
@@ -287,18 +285,13 @@ def _odometry_noise(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _log_normal(covariance: Floats, root: Floats, most: float) -> float:
+def _log_normal(covariance: Floats, root: Floats) -> float:
     """Log density of the normal error in the last column of `root` (d, d + 2).
 
-    It is -700 if half the chi-square is surely more than `most`, or if the covariance is not positive definite. The
+    It is -700 at least, and so it is if the covariance is not positive definite. The
     covariance's Cholesky factor is written to `root`, and the whitened error to its last column but one.
     """
-    d, value, square, trace = len(root), 0.0, 0.0, 0.0
-    for i in range(d):
-        square += root[i, d + 1] ** 2
-        trace += covariance[i, i]
-    if 0.5 * square > most * trace:
-        return -700.0
+    d, value = len(root), 0.0
     for i in range(d):
         for j in range(i + 1):
             rest = covariance[i, j]

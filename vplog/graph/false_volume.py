@@ -13,14 +13,11 @@ from vplog.graph.consistency import LOG_2PI, is_loop
 
 _REACH = 3
 """Keyframes over which views see the same things."""
-_SAMPLE = 200
-"""Number of poses whose pairs are counted."""
-_SAMPLE_OF_TILTS = 50
-"""Number of poses whose pairs show how far the drive's poses turn against each other."""
-_LEAST_SIDE = 0.1
-"""Shortest side of the box of positions as a share of its longest: a flat drive has false closures off its plane."""
+_SAMPLE = 100
+"""Number of poses whose pairs are compared."""
 _LEAST_SIDE_M = 5.0
-"""Shortest side in m: a camera that hardly moves sees as much, and may take any part of it for another."""
+"""Shortest side of the box of positions in m: a camera that hardly moves sees as far, and may take any part of what it
+sees for another one."""
 _VIEW_RAD = 0.2
 _VIEW_M = 0.5
 """Rotation and translation that SIFT features tolerate."""
@@ -35,8 +32,8 @@ def log_false_volumes(graph: PoseGraph, places: Floats) -> tuple[float, float]:
     most the box of positions times the volume of all rotations (8 pi^2, or 2 pi in the plane).
     """
     side = 2.0 * np.ptp(places[:, :3, 3], axis=0)[: graph.dimension]
-    side = np.maximum(side, max(_LEAST_SIDE * side.max(), _LEAST_SIDE_M))
-    box = float(np.log(side).sum()) + math.log(2.0 * math.pi if graph.dimension == 2 else 8.0 * math.pi**2)
+    box = float(np.log(np.maximum(side, _LEAST_SIDE_M)).sum())
+    box += math.log(2.0 * math.pi if graph.dimension == 2 else 8.0 * math.pi**2)
     loops = np.flatnonzero(is_loop(graph))
     axes = np.array(AXES[graph.dimension])
     if len(loops) <= 2 * len(axes):
@@ -83,7 +80,7 @@ def _view_sigmas(places: Floats) -> Floats:
     """
     step = np.linalg.norm(np.diff(places[:, :3, 3], axis=0), axis=1)
     reach = _REACH * float(np.median(step)) if len(step) else 0.0
-    sample = places[:: -(-len(places) // _SAMPLE_OF_TILTS)]
+    sample = places[:: -(-len(places) // _SAMPLE)]
     first, second = np.triu_indices(len(sample), 1)
     relative = se3.log(se3.between(sample[first], sample[second]))
     most = np.sqrt((relative**2).mean(0)) if len(first) else np.full(6, np.inf)

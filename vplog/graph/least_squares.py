@@ -149,7 +149,7 @@ class Objective:
         return self.factorised(self.linearised(se3.between(poses[:1], poses))[0], 0.0)
 
 
-def descend(factors: Factors, weight: Floats, start: Floats, max_iterations: int, tolerance: float) -> Fit:
+def descend(factors: Factors, weight: Floats, start: Floats, max_iterations: int = 100, tolerance: float = 1e-4) -> Fit:
     """The least cost of the weighted edges (E,) from poses `start` (N, 4, 4), as minimised()."""
     return minimised(Objective(factors, weight), start, max_iterations, tolerance)
 

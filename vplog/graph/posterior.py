@@ -25,8 +25,6 @@ from vplog.graph.leave_one_out import distance, tension
 from vplog.graph.slips import Slipping
 from vplog.graph.variance_components import Sigmas, claimed_times
 
-STEPS, TOLERANCE = 100, 1e-4
-"""Limits of the least squares that compare hypotheses."""
 RESOLUTIONS = (1.0, 0.25, 0.0625)
 """Shares of the odometry's noise at which false families are told apart: the finer, the better the odometry or the more
 true closures correct it."""
@@ -78,7 +76,7 @@ class Posterior:
         Raises GraphError if the poses are not determined.
         """
         if (weight[~self.factors.graph.odometry] > 0).any():
-            poses = descend(self.factors, weight, poses, STEPS, TOLERANCE).world_from_body
+            poses = descend(self.factors, weight, poses).world_from_body
         is_false, claims = weight[self.episodes.edges] == 0, self.episodes.claims.on(poses)
         likelihood, found = Likelihood(self.factors, weight, poses), dict[bytes, Hypothesis]()
         for resolution in resolutions:

@@ -21,7 +21,7 @@ from vplog.graph.consistency import OdometryChain, is_loop
 from vplog.graph.episodes import Episodes
 from vplog.graph.factors import Factors
 from vplog.graph.least_squares import Objective, descend
-from vplog.graph.posterior import RESOLUTIONS, STEPS, TOLERANCE, Hypothesis, Posterior
+from vplog.graph.posterior import RESOLUTIONS, Hypothesis, Posterior
 from vplog.graph.slips import Slipping
 from vplog.graph.variance_components import Sigmas, claimed_times, estimate
 
@@ -47,10 +47,6 @@ ROUNDS = 4
 """Largest number of rounds of two estimates that depend on each other, such as poses and noise. Two are usual."""
 LEAST_GROUP = 3
 """Smallest number of closures in a family that is proposed, and in a group that may show a slip."""
-_FAMILIES = 2
-"""Number of families that are proposed at each share."""
-TURNS = 30
-"""Number of changes after which an improvement ends."""
 
 
 def attempted(solve: Callable[[], Hypothesis]) -> list[Hypothesis]:
@@ -130,27 +126,26 @@ class Search:
         return [max([none, *none_at], key=log_density), *found]
 
     def _families(self, best: Hypothesis, loops: Bools) -> Iterator[Floats]:
-        """Weights (E,) of the largest families that may be true in place of the best set: those with a closure that it
-        rejects, and those that are a quarter of it or more."""
+        """Weights (E,) of the largest family at each resolution if it may be true in place of the best set: if that
+        rejects one of its closures, or if it is a quarter of it or more."""
         proposed = {best.weight.tobytes()}
         for share in RESOLUTIONS:
             rotation, translation, *of_closures = best.sigmas
             episodes = self.at(Sigmas(share * rotation, share * translation, *of_closures)).episodes
             size = np.bincount(episodes.families)
-            for largest in np.argsort(-size, kind="stable")[:_FAMILIES].tolist():
-                weight = np.where(loops, 0.0, 1.0)
-                weight[episodes.edges[episodes.families == largest]] = 1.0
-                may_be = (weight > best.weight).any() or 4 * size[largest] >= best.weight[loops].sum()
-                if size[largest] >= LEAST_GROUP and may_be and weight.tobytes() not in proposed:
-                    proposed.add(weight.tobytes())
-                    yield weight
+            weight = np.where(loops, 0.0, 1.0)
+            weight[episodes.edges[episodes.families == size.argmax()]] = 1.0
+            may_be = (weight > best.weight).any() or 4 * size.max() >= best.weight[loops].sum()
+            if size.max() >= LEAST_GROUP and may_be and weight.tobytes() not in proposed:
+                proposed.add(weight.tobytes())
+                yield weight
 
     def refit(self, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
         """Solve the edges of weight (E,) 1 and estimate the noise, in turns."""
         for _ in range(ROUNDS):
             slipping = self.slipping.applied(self.claimed.graph, sigmas)
             factors = replace(self.claimed, graph=claimed_times(slipping, sigmas))
-            poses = descend(factors, weight, poses, STEPS, TOLERANCE).world_from_body
+            poses = descend(factors, weight, poses).world_from_body
             before, sigmas = sigmas, estimate(Objective(factors, weight), poses, sigmas)
             sigmas = Sigmas(*np.maximum(sigmas, _LEAST_NOISE).tolist())
             if not sigmas.differ(before, STEADY):
@@ -160,10 +155,7 @@ class Search:
     def improved(self, best: Hypothesis) -> Hypothesis:
         """Flip closures, runs and families as long as the posterior rises; estimate the noise after each flip."""
         posterior = self.at(best.sigmas)
-        for _ in range(TURNS):
-            flipped = self._flipped(posterior, best)
-            if not flipped:
-                break
+        while flipped := self._flipped(posterior, best):
             best = flipped[0]
             if best.weight[is_loop(self.claimed.graph)].any():
                 for again in attempted(lambda best=best: self.refit(best.weight, best.poses, best.sigmas)):

@@ -34,8 +34,6 @@ _STILL, _FAR = 0.01, 2.0
 """Motion that is reported as none, and motion that is far too much, as a share of what 95 % of the steps stay below."""
 _MOST = 0.5
 """Largest share of slipping steps. A search for slips that exceeds it ends without a result."""
-_STEPS, _TOLERANCE = 5, 1e-2
-"""Limits of the least squares after each change of state."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +163,7 @@ class Slips:
         slipping = self._slipping(state)
         graph = claimed_times(slipping.applied(self._graph, sigmas), sigmas)
         factors = replace(factors, graph=graph)
-        poses = descend(factors, weight, poses, _STEPS, _TOLERANCE).world_from_body
+        poses = descend(factors, weight, poses).world_from_body
         objective = Objective(factors, weight)
         known = np.linalg.slogdet(informed(graph, self.edges))[1].sum()
         log_density = 0.5 * (known - objective.information(poses).log_determinant()) - objective.cost(poses)

@@ -23,15 +23,6 @@ from vplog.graph.marginals import edge_covariances
 _SPREAD = 2.0 * math.log(2.0)
 """Sigma of the logarithm of a variance factor before anything was measured: drivers claim sigmas that are off by two to
 four and, now and then, by ten."""
-_LEAST_CLOSURES = 0.5
-"""Closures are not taken for much better than they claim: those of neighbouring keyframes share landmarks, so they
-agree with each other more than they are right."""
-_LEAST_OF_ODOMETRY = 2.0
-"""Nor for better than so many times what the odometry is, where that is less than a quarter of its claim: what is left
-of closures whose noise is too large would be taken from the odometry's, down to nothing."""
-_LEAST, _MOST = 2.0**-14, 2.0**20
-"""Variance factors beyond which a claim is no longer one: sigmas 128 times too large, as of a log that tells none and
-of odometry far better than the model, or 1000 times too small."""
 _MOST_NOISE = 0.5
 """Sigma of odometry over its motion from one keyframe to the next."""
 
@@ -66,7 +57,7 @@ def most_likely_variance(chi2: float, redundancy: float) -> float:
     """
     expected = 0.5 * redundancy * _SPREAD**2
     u = float(wrightomega(math.log(0.5 * chi2 * _SPREAD**2 + 1e-300) + expected)) - expected
-    return math.exp(min(max(u, math.log(_LEAST)), math.log(_MOST)))
+    return math.exp(u)
 
 
 def claimed_times(graph: PoseGraph, sigmas: Sigmas) -> PoseGraph:
@@ -92,18 +83,10 @@ def estimate(objective: Objective, poses: Floats, present: Sigmas) -> Sigmas:
     checks *= min(1.0, most / max(checks.sum(), 1e-12))
     rest = closures_dof * (1.0 - checks.sum() / max(most, 1.0))
     own = np.array([min(own[0], rest), max(rest - own[0], 0.0)])  # that of translations drowns in rounding
-    odometry = [  # the claim itself is always possible
-        min(math.sqrt(most_likely_variance(chi2[part] * factor**2, checks[part])), max(factor * most, 1.0))
-        for part, (factor, most) in enumerate(zip(present[:2], _most_factors(graph), strict=True))
-    ]
-    of_closures = (
-        max(
-            math.sqrt(most_likely_variance(chi2 * factor**2, redundancy)),
-            min(_LEAST_OF_ODOMETRY * noise, _LEAST_CLOSURES),
-        )
-        for chi2, redundancy, factor, noise in zip(closures, own, present[2:], odometry, strict=True)
-    )
-    return Sigmas(*odometry, *of_closures)
+    parts = zip(np.append(chi2, closures), np.append(checks, own), present, strict=True)
+    found = [math.sqrt(most_likely_variance(chi2 * factor**2, redundancy)) for chi2, redundancy, factor in parts]
+    most_noise = np.maximum(np.array(present[:2]) * _most_factors(graph), 1.0)  # the claim itself is always possible
+    return Sigmas(*np.minimum(found, [*most_noise, math.inf, math.inf]).tolist())
 
 
 def _most_factors(graph: PoseGraph) -> list[float]:

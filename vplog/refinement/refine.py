@@ -25,13 +25,19 @@ _STEPS = 20
 """Most steps of least squares: each starts from the last round's best poses."""
 _LONGEST = 0.05
 """Largest change of the scale in one round."""
-
-
 _LONG = 10.0
 """Length of closures in sigma from which their scale is estimated: noise makes lengths too long by the inverse square
 of this, a hundredth."""
 _STEADY = 0.025
 """Change of a sigma in a round, as a share, below which it is settled."""
+_LEAST_FACTOR = 2.0**-7
+"""Smallest noise factor. It keeps exact data solvable, such as those of a simulation."""
+_LEAST_CLOSURES = 0.5
+"""Smallest noise factor of closures. Those of neighbouring keyframes share landmarks, so they agree with each other
+better than they are right."""
+_LEAST_OF_ODOMETRY = 2.0
+"""Smallest noise factor of closures as a multiple of the odometry's, if that is smaller. If the noise of closures is
+claimed far too large, their factor would otherwise be estimated at the expense of the odometry's, down to zero."""
 _AS_CLAIMED = Sigmas()
 
 
@@ -165,7 +171,7 @@ def refine(
         poses = minimised(objective, poses, _STEPS, 1e-6).world_from_body
         before, factor = sigmas, 1.0
         if settings.noise:
-            sigmas = estimate(objective, poses, sigmas)
+            sigmas = _no_surer(estimate(objective, poses, sigmas))
         moved = [_scale_step(measured, scales, number, sigmas, poses) for number in range(len(scales))]
         left |= {one.of: sigma / one.witnesses**0.5 for one, (_, sigma) in zip(scales, moved, strict=True)}
         if fixes is not None:
@@ -185,6 +191,13 @@ def refine(
     poses = minimised(measured.objective(scales, sigmas, poses), poses, _STEPS, 1e-6).world_from_body
     refined = _refined(rescaled(graph, scales, sigmas), solution, poses, sigmas, scales, fixes, inlier)
     return replace(refined, unknown=_unknown(of_odometry, loops, left, settings))
+
+
+def _no_surer(sigmas: Sigmas) -> Sigmas:
+    """Return the noise factors, or their lower bounds if these are larger."""
+    odometry, closures = np.reshape(np.maximum(sigmas, _LEAST_FACTOR), (2, 2))
+    least = np.minimum(_LEAST_OF_ODOMETRY * odometry, _LEAST_CLOSURES)
+    return Sigmas(*odometry.tolist(), *np.maximum(closures, least).tolist())
 
 
 def _unknown(of_odometry: Bools, loops: Bools, left: dict[str, float], settings: RefineSettings) -> list[SharedScale]:
