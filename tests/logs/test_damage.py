@@ -59,6 +59,16 @@ def test_what_is_no_log(tmp_path: Path) -> None:
     assert "not a ROS 2 bag" in refusal(tmp_path / "other.db3")
 
 
+@pytest.mark.parametrize("name", ["drive.mcap", "drive.bag", "images/0001.png"])
+def test_a_git_lfs_pointer_is_named(tmp_path: Path, name: str) -> None:
+    file = tmp_path / name
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:" + 64 * "0" + "\nsize 12345678\n")
+    for path in {file, file.parent} - {tmp_path}:
+        assert "Git LFS pointer" in refusal(path)
+        assert refusal(path).endswith("git lfs pull.")
+
+
 def test_a_list_of_topics_with_holes_is_read(tmp_path: Path) -> None:
     """Damage may leave nothing where a name was."""
     path = write_ros2(tmp_path / "drive", ros_messages(DRIVE, 2), "sqlite3") / "drive.db3"

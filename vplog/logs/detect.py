@@ -60,6 +60,9 @@ _DEEPEST, _MOST_FILES = 4, 10**6
 """Levels of folders below the one given, and files in them, that are looked through for images."""
 _OVERLAP_NS = 10**9
 """ns that one file may reach into the next: recorders split between messages that are a little out of order."""
+_LFS = b"version https://git-lfs.github.com/spec/v1"
+_LARGEST_POINTER = 1024
+"""Size in bytes below which the specification of Git LFS keeps its pointers."""
 _KNOWN = (
     "an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), a video, a folder of images, or the folder of a data set "
     "(KITTI, EuRoC, TUM RGB-D, VSLAM-LAB, COLMAP)"
@@ -447,9 +450,16 @@ def _magic(path: Path) -> str:
     return next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), "")
 
 
+def _is_lfs_pointer(path: Path) -> bool:
+    """Whether a file is what Git LFS leaves in place of a file that it has not downloaded."""
+    return path.stat().st_size <= _LARGEST_POINTER and image_folder.first_bytes(path, len(_LFS)) == _LFS
+
+
 def _no_folder(path: Path, files: list[Path]) -> str:
     if ours := [what for name, what in _RESULTS.items() if (path / name).is_file()]:
         return f"{path} is {ours[0]} that vplog wrote, not a log. Give the log of a drive."
+    if pointers := sum(map(_is_lfs_pointer, files)):
+        return f"{path} holds {plural(pointers, 'Git LFS pointer')} instead of data. Download it with: git lfs pull."
     found = f"{plural(len(files), 'file')}, but no log and no images" if files else "nothing"
     if videos := sum(video.is_video(file) and _VIDEO_NAME.search(file.name) is not None for file in files):
         holds = f"{path} holds {plural(videos, 'video')}. Give one of them, or the folder to `vplog batch`."
@@ -460,5 +470,7 @@ def _no_folder(path: Path, files: list[Path]) -> str:
 def _no_log(path: Path) -> str:
     if path.stat().st_size == 0:
         return f"{path} is empty (0 bytes). Was the recording stopped before anything was written?"
+    if _is_lfs_pointer(path):
+        return f"{path} is a Git LFS pointer instead of the file. Download it with: git lfs pull."
     found = f"{path} starts with {image_folder.first_bytes(path, 8)!r}, which no log does."
     return " ".join([found, *_unread([path]), *_to_convert([path]), f"A log is {_KNOWN}."])
