@@ -482,7 +482,7 @@ class LogInfo:
     path: str
     kind: str
     """`mcap`, `ros1`, `ros2-mcap`, `ros2-db3`, `images`, or a data set's: `kitti`, `euroc`, `tum-rgbd`, `vslam-lab`,
-    `colmap`, `utm-images`, `video`."""
+    `colmap`, `utm-images`, `stereo-images`, `video`."""
     start_ns: int
     end_ns: int
     messages: int

@@ -265,6 +265,19 @@ def test_the_imu_of_openvins_and_of_orb_slam_3(tmp_path: Path) -> None:
     np.testing.assert_allclose(second.from_first, RIGHT_FROM_LEFT, atol=1e-6)
 
 
+@pytest.mark.parametrize("baseline", [{"Camera.bf": 15.0}, {"Stereo.b": 0.1}])
+def test_a_baseline_in_the_settings_of_orb_slam_makes_a_rectified_pair(tmp_path: Path, baseline: dict) -> None:
+    tree = {"Camera.fx": 150.0, "Camera.fy": 150.0, "Camera.cx": 31.0, "Camera.cy": 22.0} | baseline
+    path = write(tmp_path / "pair.yaml", tree)
+    left, right = read_calibrations(path)
+    assert right.from_first is not None
+    np.testing.assert_allclose(right.from_first[:3], [[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0]])
+    assert camera_for([left, right], "/stereo/right/image_rect", path) is right
+    assert camera_for([left, right], "/front", path) is left  # both have the same calibration
+    (alone,) = read_calibrations(write(tmp_path / "depth.yaml", tree | {"DepthMapFactor": 5000.0}))
+    assert alone.depth_per_m == 5000.0
+
+
 def test_camchain_makes_a_pair_without_any_calibration_in_the_log(tmp_path: Path) -> None:
     names = ("/stereo/left/image_raw", "/stereo/right/image_raw")
     tree = kalibr(names)

@@ -141,13 +141,31 @@ def test_images_of_another_size_in_a_drive_are_resampled_or_left_out(tmp_path: P
 
 
 def test_folders_of_several_cameras_are_named(tmp_path: Path) -> None:
-    for name in ("left", "right"):
+    for name in ("front", "rear"):
         write(tmp_path / name, [f"{i}.png" for i in range(4)])
-    with pytest.raises(LogError, match=r"several cameras: left \(4\), right \(4\)\. Choose one") as found:
+    with pytest.raises(LogError, match=r"several cameras: front \(4\), rear \(4\)\. Choose one") as found:
         logs.open(tmp_path)
     assert "\n" not in str(found.value)
-    assert logs.open(tmp_path, TopicChoice(image="left")).file_names() == [f"left/{i}.png" for i in range(4)]
+    assert logs.open(tmp_path, TopicChoice(image="front")).file_names() == [f"front/{i}.png" for i in range(4)]
     assert len(logs.open(tmp_path, TopicChoice(image="*")).stamps()) == 8
+
+
+def test_folders_left_and_right_are_a_stereo_pair(tmp_path: Path) -> None:
+    """Images with the same name were taken together; the left one of `2.png` is missing."""
+    write(tmp_path / "left", [f"{i}.png" for i in (1, 3, 10)])
+    write(tmp_path / "right", [f"{i}.png" for i in (1, 2, 3, 10)])
+    settings = {"Camera1.fx": 60.0, "Camera1.fy": 60.0, "Camera1.cx": 32.0, "Camera1.cy": 24.0, "Stereo.b": 0.1}
+    calibration = tmp_path / "pair.yaml"
+    calibration.write_text("".join(f"{name}: {value}\n" for name, value in settings.items()))
+    log = logs.open(tmp_path, TopicChoice(calibration_file=calibration))
+    np.testing.assert_array_equal(log.stamps() // 10**8, [0, 2, 3])
+    assert log.camera().baseline_m == pytest.approx(0.1)
+    assert len([*log.frames(log.stamps())]) == 3
+    (tmp_path / "right" / "1.png").rename(tmp_path / "right" / "x.png")
+    for name in ("2", "3", "10"):
+        (tmp_path / "right" / f"{name}.png").unlink()
+    with pytest.raises(LogError, match="Name both images of a pair alike"):
+        logs.open(tmp_path)
 
 
 def test_folders_of_places_are_one_set(tmp_path: Path) -> None:

@@ -104,11 +104,14 @@ class SidecarFiles:
 
 
 def camera_for(cameras: list[CalibratedCamera], topic: str, path: Path) -> CalibratedCamera:
-    """The camera of an image topic: by its topic, by its name in the topic, or the only one. Raises LogError."""
+    """Return the camera of an image topic: by its topic, by its name in the topic, or the only calibration. Raises
+    LogError."""
     if len(cameras) == 1:
         return cameras[0]
     if len(named := named_for(cameras, topic)) == 1:
         return named[0]
+    if all(camera.calibration is cameras[0].calibration for camera in cameras):  # a rectified pair
+        return cameras[0]
     known = ", ".join(f"{c.name} ({c.topic})" if c.topic else c.name for c in cameras[:8])
     raise LogError(f"{path} does not say which of its cameras is {topic}: {known}. Choose a topic with --image-topic.")
 

@@ -17,7 +17,7 @@ from vplog.errors import LogError, nearest_path, plural
 from vplog.logs import image_folder
 from vplog.logs.calibration_file import read_calibrations
 from vplog.logs.clocks import LONGEST_PAUSE_NS
-from vplog.logs.datasets import colmap, euroc, kitti, tum_rgbd, utm_images, video, vslam_lab
+from vplog.logs.datasets import colmap, euroc, kitti, stereo_folders, tum_rgbd, utm_images, video, vslam_lab
 from vplog.logs.datasets.images import read as read_images
 from vplog.logs.datasets.streams import DataSet, DataSetContainer
 from vplog.logs.formats import mcap_layout, ros1_layout, sqlite_bag
@@ -44,7 +44,7 @@ _MAGIC = {
     mcap_layout.MAGIC: "mcap", ros1_layout.MAGIC: "ros1", sqlite_bag.MAGIC: "ros2-db3", zstandard.FRAME_HEADER: "zstd",
 }  # fmt: skip
 _READERS = {"mcap": McapFile, "ros1": Ros1Bag, "ros2-db3": SqliteBag}
-_DATA_SETS = (kitti, euroc, vslam_lab, tum_rgbd, colmap, utm_images)
+_DATA_SETS = (kitti, euroc, vslam_lab, tum_rgbd, colmap, utm_images, stereo_folders)
 _LOG_NAME = re.compile(r"\.(mcap|bag|db3)(\.zstd?)?$", re.IGNORECASE)
 """Names of logs among other files: to look into each of a bucket costs a request."""
 _NO_LOG = re.compile(r"\.|lost\+found$")

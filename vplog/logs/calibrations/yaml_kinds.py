@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import reprlib
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -135,12 +136,26 @@ def _settings(tree: dict, sections: list[str]) -> list[CalibratedCamera]:
     from_first, mounts = {sections[0]: np.eye(4)}, {sections[0]: _mount(tree)}
     if "Stereo.T_c1_c2" in tree:
         from_first["Camera2"] = se3.inverse(rigid_of(tree["Stereo.T_c1_c2"]))
-    return [
+    cameras = [
         CalibratedCamera(
             name, "", _section(tree, name), from_first.get(name), mounts.get(name), True, depth_per_m=per_m
         )
         for name in sections
     ]
+    if len(cameras) == 1 and per_m is None and (baseline_m := _baseline_m(tree, cameras[0].calibration)):
+        first = replace(cameras[0], name="Camera1")
+        right_from_left = se3.pose(np.eye(3), np.array([-baseline_m, 0.0, 0.0]))
+        cameras = [first, CalibratedCamera("Camera2", "", first.calibration, right_from_left, None, True)]
+    return cameras
+
+
+def _baseline_m(tree: dict, calibration: CalibrationMessage) -> float:
+    """Baseline of a rectified pair in m, as ORB-SLAM 3 names it since 1.0, and before; 0 without one.
+
+    The settings of a depth camera have one, too, for a right image that ORB-SLAM computes from the depth.
+    """
+    baseline_m, in_px = (float(numbers_of([tree.get(name, 0.0)], 1)[0]) for name in ("Stereo.b", "Camera.bf"))
+    return max(baseline_m or in_px / max(calibration.matrix[0, 0], 1.0), 0.0)
 
 
 def _raw(tree: dict, side: str) -> CalibratedCamera:

@@ -54,7 +54,7 @@ class DataSet:
     """One drive of a data set."""
 
     kind: str
-    """`kitti`, `euroc`, `tum-rgbd`, `vslam-lab`, `colmap`, `utm-images` or `video`."""
+    """`kitti`, `euroc`, `tum-rgbd`, `vslam-lab`, `colmap`, `utm-images`, `stereo-images` or `video`."""
     streams: list[Stream]
     truth: Trajectory | Gps | None = None
     """Poses of the body, or fixes."""
