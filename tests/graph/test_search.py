@@ -60,7 +60,7 @@ def test_claimed_sigmas_decide_nothing(odometry: float, closures: float) -> None
 def test_claims_further_off_than_an_estimate_reaches_are_found() -> None:
     sigmas = decided(claiming(ring(60, loops=20, false=10, seed=2), odometry=0.01).graph, GncSettings()).sigmas
     assert sigmas.rotation * 0.01 == pytest.approx(1.0, rel=0.3)
-    assert 0.5 < sigmas.of_closures < 2.0
+    assert 0.5 < math.sqrt(sigmas.closure_rotation * sigmas.closure_translation) < 2.0
 
 
 def test_true_closures_of_heavy_tails_are_kept_and_false_ones_left_out() -> None:

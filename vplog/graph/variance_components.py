@@ -35,11 +35,6 @@ class Sigmas(NamedTuple):
     closure_rotation: float = 1.0
     closure_translation: float = 1.0
 
-    @property
-    def of_closures(self) -> float:
-        """Factor of the closures' sigma along a mean axis."""
-        return math.sqrt(self.closure_rotation * self.closure_translation)
-
     def log_prior(self) -> float:
         """Log of the prior density but for a constant: normal in the logarithm of each variance."""
         return -sum((2.0 * math.log(sigma) / _SPREAD) ** 2 for sigma in self) / 2.0
