@@ -15,9 +15,10 @@ _REACH = 3
 """Keyframes over which views see the same things."""
 _SAMPLE = 100
 """Number of poses whose pairs are compared."""
+_LEAST_SIDE = 0.1
+"""Shortest side of the box of positions as a share of its longest: a flat drive has false closures off its plane."""
 _LEAST_SIDE_M = 5.0
-"""Shortest side of the box of positions in m: a camera that hardly moves sees as far, and may take any part of what it
-sees for another one."""
+"""Shortest side in m: a camera that hardly moves sees as far, and may take any part of what it sees for another one."""
 _VIEW_RAD = 0.2
 _VIEW_M = 0.5
 """Rotation and translation that SIFT features tolerate."""
@@ -32,7 +33,7 @@ def log_false_volumes(graph: PoseGraph, places: Floats) -> tuple[float, float]:
     most the box of positions times the volume of all rotations (8 pi^2, or 2 pi in the plane).
     """
     side = 2.0 * np.ptp(places[:, :3, 3], axis=0)[: graph.dimension]
-    box = float(np.log(np.maximum(side, _LEAST_SIDE_M)).sum())
+    box = float(np.log(np.maximum(side, max(_LEAST_SIDE * side.max(), _LEAST_SIDE_M))).sum())
     box += math.log(2.0 * math.pi if graph.dimension == 2 else 8.0 * math.pi**2)
     loops = np.flatnonzero(is_loop(graph))
     axes = np.array(AXES[graph.dimension])

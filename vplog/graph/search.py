@@ -47,6 +47,8 @@ ROUNDS = 4
 """Largest number of rounds of two estimates that depend on each other, such as poses and noise. Two are usual."""
 LEAST_GROUP = 3
 """Smallest number of closures in a family that is proposed, and in a group that may show a slip."""
+_FAMILIES = 2
+"""Number of families that are proposed at each resolution."""
 
 
 def attempted(solve: Callable[[], Hypothesis]) -> list[Hypothesis]:
@@ -126,19 +128,20 @@ class Search:
         return [max([none, *none_at], key=log_density), *found]
 
     def _families(self, best: Hypothesis, loops: Bools) -> Iterator[Floats]:
-        """Weights (E,) of the largest family at each resolution if it may be true in place of the best set: if that
-        rejects one of its closures, or if it is a quarter of it or more."""
+        """Weights (E,) of the largest families that may be true in place of the best set: those with a closure that it
+        rejects, and those that are a quarter of it or more."""
         proposed = {best.weight.tobytes()}
         for share in RESOLUTIONS:
             rotation, translation, *of_closures = best.sigmas
             episodes = self.at(Sigmas(share * rotation, share * translation, *of_closures)).episodes
             size = np.bincount(episodes.families)
-            weight = np.where(loops, 0.0, 1.0)
-            weight[episodes.edges[episodes.families == size.argmax()]] = 1.0
-            may_be = (weight > best.weight).any() or 4 * size.max() >= best.weight[loops].sum()
-            if size.max() >= LEAST_GROUP and may_be and weight.tobytes() not in proposed:
-                proposed.add(weight.tobytes())
-                yield weight
+            for largest in np.argsort(-size, kind="stable")[:_FAMILIES].tolist():
+                weight = np.where(loops, 0.0, 1.0)
+                weight[episodes.edges[episodes.families == largest]] = 1.0
+                may_be = (weight > best.weight).any() or 4 * size[largest] >= best.weight[loops].sum()
+                if size[largest] >= LEAST_GROUP and may_be and weight.tobytes() not in proposed:
+                    proposed.add(weight.tobytes())
+                    yield weight
 
     def refit(self, weight: Floats, poses: Floats, sigmas: Sigmas) -> Hypothesis:
         """Solve the edges of weight (E,) 1 and estimate the noise, in turns."""
