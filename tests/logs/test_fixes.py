@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 DEGREE_M = 111_000.0
 
 
-def track(fixes: list[FixMessage]) -> tuple[Gps | None, str]:
-    notes, found = Notes(), FixTrack("/fix")
+def track(fixes: list[FixMessage], any_status: bool = False) -> tuple[Gps | None, str]:
+    notes, found = Notes(), FixTrack("/fix", any_status)
     for fix in fixes:
         found.add(fix, fix.stamp_ns)
     return found.finish(notes), " ".join(notes.lines)
@@ -63,6 +63,18 @@ def test_sound_fixes_are_all_taken(seed: int) -> None:
     gps, said = track(fixes)
     assert gps is not None
     assert gps.latitude_deg.tolist() == [fix.latitude_deg for fix in fixes]
+    assert said == ""
+
+
+@given(seeds)
+def test_fixes_of_any_status_are_taken_on_request(seed: int) -> None:
+    fixes = [dataclasses.replace(fix, valid=False) for fix in drive(seed)]
+    gps, said = track(fixes)
+    assert gps is None
+    assert "--gps-any-status" in said
+    gps, said = track(fixes, any_status=True)
+    assert gps is not None
+    assert len(gps.stamp_ns) == len(fixes)
     assert said == ""
 
 

@@ -253,7 +253,7 @@ def topics_of(arguments: argparse.Namespace) -> TopicChoice:
     chosen |= {"image": first, "cameras": more or None, "mask": masks.pop("", None), "mask_topics": masks}
     others = (
         *("odometry_file", "calibration_file", "start_s", "stop_s"),
-        *("wheelbase_m", "track_m", "wheel_radius_m", "camera_height_m"),
+        *("wheelbase_m", "track_m", "wheel_radius_m", "camera_height_m", "gps_any_status"),
     )
     return TopicChoice(**chosen, masks=dict(arguments.mask), **{name: getattr(arguments, name) for name in others})
 
@@ -273,6 +273,7 @@ def topic_options() -> argparse.ArgumentParser:
         option(topics, f"--{name}-m", positive, "M", f"metres between {what}, for odometry of wheels")
     text = "height of a single camera over the ground, which gives its visual odometry metres"
     option(topics, "--camera-height-m", positive, "M", text)
+    flag(topics, "--gps-any-status", "use satellite fixes even if their status says that there is no fix")
     option(topics, "--start", not_negative, "S", "leave out images before S seconds of the log", dest="start_s")
     option(topics, "--stop", not_negative, "S", "leave out images from S seconds of the log on", dest="stop_s")
     option(topics, "--odometry-file", resolved, "FILE.tum", "use these poses as the odometry")

@@ -143,7 +143,7 @@ class TopicCollector:
             if source not in chosen.tf
         }
         """Tracks of the topics that may be the odometry."""
-        self.fixes = FixTrack(chosen.gps.topic) if chosen.gps else None
+        self.fixes = FixTrack(chosen.gps.topic, chosen.gps_any_status) if chosen.gps else None
         self.imu = ImuTrack(chosen.imu)
         self._paths: dict[Channel, Message] = {}
         """The last message of each topic of paths, which holds those before it."""

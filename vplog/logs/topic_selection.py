@@ -51,7 +51,7 @@ OPTIONS = {
     "odometry": "odometry-topic", "gps": "gps-topic", "odometry_file": "odometry-file",
     "calibration_file": "calibration", "imu": "imu-topic", "start_s": "start", "stop_s": "stop",
     "mask": "mask-topic", "wheelbase_m": "wheelbase-m", "track_m": "track-m", "wheel_radius_m": "wheel-radius-m",
-    "camera_height_m": "camera-height-m",
+    "camera_height_m": "camera-height-m", "gps_any_status": "gps-any-status",
 }  # fmt: skip
 """Option of the command line for each field of TopicChoice."""
 _NO_LIDAR = re.compile(r"depth|camera|stereo|radar|map|cluster|obstacle|segment|ground|filtered", re.IGNORECASE)
@@ -82,6 +82,8 @@ class TopicChoice(Settings):
     EuRoC's sensor.yaml; and those further cameras that it names."""
     gps: str | None = None
     """Topic of the satellite fixes; an empty string uses none."""
+    gps_any_status: bool = False
+    """Use fixes whose status says that there is no fix, as some drivers write it for every fix."""
     mask: str | None = None
     """Topic of masks of the camera's images, in which a px of zero is masked."""
     mask_topics: dict[str, str] = Field(default_factory=dict)
@@ -169,6 +171,8 @@ class Selection:
     odometry: Channel | None = None
     """As requested, or as chosen among `sources` once these are read."""
     gps: Channel | None = None
+    gps_any_status: bool = False
+    """As in TopicChoice."""
     right: Channel | None = None
     right_info: Channel | None = None
     depth_info: Channel | None = None
@@ -255,7 +259,13 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
     tf = tuple(c.channel for c in usable if c.role == "tf")
     channels = {part: c.channel for part, c in found.items() if c is not None}
     return Selection(
-        **channels, sources=tuple(c.channel for c in sources), tf_static=static, tf=tf, kind=kind, geometry=geometry
+        **channels,
+        sources=tuple(c.channel for c in sources),
+        tf_static=static,
+        tf=tf,
+        kind=kind,
+        geometry=geometry,
+        gps_any_status=choice.gps_any_status,
     )
 
 

@@ -215,8 +215,10 @@ class ImuTrack:
 class FixTrack:
     """Collects the fixes of one GPS topic."""
 
-    def __init__(self, topic: str) -> None:
+    def __init__(self, topic: str, any_status: bool = False) -> None:
+        """With `any_status`, a status that says "no fix" does not matter."""
         self.topic = topic
+        self._any_status = any_status
         self.stamps = Stamps()
         self._fixes: list[FixMessage] = []
         self.frame = ""
@@ -228,7 +230,7 @@ class FixTrack:
 
     def add_sentences(self) -> None:
         """Add the fixes of the one type of NMEA's sentences with a position that comes often and holds most."""
-        counts = Counter(one.sentence for one, _, _ in self._sentences if not _no_position(one))
+        counts = Counter(one.sentence for one, _, _ in self._sentences if not _no_position(one, self._any_status))
         often = [kind for kind in SENTENCES if counts and counts[kind] > max(counts.values()) / 2]
         found, self._sentences = [one for one in self._sentences if one[0].sentence in often[:1]], []
         for message, log_ns, position in found:
@@ -238,7 +240,7 @@ class FixTrack:
         if message.sentence:
             self._sentences.append((message, log_ns, position))
             return
-        if why := _no_position(message):
+        if why := _no_position(message, self._any_status):
             self._dropped[why] += 1
             return
         self.frame = self.frame or message.frame
@@ -278,11 +280,11 @@ class FixTrack:
         return gps
 
 
-def _no_position(fix: FixMessage) -> str:
+def _no_position(fix: FixMessage, any_status: bool) -> str:
     """Why a message holds no position, as it follows `dropped:`; empty where it does."""
     latitude, longitude = fix.latitude_deg, fix.longitude_deg
-    if not fix.valid:
-        return "its status is no fix"
+    if not (fix.valid or any_status):
+        return "its status says that there is no fix; --gps-any-status uses it"
     if not (math.isfinite(latitude) and math.isfinite(longitude)):
         return "latitude or longitude is not a number"
     if abs(latitude) < _NULL_ISLAND_DEG and abs(longitude) < _NULL_ISLAND_DEG:

@@ -143,7 +143,8 @@ def arguments(
         chosen += [("set", f"{one}={json.dumps(value)}") for one, value in changed.items() if one != "decisions.file"]
     # a URL with its query is shown nowhere
     logs_ = ["LOG" if address(path) != str(path) else str(path) for path in paths]
-    options = [text for name, value in chosen if value is not None for text in (f"--{name}", str(value))]
+    named = [(f"--{name}", value) for name, value in chosen if value is not None and value is not False]
+    options = [text for name, value in named for text in ([name] if value is True else [name, str(value)])]
     return [*logs_, *(["--one-drive"] if len(paths) > 1 else []), *options]
 
 
