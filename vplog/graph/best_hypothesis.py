@@ -67,7 +67,7 @@ class _WithSlips:
         """Return likely hypotheses with slips, and those `found` without slips with the noise of these."""
         best, result = max(found, key=log_density), list[Hypothesis]()
         for start in self._starts(best):
-            grown = [one for at_once in (True, False) for one in self._improved(self._grown(start, at_once))]
+            grown = self._improved(self._grown(start))
             with_slips = [one for one in grown if one.slipping.state.any()]
             result += [self._pruned(one) if one.log_density > best.log_density else one for one in with_slips]
         for one in list(result):
@@ -142,9 +142,9 @@ class _WithSlips:
     def _improved(self, one: Hypothesis) -> list[Hypothesis]:
         return self.sound.with_slips(one.slipping).improved_from(one)
 
-    def _grown(self, best: Hypothesis, at_once: bool) -> Hypothesis:
-        """Add groups of closures that gain more than the slips that they imply cost: the first of `_rejected` that
-        gains if `at_once`, or the one that gains most."""
+    def _grown(self, best: Hypothesis) -> Hypothesis:
+        """Add groups of closures that gain more than the slips that they imply cost, always the first of `_rejected`
+        that gains."""
         best, tried = self.sound.with_slips(best.slipping).improved(best), set[bytes]()
         while True:
             posterior, before = self.sound.with_slips(best.slipping).at(best.sigmas), best
@@ -154,11 +154,10 @@ class _WithSlips:
                 weight[posterior.episodes.edges[group]] = 1.0
                 least = before.slipping.log_prior - posterior.most_gain(before, group)
                 found = self._with_implied(replace(before, weight=weight), least)
-                if not (found and found[0].log_density > before.log_density):
-                    tried.add(group.tobytes())
-                best = max([best, *found], key=log_density)
-                if at_once and best is not before:
+                if found and found[0].log_density > before.log_density:
+                    best = found[0]
                     break
+                tried.add(group.tobytes())
             if best is before:
                 break
             best = self.sound.with_slips(best.slipping).improved(best)
