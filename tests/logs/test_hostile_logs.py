@@ -23,10 +23,10 @@ from vplog import logs
 from vplog.errors import LogError
 from vplog.logs import topic_selection
 from vplog.logs.formats.budget import Budget
-from vplog.logs.formats.chunk_layout import ResyncSearch
 from vplog.logs.formats.container import Channel, Message, Notes
 from vplog.logs.formats.mcap_file import ChunkReader, McapFile
 from vplog.logs.formats.ros2_folder import ZstdMessages
+from vplog.logs.formats.salvage import ResyncSearch
 from vplog.logs.formats.sqlite_bag import SqliteBag
 
 if TYPE_CHECKING:

@@ -64,10 +64,8 @@ class _Lost:
     detail: str
 
 
-_OUTSIDE = ("cut", "missing_file", "damaged_bytes", "unknown_channel")
-"""Reasons for which messages never came to light, so that no count of what was found has them."""
-_OPEN = (*_OUTSIDE, "damaged_chunk")
-"""Reasons that may leave open how many messages they took."""
+_OPEN = ("cut", "missing_file", "damaged_bytes", "unknown_channel", "damaged_chunk")
+"""Reasons that may leave the number of lost messages open, the most serious first."""
 
 
 @dataclass
@@ -81,8 +79,6 @@ class LossAccount:
     _recorded: dict[str, dict[str, int]] = field(default_factory=dict)
     """Messages by topic of each file, as far as known."""
     _found: dict[tuple[str, str], dict[tuple[str, int], _Lost]] = field(default_factory=dict)
-    _settled: set[tuple[str, tuple[str, int]]] = field(default_factory=set)
-    """Losses that what was recorded gave their numbers: found again, they are ignored."""
 
     def add(
         self,
@@ -94,8 +90,6 @@ class LossAccount:
     ) -> None:
         """Messages lost by topic; None where their number is unknown; 0 of no topic where none is lost. `key`,
         a file or topic and a place in it, makes the same loss found again replace itself."""
-        if (reason, key) in self._settled:
-            return
         self._found.get((reason, ""), {}).pop(key, None)  # their topic, or how many, may be known by now
         spans = [(min(span), max(span)) for span in spans]  # damage may have turned them around
         for topic, count in ({"": None} if counts is None else counts).items():
@@ -136,41 +130,36 @@ class LossAccount:
     def reconcile(
         self, files: Collection[str], recorded: Mapping[str, int], found: Mapping[str, int], end_ns: int | None = None
     ) -> dict[str, int]:
-        """Make the losses in these files add up to what was recorded less what was found: uncounted ones get what is
-        left; all of them, where those that were counted are more. `end_ns` is when the recording ended. Returns what no
-        loss explains."""
+        """Make the losses in these files add up to the messages that were recorded less those `found`, by topic. If the
+        numbers that are known do not exceed that, the losses of unknown number share the rest; else all losses do.
+        `end_ns` is the end of the recording. Returns the messages that no loss explains."""
         if not recorded:
             return {}
-        unnamed = self._found.get(("damaged_chunk", ""), {}).items()
-        found = {"": sum(one.messages or 0 for key, one in unnamed if key[0] in files), **found}
-        short = Counter({topic: count - found.get(topic, 0) for topic, count in recorded.items()})
-        lost = [
-            (reason, topic, key, lost)
+        short = Counter({topic: max(count - found.get(topic, 0), 0) for topic, count in recorded.items()})
+        losses = [
+            (_OPEN.index(reason), key, topic, lost)
             for (reason, topic), places in self._found.items()
             for key, lost in places.items()
-            if key[0] in files and (reason in _OUTSIDE or (reason == "damaged_chunk" and lost.messages is None))
-        ]  # of the other damaged chunks, `found` has the messages
+            if key[0] in files and reason in _OPEN
+        ]
         counted = Counter[str]()
-        for _, topic, _, one in lost:
-            counted[topic] += one.messages or 0 if topic else 0
-        if all(count <= short[topic] for topic, count in counted.items()):
-            short.subtract(counted)
-            lost = [one for one in lost if not one[1]]
-        short = Counter({topic: count for topic, count in short.items() if count > 0})
-        if not lost:
-            return short
-        spans = merged([span for *_, one in lost for span in one.spans])
-        first, _, key, _ = min(lost, key=lambda one: (_OPEN.index(one[0]), one[2]))
-        if first == "cut" and spans and end_ns is not None:
+        for *_, topic, lost in losses:
+            counted[topic] += lost.messages or 0 if topic else 0
+        if counted <= short:
+            short -= counted
+            losses = [loss for loss in losses if not loss[2]]
+        if not losses:
+            return dict(+short)
+        spans = merged([span for *_, lost in losses for span in lost.spans])
+        order, key, *_ = min(losses, key=lambda loss: loss[:2])
+        if _OPEN[order] == "cut" and spans and end_ns is not None:
             spans[-1] = spans[-1][0], max(spans[-1][1], end_ns)
-        for reason, topic, place, _ in lost:
-            del self._found[reason, topic][place]
-        detail = " ".join(dict.fromkeys(one.detail for *_, one in lost if one.detail))
-        beside = {
-            topic: places[key].messages for (r, topic), places in self._found.items() if r == first and key in places
-        }
-        self.add(first, short + Counter(beside) or {"": 0}, key, spans, detail)
-        self._settled.update((reason, place) for reason, _, place, _ in lost)
+        for place, loss_key, topic, _ in losses:
+            del self._found[_OPEN[place], topic][loss_key]
+        beside = {topic: places[key].messages for (reason, topic), places in self._found.items()
+                  if reason == _OPEN[order] and key in places}  # fmt: skip
+        detail = " ".join(dict.fromkeys(lost.detail for *_, lost in losses if lost.detail))
+        self.add(_OPEN[order], +(short + Counter(beside)) or {"": 0}, key, spans, detail)
         return {}
 
     @property

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import io
 import struct
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Set
 from functools import partial
 from pathlib import Path
 
 from mcap import records
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from vplog.logs.formats.budget import Budget
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
-from vplog.logs.formats.chunk_layout import Chunk, ChunkLosses
 from vplog.logs.formats.compression import BadChunkError, crc32, unpack
 from vplog.logs.formats.container import HEADER_BYTES, Channel, Contents, Message, Notes, Place, RawData, part_of
-from vplog.logs.formats.loss_account import sampled
-from vplog.logs.formats.mcap_layout import RECORD, read_layout
+from vplog.logs.formats.mcap_layout import RECORD, Definition, parse, read_layout
+from vplog.logs.formats.salvage import Chunk, ChunkRead, FileLosses
 from vplog.storage.remote_path import RemotePath
 
 _IDL = ("ros2idl", "omgidl")
@@ -44,12 +40,13 @@ class McapFile:
         self._file = path.open("rb")
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {0: ""}
-        self._doubtful: set[tuple[int, int]] = set()
-        """Opcodes and ids of schemas and channels from damaged chunks, until a sound one repeats it."""
+        self._doubtful: list[Definition] = []
+        """Schemas and channels from a damaged summary or chunk, for ids that nothing else defines."""
         self._unread: dict[int, str] = {}
-        """End of the sentence about each chunk that could not be unpacked, by its number."""
+        """By number of a chunk that could not be unpacked: the end of the sentence about it."""
+        self._contents: Contents | None = None
         self._layout = read_layout(self._file, length, self._define, self._name)
-        self._losses = ChunkLosses(self._name, length, self._layout, self._channels, notes)
+        self._losses = FileLosses(self._name, length, self._layout, self._channels, notes)
         self._local = not isinstance(path, RemotePath)
         self._at = reader_at(self._file, self._local)
         self._sound = bytearray(len(self._layout.chunks))
@@ -61,40 +58,21 @@ class McapFile:
         self._data = Chunks(load, damaged, sizes.__getitem__, cached.__getitem__, self._local)
 
     def contents(self) -> Contents:
-        """Counted by the indexes behind the chunks; a chunk without is unpacked, as all are where the file's statistics
-        differ or a channel is not defined: its definition may lie in any chunk before."""
-        layout = self._layout
-        by_id, times = self._counted(unpack_all=False)
-        if layout.summary_definitions or by_id.keys() - self._channels.keys():
-            self._define_all()
-            by_id, times = self._counted(unpack_all=False)
-        listed = +by_id
-        for chunk in layout.missing:
-            listed.update(chunk.counts)
-        if layout.recorded and layout.recorded != dict(listed) and layout.chunks:
-            by_id, times = self._counted(unpack_all=True)
-        for number in self._unread:  # more channels may be defined by now
-            self._add_unread(number)
-        return self._losses.contents(by_id, times, "statistics record")
+        """Return the counts by the indexes of the chunks, which are read only if the file is damaged or has none."""
+        self._contents = self._contents or self._losses.contents(self._read_chunk, self._define_all)
+        return self._contents
 
-    def _counted(self, unpack_all: bool) -> tuple[Counter[int], list[int]]:
-        """Messages by channel id, and log times of each chunk, the first and last among them."""
-        counts: Counter[int] = Counter()
-        times: list[int] = []
-        for number, chunk in enumerate(self._layout.chunks):
-            sure = self._losses.is_counted(number) and not unpack_all
-            if sure and chunk.counts.keys() <= self._channels.keys():
-                counts.update(chunk.counts)
-                times += (chunk.first_ns, chunk.last_ns)
-            else:
-                data = self._data(number)
-                reader = self._reader(number, len(data))
-                times += sampled([message.log_ns for message in reader.read(data)])
-                damaged = self._account_for_chunk(chunk, reader) or not data
-                counts.update(reader.counts | Counter(chunk.counts) if damaged else reader.counts)
-                if not damaged:
-                    chunk.counts = dict(reader.counts)
-        return counts, times
+    def _read_chunk(self, number: int) -> ChunkRead:
+        data = self._data(number)
+        reader = self._reader(number, len(data))
+        return self._outcome(reader, [message.log_ns for message in reader.read(data)])
+
+    def _outcome(self, reader: ChunkReader, log_ns: list[int]) -> ChunkRead:
+        rest = "; the rest of it is left out" if reader.position < reader.end else ""
+        problem = self._unread.get(reader.number, rest)
+        return ChunkRead(
+            reader.number, reader.counts, log_ns, reader.last_ns, problem, bool(self._sound[reader.number])
+        )
 
     def messages(self, channels: Collection[Channel], header_only: Collection[Channel] = ()) -> Iterator[Message]:
         wanted, chunks = set(channels), self._layout.chunks
@@ -102,15 +80,13 @@ class McapFile:
         in_place = (self._is_read_in_place,) if header_only else ()
         for number, data in self._data.iterate(numbers, *in_place):
             chunk = chunks[number]
-            if not self._losses.may_hold(chunk, wanted):  # by a definition that came meanwhile
-                continue
             end = chunk.stop - chunk.start if data is None else len(data)
             reader = self._reader(number, end, wanted, header_only)
             if data is None:
                 yield from reader.read_in_place(lambda start, length, at=chunk.start: self._at(at + start, length))
             else:
                 yield from reader.read(data)
-            self._account_for_chunk(chunk, reader)
+            self._losses.check(self._outcome(reader, []))
 
     def read(self, place: Place) -> RawData:
         number, start, stop = place
@@ -119,38 +95,30 @@ class McapFile:
             return self._at(chunk.start + start, stop - start)
         return self._data.part(number, start, stop)
 
-    def _define(self, opcode: int, data: bytes, doubtful: bool = False) -> None:
-        """Take a schema or a channel: the first sound definition of a number, or a doubtful one until there is a sound
-        one."""
-        stream = ReadDataStream(io.BytesIO(data))
-        try:
-            record = records.Schema.read(stream) if opcode == Opcode.SCHEMA else records.Channel.read(stream)
-        except (struct.error, UnicodeDecodeError, McapError):
+    def _define(self, record: Definition | None, doubtful: bool = False) -> None:
+        """Take the first definition of each schema and channel, and keep doubtful ones."""
+        if record is None:
             self._notes.add(f"{self._name} holds a damaged schema or channel; its messages are left out.")
-            return
-        known = self._schemas if isinstance(record, records.Schema) else self._channels
-        if isinstance(record, records.Channel) and record.schema_id not in self._schemas:
-            return  # a summary may repeat channels without their schemas: this one waits for that in the data
-        key = opcode, record.id
-        if record.id in known and (doubtful or key not in self._doubtful):
-            return
-        self._doubtful.add(key) if doubtful else self._doubtful.discard(key)
-        if isinstance(record, records.Schema):
+        elif doubtful:
+            self._doubtful.append(record)
+        elif isinstance(record, records.Schema):
             name = record.name
             if record.encoding in _IDL:  # sensor_msgs::msg::Image, and DDS's sensor_msgs::msg::dds_::Image_
                 name = name.replace("::", "/").replace("/dds_/", "/").rstrip("_")
-            self._schemas[record.id] = name
-        else:
-            self._channels[record.id] = Channel(record.topic, self._schemas[record.schema_id], record.message_encoding)
+            self._schemas.setdefault(record.id, name)
+        elif record.schema_id in self._schemas:  # a summary may repeat channels without their schemas, as chunks do not
+            channel = Channel(record.topic, self._schemas[record.schema_id], record.message_encoding)
+            self._channels.setdefault(record.id, channel)
 
-    def _define_all(self) -> None:
-        """Take the schemas and channels of all chunks, and those of a damaged summary where no chunk has them."""
+    def _define_all(self, ids: Set[int]) -> None:
+        """Read chunks until these channels are defined, then take doubtful definitions of those that are not."""
         for number in range(len(self._layout.chunks)):
+            if ids <= self._channels.keys():
+                return
             data = self._data(number)
             self._reader(number, len(data)).read(data)
-        for opcode, data in self._layout.summary_definitions:
-            self._define(opcode, data, doubtful=True)
-        self._layout.summary_definitions.clear()
+        for record in self._doubtful:
+            self._define(record)
 
     def _reader(
         self,
@@ -161,23 +129,15 @@ class McapFile:
         doubtful: bool = False,
     ) -> ChunkReader:
         """Return a reader of chunk `number`. The definitions of a damaged chunk are `doubtful`."""
-        define, cut = partial(self._define, doubtful=doubtful), self._layout.chunks[number].cut and not doubtful
+
+        def define(opcode: int, data: bytes) -> None:
+            self._define(parse(opcode, data), doubtful)  # pyrefly: ignore[bad-argument-type]
+
+        cut = self._layout.chunks[number].cut and not doubtful
         return ChunkReader(number, end, self._channels, define, wanted, header_only, cut, self._budget)
 
-    def _account_for_chunk(self, chunk: Chunk, reader: ChunkReader) -> bool:
-        """Account for what a chunk lacks; whether it is damaged."""
-        counts = reader.counts
-        fewer = not self._sound[reader.number] and counts.total() < sum(chunk.counts.values())
-        damaged = reader.end > 0 and not chunk.cut and (reader.position < reader.end or fewer)
-        if damaged:
-            last_ns = chunk.first_ns if reader.last_ns is None else reader.last_ns
-            span = min(last_ns, chunk.last_ns), chunk.last_ns
-            self._losses.add_chunk(chunk, counts, [span], "; the rest of it is left out")
-        self._losses.add_unknown(chunk, counts, damaged, [(chunk.first_ns, chunk.last_ns)])
-        return damaged
-
     def _unpack(self, number: int) -> bytes:
-        """The records of one chunk. Raises BadChunkError where it is damaged."""
+        """Return the records of one chunk. Raises BadChunkError if it is damaged."""
         chunk = self._layout.chunks[number]
         data = self._at(chunk.start, chunk.stop - chunk.start)
         if chunk.compression is None:
@@ -191,18 +151,12 @@ class McapFile:
         return data
 
     def _add_damaged_chunk(self, number: int, error: BadChunkError) -> None:
-        """Account for a damaged chunk, and take its schemas and channels, which other chunks need."""
+        """Remember why a chunk is left out, and its schemas and channels, which other chunks need."""
         self._reader(number, len(error.data), doubtful=True).read(error.data)
         self._unread[number] = f", left out: {error}"
-        self._add_unread(number)
-
-    def _add_unread(self, number: int) -> None:
-        chunk = self._layout.chunks[number]
-        span = chunk.first_ns, max(chunk.first_ns, chunk.last_ns)
-        self._losses.add_chunk(chunk, {}, [span], self._unread[number])
 
     def _is_read_in_place(self, number: int) -> bool:
-        """Whether a chunk's messages can be found where they lie, without reading all of it."""
+        """Return whether a chunk's messages can be found in the file without reading all of it."""
         chunk = self._layout.chunks[number]
         if not self._local or not _is_plain(chunk) or chunk.cut:
             return False

@@ -1,28 +1,34 @@
-"""Layout of the chunks of an MCAP file (mcap.dev/spec): read record by record, over damage too.
+"""Chunks of an MCAP file (mcap.dev/spec): from its summary if that is sound, else record by record and over damage.
 
-A record has its length twice, before its fields and by them: where the two differ, the one with a record behind it
-holds. Where neither has, reading goes on at the next chunk of the file's index, or the next bytes that can be a record.
+A record has its length twice: before its fields, and by the lengths among them. If the two agree, the record is valid.
+If they differ, the length with a valid record after it holds. Otherwise the walk resumes at the next valid record.
 """
 
 from __future__ import annotations
 
+import io
 import re
 import struct
+from collections import Counter
 from collections.abc import Callable
 from typing import BinaryIO
 
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
+from mcap.stream_reader import StreamReader
 
 from vplog.errors import LogError
-from vplog.logs.formats.chunk_layout import MOST_GAPS, Chunk, Layout, ResyncSearch
 from vplog.logs.formats.compression import KINDS, crc32
+from vplog.logs.formats.salvage import MAX_GAPS, Chunk, Layout, ResyncSearch
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD = struct.Struct("<BQ")
 """Opcode and length before every record."""
+_MESSAGE_INDEX = int(Opcode.MESSAGE_INDEX)
 _INDEX_HEAD = struct.Struct("<BQHI")
 """Opcode, length, channel id, bytes of entries: a message index up to its entries."""
-_MESSAGE_INDEX = int(Opcode.MESSAGE_INDEX)
 _CHUNK_HEAD = struct.Struct("<QQQII")
 """Start, end, unpacked size, CRC, length of the compression's name: the head of a chunk record."""
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
@@ -31,24 +37,22 @@ _FOOTER = struct.Struct("<BQQQI")
 """Opcode 2, length 20, starts of the summary and of its offsets, CRC; the magic follows it, and the file ends."""
 _ENTRY = 16
 """Bytes of an entry of a message index: time and offset, 8 each."""
-_LEAST_CHUNK = RECORD.size + _CHUNK_HEAD.size + 8
-"""Bytes of a chunk record without data."""
 _MAX_DEFINITION = 16 * 2**20
 """Bytes of a schema or channel record that are read; the largest real schemas are some 100 kB."""
 _MAX_SUMMARY = 64 * 2**20
-"""Bytes of a summary whose checksum is tried; one of 100,000 chunks has some 10 MB."""
+"""Bytes of a summary that is read at once; one of 100,000 chunks has some 10 MB."""
 _RUN = 2**20
 """Bytes up to which neighbouring messages outside chunks form one run."""
 _FARTHEST_NS = 10 * 365 * 86_400 * 10**9
 """ns between two messages of a log above which bytes that look like a message are none: ten years."""
 _PRIVATE = 0x80
-"""Opcodes from here on are an application's own and stepped over, as the specification requires."""
+"""Opcodes from here on belong to applications and are skipped, as the specification requires."""
 _BEGIN = re.compile(re.escape(MAGIC) + rb"\x01")
 """Magic bytes of a recording: another one may be appended to the first."""
 _FILLED = re.compile(rb"[^\0]")
-"""Anything but the zeros that a disk may leave behind the end."""
+"""Anything but the zeros that a disk may leave after the end."""
 _U32, _U64 = -4, -8
-"""Bytes behind a length of 4 or 8 bytes, in _SHAPES."""
+"""Bytes that follow a length of 4 or 8 bytes, in _SHAPES."""
 _SHAPES: dict[int, tuple[int, ...]] = {
     Opcode.HEADER: (_U32, _U32),
     Opcode.FOOTER: (20,),
@@ -66,47 +70,110 @@ _SHAPES: dict[int, tuple[int, ...]] = {
     Opcode.DATA_END: (4,),
 }
 """Fields of each kind of record but messages: bytes of numbers, or _U32, _U64."""
-_OUTSIDE = _SHAPES.keys() - {Opcode.SCHEMA, Opcode.CHANNEL}
 _OUTSIDE_CHUNKS = re.compile(rb"[\x06-\x0f].{5}\x00{3}", re.DOTALL)
 """The opcode of a record that lies in no chunk, and a length below 2^40 bytes."""
 _CHUNKS = re.compile(rb"[\x06\x07].{5}\x00{3}", re.DOTALL)
 """The opcode of a chunk or a message index, and a length below 2^40 bytes."""
 _UNCHUNKED = re.compile(rb"[\x03-\x05\x09\x0c\x0f].{3}\x00{5}", re.DOTALL)
 """The opcode of a record in the data of a file without chunks, and a length below 2^24 bytes."""
+_BAD_RECORD = (McapError, struct.error, UnicodeDecodeError)
+"""Errors of the mcap library for records that it cannot read."""
+_PARSED: dict[int, type[records.Schema | records.Channel | records.Statistics | records.ChunkIndex]] = {
+    Opcode.SCHEMA: records.Schema,
+    Opcode.CHANNEL: records.Channel,
+    Opcode.STATISTICS: records.Statistics,
+    Opcode.CHUNK_INDEX: records.ChunkIndex,
+}
+
+Definition = records.Schema | records.Channel
 
 
-def read_layout(file: BinaryIO, length: int, define: Callable[[int, bytes], None], name: str) -> Layout:
-    """Read the records of a file; `define` gets every schema and channel record outside the chunks. Raises LogError."""
-    reader = _LayoutReader(file, length, define)
-    if reader.at(0, len(MAGIC)) != MAGIC:
+def read_layout(file: BinaryIO, length: int, define: Callable[[Definition | None, bool], None], name: str) -> Layout:
+    """Return the chunks of a file. `define` gets every schema and channel record outside the chunks (None for one that
+    is damaged), and whether it may be wrong. Raises LogError if the file is not an MCAP."""
+    walk = _Walk(file, length, define)
+    if walk.at(0, len(MAGIC)) != MAGIC:
         raise LogError(f"{name} is not an MCAP file: it does not start with MCAP's magic bytes.")
-    reader.check_summary()
-    reader.records(len(MAGIC))
-    reader.finish()
-    return reader.layout
+    walk.read_summary()
+    if not walk.is_indexed():
+        walk.records(len(MAGIC))
+        walk.finish()
+    return walk.layout
 
 
-class _LayoutReader:
-    def __init__(self, file: BinaryIO, length: int, define: Callable[[int, bytes], None]) -> None:
+def parse(opcode: int, data: bytes) -> Definition | records.Statistics | records.ChunkIndex | None:
+    """Return a record as the mcap library reads it, or None if it is damaged or of another kind."""
+    try:
+        return _PARSED[opcode].read(ReadDataStream(io.BytesIO(data)))
+    except (*_BAD_RECORD, KeyError):
+        return None
+
+
+class _Walk:
+    def __init__(self, file: BinaryIO, length: int, define: Callable[[Definition | None, bool], None]) -> None:
         self._length, self._define = length, define
         self.layout = Layout()
-        self._indexed: dict[int, tuple[Chunk, dict[int, int]]] = {}
-        """By offset: chunks as the summary's index lists them, and where the message index of each channel lies."""
-        self._ahead: list[int] | None = None
-        """Offsets of the index that may be chunks to go on with behind damage, the next one last."""
+        self._listed: dict[int, Chunk] = {}
+        """By offset of its record: chunks as the summary lists them."""
         self._unfit: list[tuple[int, int]] = []
         """Offset and opcode of records of other lengths than their fields, which may have been messages."""
-        self._chunked = self._looked_for_chunks = False
+        self._chunked = False
         self._indexing: Chunk | None = None
-        """The chunk whose message indexes come by."""
+        """The chunk whose message indexes are being read."""
         self._search = ResyncSearch(file, length)
         self.at = self._search.at
-        self._summary_start: int | None = None
+        self._summary_start = length
         self._summary_sound: bool | None = None
-        """By its checksum; None where it has none."""
+        """Whether the checksum of the summary is right; None if there is no checksum or no summary."""
+
+    def read_summary(self) -> None:
+        """Read the summary at the end of the file unless its checksum is wrong."""
+        size = _FOOTER.size + len(MAGIC)
+        tail = self.at(self._length - size, size)
+        if len(tail) < size or not tail.endswith(MAGIC):
+            return
+        opcode, length, start, _, crc = _FOOTER.unpack_from(tail)
+        if (opcode, length) != (Opcode.FOOTER, 20) or not 0 < start < self._length <= start + _MAX_SUMMARY:
+            return
+        self._summary_start, data = start, self.at(start, self._length - start)
+        if crc:
+            self._summary_sound = crc32(data[: -len(MAGIC) - 4]) == crc
+        if self._summary_sound is False:
+            return
+        summary = io.BytesIO(data)
+        try:
+            for record in StreamReader(summary, skip_magic=True).records:
+                self._take(record)
+        except _BAD_RECORD:
+            self._summary_sound = False
+        if summary.tell() < len(data):  # another recording follows
+            self._summary_sound = False
+
+    def is_indexed(self) -> bool:
+        """Return whether the summary counts every message and each of its chunks begins where it says."""
+        layout, counts = self.layout, Counter[int]()
+        for chunk in self._listed.values():
+            counts.update(chunk.counts)
+        if self._summary_sound is False or not counts or dict(counts) != layout.recorded:
+            return False
+        chunks, end = sorted(self._listed.values(), key=lambda chunk: chunk.start), len(MAGIC)
+        for chunk in chunks:
+            head = self.at(chunk.record, RECORD.size + _CHUNK_HEAD.size).ljust(RECORD.size + _CHUNK_HEAD.size, b"\0")
+            opcode, length = RECORD.unpack_from(head)
+            *fields, chunk.crc, name_length = _CHUNK_HEAD.unpack_from(head, RECORD.size)
+            if (
+                (opcode, chunk.record + RECORD.size + length) != (Opcode.CHUNK, chunk.stop)
+                or fields != [chunk.first_ns, chunk.last_ns, chunk.size]
+                or name_length != len(chunk.compression or "")
+                or not end <= chunk.record < chunk.start <= chunk.stop <= self._summary_start
+            ):
+                return False
+            end = chunk.stop
+        layout.chunks = chunks
+        return True
 
     def records(self, position: int) -> None:
-        """Every record from here on, to the footer or the end."""
+        """Read every record from here on, to the footer or the end."""
         before, data_ended = position, False
         while True:
             opcode, stop = self._bounds(position)
@@ -115,10 +182,8 @@ class _LayoutReader:
                     self.layout.index_cut_at = min(position, self._length)
                     self.layout.appended_at = self._search.first(_BEGIN, position)
                     return
-                resumed = self._resume(before, position) if len(self.layout.gaps) < MOST_GAPS else None
+                resumed = self._resume(before, position) if len(self.layout.gaps) < MAX_GAPS else None
                 if resumed is None:
-                    if self._indexing is not None and position < self._length:
-                        self._indexing.doubtful = True
                     self.layout.cut_at = min(position, self._length)
                     return
                 before = position = resumed
@@ -138,71 +203,49 @@ class _LayoutReader:
             before, position = position, stop
 
     def finish(self) -> None:
-        """Hold the chunks that were found against those that the index at the end lists."""
+        """Add the chunks that the summary lists in damaged bytes, and a message that damage made another record."""
+        layout, found = self.layout, {chunk.record for chunk in self.layout.chunks}
         if not self._chunked:
-            timed = any(chunk.last_ns > _FARTHEST_NS for chunk in self.layout.chunks)  # else any field may be a time
-            unfit = (one for one in self._unfit if timed or one[1] not in _SHAPES)
-            self.layout.unknown_at = next((at for at, opcode in unfit if self._is_message_head(at, opcode)), None)
-        found = {chunk.record: chunk for chunk in self.layout.chunks if chunk.compression is not None}
-        placed = bool(found and self._indexed)
-        for offset, (listed, indexes) in sorted(self._indexed.items()):
-            if (chunk := found.get(offset)) is not None:
-                if chunk.counts and chunk.counts.keys() != indexes.keys():
-                    chunk.doubtful |= chunk.counts != {i: n for i, n in self._counts(indexes).items() if n}
-            elif (there := self._bounds(offset))[0] == Opcode.CHUNK and there[1] <= self._length:  # jumped over
-                self._add_chunk(offset + RECORD.size, there[1], cut=False)
-                self.layout.chunks[-1].counts = self._counts(indexes)
-            elif self.layout.is_in_gap(offset):
-                listed.counts = self._counts(indexes)
-                self.layout.missing.append(listed)
-            else:  # bytes are gone or new before it, or the index is damaged
-                placed = False
-        self.layout.in_order()
-        if placed:  # the index tells of every chunk in the gaps
-            self.layout.gaps = []
+            timed = any(chunk.last_ns > _FARTHEST_NS for chunk in layout.chunks)  # else any field may be a time
+            unfit = ((at, opcode) for at, opcode in self._unfit if timed or opcode not in _SHAPES)
+            at = next((at for at, opcode in unfit if self._is_message_head(at, opcode)), None)
+            layout.gaps += [] if at is None else [(at, at)]
+        absent = [self._listed[at] for at in self._listed.keys() - found]
+        if found and all(layout.is_in_gap(chunk.record) for chunk in absent):
+            orphans = [chunk for chunk in layout.missing if not layout.is_in_gap(chunk.record)]
+            layout.missing = absent + orphans if self._listed else layout.missing
+            layout.gaps = [] if self._listed else layout.gaps
+        layout.chunks.sort(key=lambda chunk: chunk.start)
+        layout.sound &= not (layout.gaps or layout.missing or absent)
 
-    def _counts(self, indexes: dict[int, int]) -> dict[int, int]:
-        """Messages per channel id by message indexes at these offsets; empty where one is not there."""
-        counts: dict[int, int] = {}
-        for channel_id, position in indexes.items():
-            opcode, stop = self._bounds(position)
-            if opcode != Opcode.MESSAGE_INDEX or self.at(position + RECORD.size, 2) != channel_id.to_bytes(2, "little"):
-                return {}
-            counts[channel_id] = (stop - position - RECORD.size - 6) // _ENTRY
-        return counts
-
-    def _bounds(self, position: int, damaged: int = 2) -> tuple[int, int]:
-        """Opcode of the record at `position` and where it stops, either as what it must have been where one of them is
-        damaged; opcode 0, which the specification has as invalid, where there is none. A chunk may go on behind the end
-        of the file. So many records behind it may be `damaged` too."""
-        head = self.at(position, _INDEX_HEAD.size)
+    def _bounds(self, position: int, nested: bool = False) -> tuple[int, int]:
+        """Return the opcode of the record at `position` and its end, with either repaired if it is damaged. The opcode
+        is 0, which is invalid, if there is no record. A chunk may end after the file."""
+        head = self.at(position, RECORD.size)
         if len(head) < RECORD.size:
             return 0, 0
-        opcode, length = RECORD.unpack_from(head)
+        opcode, length = RECORD.unpack(head)
         start = position + RECORD.size
         stop = start + length
-        if opcode == _MESSAGE_INDEX and length == int.from_bytes(head[-4:], "little") + 6 and stop <= self._length:
-            return opcode, stop  # most records are of this kind
         if opcode == Opcode.MESSAGE and length >= _MESSAGE_HEAD.size and stop <= self._length and not self._chunked:
             return opcode, stop
-        for kind in (opcode, Opcode.CHUNK, Opcode.MESSAGE_INDEX):  # of which damage may have changed the opcode
+        for kind in dict.fromkeys((opcode, Opcode.CHUNK, Opcode.MESSAGE_INDEX)):  # damage may have changed the opcode
             if kind == Opcode.CHUNK:
                 agrees = self._is_chunk(position, length)
             else:
                 agrees = self._length_by_fields(kind, start) == length and stop <= self._length
             if agrees:
                 return kind, stop
+        known = opcode in _SHAPES
         by_fields = start + (self._length_by_fields(opcode, start) or 0)
-        ends = sorted({stop, by_fields})
-        for end in ends:
-            if ((opcode in _SHAPES and end > start) or end == stop) and self._is_record(end, behind=opcode):
+        for end in sorted({stop, by_fields}):
+            if ((known and end > start) or end == stop) and self._is_record(end, after=opcode):
                 return opcode, end
-        for end in ends if damaged and opcode in _SHAPES else ():
-            if end > start and self._bounds(end, damaged - 1)[0] in (_OUTSIDE if self._chunked else _SHAPES):
+            if known and end > start and not nested and self._bounds(end, nested=True)[0] in _SHAPES:
                 return opcode, end
-        if (0 < by_fields < stop or opcode >= _PRIVATE) and self._is_record(stop, behind=opcode, longer=True):
-            return opcode, stop  # with fields of a later version, which are ignored
-        return (opcode, stop) if opcode >= _PRIVATE and stop <= self._length else (0, 0)
+        longer = 0 < by_fields < stop and self._is_record(stop, after=opcode, longer=True)
+        private = opcode >= _PRIVATE and stop <= self._length
+        return (opcode, stop) if longer or private else (0, 0)  # longer: with fields of a later version
 
     def _length_by_fields(self, opcode: int, start: int) -> int | None:
         """Bytes of a record whose fields begin at `start`, by the lengths among them."""
@@ -213,15 +256,15 @@ class _LayoutReader:
             at += step if step > 0 else int.from_bytes(self.at(at, -step), "little") - step
         return at - start
 
-    def _is_record(self, position: int, behind: int = 0, longer: bool = False) -> bool:
-        """Whether a record lies here whose two lengths agree, or that is `longer` than its fields, or the end of the
-        file. Behind a chunk it is none of those that lie in chunks."""
+    def _is_record(self, position: int, after: int = 0, longer: bool = False) -> bool:
+        """Return whether a record lies here whose two lengths agree, or that is `longer` than its fields, or the end of
+        the file. After a chunk, records that lie in chunks do not count."""
         head = self.at(position, RECORD.size)
         if len(head) < RECORD.size:
             return position == self._length or (head == MAGIC and position + len(head) == self._length)
         opcode, length = RECORD.unpack(head)
         inside = opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
-        if position + RECORD.size + length > self._length or (behind == Opcode.CHUNK and inside):
+        if position + RECORD.size + length > self._length or (after == Opcode.CHUNK and inside):
             return False
         if opcode == Opcode.MESSAGE:
             return length >= _MESSAGE_HEAD.size
@@ -230,39 +273,43 @@ class _LayoutReader:
 
     def _record(self, opcode: int, position: int, stop: int, cut: bool) -> None:
         start = position + RECORD.size
-        length = stop - start
         if opcode == _MESSAGE_INDEX:
-            self._add_message_index(start, length)
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            data = self.at(start, min(length, _MAX_DEFINITION))
-            if self._summary_sound is False and position >= (self._summary_start or 0):
-                self.layout.summary_definitions.append((opcode, data))
-            else:
-                self._define(opcode, data)
+            self._add_message_index(start, stop - start)
         elif opcode == Opcode.CHUNK:
             self._add_chunk(start, stop, cut)
         elif opcode == Opcode.MESSAGE:
             self._add_message(start, stop)
-        elif opcode == Opcode.STATISTICS and 46 <= length <= _MAX_DEFINITION:  # 42 bytes of totals, then id and count
-            data = self.at(start, length)
-            total, size = struct.unpack_from("<Q34xI", data)
-            entries = struct.iter_unpack("<HQ", data[46 : 46 + min(size, length - 46) // 10 * 10])
-            counts = {channel_id: count for channel_id, count in entries if count}
-            self.layout.recorded = counts if sum(counts.values()) == total <= self._length else {}
-        elif opcode == Opcode.CHUNK_INDEX and 64 <= length <= _MAX_DEFINITION:
-            data = self.at(start, length)
-            first_ns, last_ns, offset, _, size = struct.unpack_from("<QQQQI", data)
-            entries = data[36 : 36 + min(size, len(data) - 36) // 10 * 10]  # channel id and offset of its message index
-            listed = Chunk(offset, offset, first_ns=first_ns, last_ns=last_ns)
-            self._indexed[offset] = listed, dict(struct.iter_unpack("<HQ", entries))
+        elif opcode in _PARSED:
+            record = parse(opcode, self.at(start, min(stop - start, _MAX_DEFINITION)))
+            self._take(record, opcode in (Opcode.SCHEMA, Opcode.CHANNEL), position >= self._summary_start)
+
+    def _take(self, record: object, is_definition: bool = False, doubtful: bool = False) -> None:
+        """Take a record of the summary; a definition, which may be damaged (None), outside it as well."""
+        if is_definition or isinstance(record, Definition):
+            self._define(record, doubtful)  # pyrefly: ignore[bad-argument-type]
+        elif isinstance(record, records.Statistics):
+            counts = {i: count for i, count in record.channel_message_counts.items() if count}
+            plausible = sum(counts.values()) == record.message_count <= self._length
+            self.layout.recorded = counts if plausible else {}
+        elif isinstance(record, records.ChunkIndex):
+            at, stop = record.chunk_start_offset, record.chunk_start_offset + record.chunk_length
+            first_ns, last_ns = record.message_start_time, record.message_end_time
+            chunk = Chunk(stop - record.compressed_size, stop, record.compression, record.uncompressed_size, 0,
+                          first_ns, last_ns, record=at)  # fmt: skip
+            starts = sorted((offset, i) for i, offset in record.message_index_offsets.items())
+            ends = [*(offset for offset, _ in starts[1:]), stop + record.message_index_length]
+            for (start, i), end in zip(starts, ends, strict=False):
+                chunk.counts[i] = max(end - start - _INDEX_HEAD.size, 0) // _ENTRY
+            self._listed[at] = chunk
 
     def _add_message_index(self, start: int, length: int) -> None:
-        if self._indexing is None or length < 6:
+        if self._indexing is None or length < _INDEX_HEAD.size - RECORD.size:
             return
         chunk, channel_id = self._indexing, int.from_bytes(self.at(start, 2), "little")
-        chunk.doubtful |= channel_id in chunk.counts or (length - 6) % _ENTRY > 0
-        if length > 6:
-            chunk.counts[channel_id] = (length - 6) // _ENTRY
+        entries, rest = divmod(length - (_INDEX_HEAD.size - RECORD.size), _ENTRY)
+        chunk.doubtful |= channel_id in chunk.counts or rest > 0
+        if entries:
+            chunk.counts[channel_id] = entries
 
     def _add_chunk(self, start: int, stop: int, cut: bool) -> None:
         head = self.at(start, _CHUNK_HEAD.size)
@@ -293,88 +340,47 @@ class _LayoutReader:
             chunks.append(Chunk(start - RECORD.size, stop, None, first_ns=log_ns, last_ns=log_ns))
 
     def _resume(self, before: int, position: int) -> int | None:
-        """The next record to go on with, where there is none at `position`. In a file without chunks the message
-        before, at `before`, may be the one whose length is damaged, and is dropped."""
-        if self._summary_start is not None and not self._indexed:
-            self._read_summary(self._summary_start)
-        chunks, found = self.layout.chunks, None
-        self._look_for_chunks(position)
+        """Return where the walk continues if there is no record at `position`. In a file without chunks the length of
+        the message before, at `before`, may be what is damaged, so this message is dropped."""
+        layout, chunks = self.layout, self.layout.chunks
+        layout.sound = False
+        if not chunks:  # damage before the first message
+            self._chunked |= (
+                bool(self._listed) or self._search.first(_CHUNKS, position + 1, self._is_record) is not None
+            )
         if not self._chunked and chunks and chunks[-1].stop > before and not self._is_message_head(position):
             chunks[-1].stop, position = before, before
             if chunks[-1].start == before:
                 chunks.pop()
-        if self._indexed:
-            found = self._next_listed_chunk(position)
-        elif self._chunked:
-            found = self._search.first(_OUTSIDE_CHUNKS, position + 1, self._is_record)
-        else:
-            found = self._search.first(_UNCHUNKED, position + 1, self._is_likely)
-        found = self._summary_start if found is None else found
-        self.layout.appended_at = self._search.first(_BEGIN, before, stop=found)
-        if found is None or found <= position or self.layout.appended_at is not None:
+        pattern, accept = (_OUTSIDE_CHUNKS, self._is_record) if self._chunked else (_UNCHUNKED, self._is_likely)
+        found = self._search.first(pattern, position + 1, accept)
+        layout.appended_at = self._search.first(_BEGIN, before, stop=found)
+        if found is None or layout.appended_at is not None:
             return None
-        self._indexing = None
         if chunks and chunks[-1].record >= 0:
             chunks[-1].doubtful = True
-        if not self._indexed and self.at(found, 1) == bytes([Opcode.MESSAGE_INDEX]):
+        self._indexing = None
+        if self.at(found, 1) == bytes([_MESSAGE_INDEX]):
             first_ns = int.from_bytes(self.at(found + _INDEX_HEAD.size, 8), "little")
             if chunks and chunks[-1].record >= 0 and chunks[-1].first_ns <= first_ns <= chunks[-1].last_ns:
                 self._indexing = chunks[-1]
-            else:
-                is_whole = self._is_chunk(position, found - position - RECORD.size)
-                self._indexing = Chunk(position, found, doubtful=not is_whole)
-                self.layout.missing.append(self._indexing)
-        if found - position >= (_LEAST_CHUNK if self._chunked else RECORD.size + _MESSAGE_HEAD.size):
-            self.layout.gaps.append((position, found))  # else no message has room in it
+                return found  # a damaged index, and no message
+            is_one = self._is_chunk(position, found - position - RECORD.size)
+            self._indexing = Chunk(position, found, record=position, doubtful=not is_one)
+            layout.missing.append(self._indexing)
+        else:
+            layout.gaps.append((position, found))
         return found
 
-    def _look_for_chunks(self, position: int) -> None:
-        """Find out whether chunks follow damage before the first message; a second search would find the same."""
-        if not self.layout.chunks and not self._looked_for_chunks:
-            self._looked_for_chunks = True
-            self._chunked |= self._search.first(_CHUNKS, position + 1, self._is_record) is not None
-
-    def _next_listed_chunk(self, position: int) -> int | None:
-        """Return the next chunk of the index behind `position`, which increases from call to call; None without one."""
-        if self._ahead is None:
-            self._ahead = sorted(self._indexed, reverse=True)
-        while self._ahead and (self._ahead[-1] <= position or self._bounds(self._ahead[-1])[0] != Opcode.CHUNK):
-            self._ahead.pop()
-        return self._ahead[-1] if self._ahead else None
-
-    def check_summary(self) -> None:
-        """Find the summary at the end of the file, and read it where its checksum is right."""
-        size = _FOOTER.size + len(MAGIC)
-        tail = self.at(max(self._length - size, 0), size)
-        if len(tail) < size or not tail.endswith(MAGIC):
-            return
-        opcode, length, start, _, crc = _FOOTER.unpack_from(tail)
-        if (opcode, length) != (Opcode.FOOTER, 20) or not 0 < start < self._length:
-            return
-        self._summary_start = start
-        length = self._length - len(MAGIC) - 4 - start
-        if crc and length <= _MAX_SUMMARY:
-            self._summary_sound = crc32(self.at(start, length)) == crc
-        if self._summary_sound:
-            self._read_summary(start)
-
-    def _read_summary(self, position: int) -> None:
-        while position + RECORD.size <= self._length - _FOOTER.size - len(MAGIC):
-            opcode, stop = self._bounds(position)
-            if stop > self._length or opcode in (0, Opcode.CHUNK, Opcode.MESSAGE, Opcode.FOOTER):
-                return
-            self._record(opcode, position, stop, cut=False)
-            position = stop
-
     def _is_chunk(self, position: int, length: int) -> bool:
-        """Whether the lengths that the head of a chunk holds agree: with that of the record, and with each other."""
+        """Return whether the lengths in the head of a chunk agree with that of the record and with each other."""
         start = position + RECORD.size
         size, name = struct.unpack("<I4s", self.at(start + _CHUNK_HEAD.size - 4, 8).ljust(8, b"\xff"))
         known = size <= len(name) and name[:size].decode("latin-1") in KINDS
         return known and self._length_by_fields(Opcode.CHUNK, start) == length
 
     def _is_message_head(self, position: int, opcode: int = Opcode.MESSAGE) -> bool:
-        """Whether a message of a time near those found begins here, whatever its length."""
+        """Return whether a message of a time near those found begins here, whatever its length."""
         head = self.at(position, RECORD.size + _MESSAGE_HEAD.size)
         if len(head) < RECORD.size + _MESSAGE_HEAD.size or head[0] != opcode:
             return False
@@ -382,7 +388,7 @@ class _LayoutReader:
         return not chunks or abs(log_ns - chunks[-1].last_ns) <= _FARTHEST_NS
 
     def _is_likely(self, position: int) -> bool:
-        """Whether a record of a file without chunks can lie here, with another or the end behind it."""
+        """Return whether a record of a file without chunks lies here, with another one or the end after it."""
         opcode, length = RECORD.unpack(self.at(position, RECORD.size))
         if opcode == Opcode.MESSAGE and not self._is_message_head(position):
             return False

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Set
 from functools import partial
 from pathlib import Path
 
 from vplog.logs.formats.budget import Budget
 from vplog.logs.formats.chunk_cache import Chunks, reader_at
-from vplog.logs.formats.chunk_layout import ChunkLosses
 from vplog.logs.formats.compression import BadChunkError, unpack
 from vplog.logs.formats.container import Channel, Contents, Message, Notes, Place, RawData, part_of
-from vplog.logs.formats.loss_account import sampled
 from vplog.logs.formats.ros1_layout import CONNECTION, MESSAGE, fields, number, read_layout, time_ns
+from vplog.logs.formats.salvage import ChunkRead, FileLosses
 from vplog.storage.remote_path import RemotePath
 
 _FIELDS = {MESSAGE: {b"conn", b"time"}, CONNECTION: {b"conn", b"topic"}}
@@ -31,57 +30,43 @@ class Ros1Bag:
         self._channels: dict[int, Channel] = {}
         self._doubtful: dict[int, Channel] = {}
         """Connections whose type is damaged, for those that no other record defines."""
+        self._unread: dict[int, str] = {}
+        """By number of a chunk that could not be unpacked: the end of the sentence about it."""
+        self._contents: Contents | None = None
         self._layout = read_layout(self._file, length, self._connect, self._name)
-        self._losses = ChunkLosses(self._name, length, self._layout, self._channels, notes)
+        self._losses = FileLosses(self._name, length, self._layout, self._channels, notes)
         local = not isinstance(path, RemotePath)
         self._at = reader_at(self._file, local)
         sizes = [chunk.size for chunk in self._layout.chunks]
         self._data = Chunks(self._unpack, self._add_damaged_chunk, sizes.__getitem__, lambda _: True, local)
 
     def contents(self) -> Contents:
-        """Counted by the indexes; a chunk without is unpacked, as all are where a connection is not defined."""
-        by_id, times = self._counted()
-        if (by_id.keys() | self._doubtful.keys()) - self._channels.keys():
-            for row in range(len(self._layout.chunks)):  # which define their connections too
-                self._found(row, self._data(row))
-            for connection, channel in self._doubtful.items():
-                self._channels.setdefault(connection, channel)
-            by_id, times = self._counted()
-        return self._losses.contents(by_id, times, "index")
+        """Return the counts by the indexes of the chunks, which are read only if the file is damaged or has none."""
+        self._contents = self._contents or self._losses.contents(self._read_chunk, self._define_all)
+        return self._contents
 
-    def _counted(self) -> tuple[Counter[int], list[int]]:
-        """Messages by connection, and log times of each chunk, the first and last among them."""
-        counts: Counter[int] = Counter()
-        times: list[int] = []
-        for row, chunk in enumerate(self._layout.chunks):
-            if self._losses.is_counted(row) and chunk.counts.keys() <= self._channels.keys() and chunk.last_ns:
-                found = chunk.counts
-                times += chunk.first_ns, chunk.last_ns
-            else:
-                messages = self._found(row, self._data(row))
-                found = Counter(connection for connection, *_ in messages)
-                own = [log_ns for _, log_ns, _, _ in messages]
-                chunk.first_ns = min([*own, chunk.first_ns] if chunk.first_ns else own, default=0)
-                chunk.last_ns = max([*own, chunk.last_ns])
-                times += sampled(own)
-                if not chunk.damaged:
-                    chunk.counts = dict(found)
-            if chunk.damaged:
-                found = Counter(found) | Counter(chunk.counts)
-            if chunk.listed and (chunk.disputed or not chunk.damaged) and found != chunk.listed:
-                self._layout.recorded = {}  # the bag's index is what is damaged
-            counts.update(found)
-        return counts, times
+    def _read_chunk(self, row: int) -> ChunkRead:
+        found, outcome = self._found(row, self._data(row))
+        return outcome._replace(log_ns=[log_ns for _, log_ns, _, _ in found])
+
+    def _define_all(self, ids: Set[int]) -> None:
+        """Read chunks, which define their connections too, until these are defined; then take damaged definitions."""
+        for row in range(len(self._layout.chunks)):
+            if (ids | self._doubtful.keys()) <= self._channels.keys():
+                return
+            self._found(row, self._data(row))
+        for connection, channel in self._doubtful.items():
+            self._channels.setdefault(connection, channel)
 
     def messages(self, channels: Collection[Channel], header_only: Collection[Channel] = ()) -> Iterator[Message]:
         wanted, chunks = set(channels), self._layout.chunks
         rows = (row for row, chunk in enumerate(chunks) if self._losses.may_hold(chunk, wanted))
         for row, data in self._data.iterate(rows):
-            if data is None or not self._losses.may_hold(chunks[row], wanted):  # by a connection that came meanwhile
-                continue
-            for connection, log_ns, start, stop in self._found(row, data):
+            found, outcome = self._found(row, data or b"")
+            for connection, log_ns, start, stop in found:
                 if (channel := self._channels.get(connection)) in wanted and channel:
-                    yield Message(channel, log_ns, part_of(data, start, stop), (row, start, stop))
+                    yield Message(channel, log_ns, part_of(data or b"", start, stop), (row, start, stop))
+            self._losses.check(outcome)
 
     def read(self, place: Place) -> RawData:
         return self._data.part(*place)
@@ -93,9 +78,8 @@ class Ros1Bag:
         known = self._channels if b"type" in about else self._doubtful
         known.setdefault(number(header, b"conn"), Channel(topic, kind, "ros1"))
 
-    def _found(self, row: int, data: bytes) -> list[tuple[int, int, int, int]]:
-        """Connection, log time, start and stop of every message in a chunk; what it was short of is accounted for."""
-        chunk = self._layout.chunks[row]
+    def _found(self, row: int, data: bytes) -> tuple[list[tuple[int, int, int, int]], ChunkRead]:
+        """Return the connection, log time, start and stop of every message in a chunk, and the outcome of reading."""
         found: list[tuple[int, int, int, int]] = []
         position = 0
         while position < len(data):
@@ -113,17 +97,12 @@ class Ros1Bag:
                     raise self._budget.error()
             position = stop
         self._budget.charge_messages(row, len(found))
-        damaged = position < len(data) and not chunk.cut
+        damaged = position < len(data) and not self._layout.chunks[row].cut
         if damaged and found:
             found.pop()  # its length may be what is damaged
-        counts = Counter(connection for connection, *_ in found)
-        last_ns = found[-1][1] if found else chunk.first_ns
-        span = [(min(last_ns, chunk.last_ns or last_ns), max(last_ns, chunk.last_ns))] if last_ns else []
-        if damaged:
-            chunk.damaged = True
-            self._losses.add_chunk(chunk, counts, span, "; the rest of it is left out")
-        self._losses.add_unknown(chunk, counts, damaged, span)
-        return found
+        problem = self._unread.get(row, "; the rest of it is left out" if damaged else "")
+        counts, last_ns = Counter(connection for connection, *_ in found), found[-1][1] if found else None
+        return found, ChunkRead(row, counts, [], last_ns, problem)
 
     def _unpack(self, row: int) -> bytes:
         """The records of one chunk. Raises BadChunkError where it is damaged."""
@@ -133,7 +112,4 @@ class Ros1Bag:
         return unpack(chunk.compression or "", data, chunk.size, chunk.cut, charge)
 
     def _add_damaged_chunk(self, row: int, error: BadChunkError) -> None:
-        chunk = self._layout.chunks[row]
-        chunk.damaged = True
-        span = [(chunk.first_ns, chunk.last_ns)] if chunk.last_ns else []
-        self._losses.add_chunk(chunk, {}, span, f", left out: {error}")
+        self._unread[row] = f", left out: {error}"

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import re
 import struct
-from collections import Counter
 from collections.abc import Callable
 from typing import BinaryIO
 
 from vplog.errors import LogError
-from vplog.logs.formats.chunk_layout import MOST_GAPS, Chunk, Layout, ResyncSearch
+from vplog.logs.formats.salvage import MAX_GAPS, Chunk, Layout, ResyncSearch
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
@@ -62,9 +61,9 @@ class _LayoutReader:
         self._length, self._connect = length, connect
         self.layout = Layout()
         self._infos: dict[int, Chunk] = {}
-        """By offset of their record: chunks as the bag's index lists them."""
+        """By offset of its record: chunks as the bag's index lists them."""
         self._index_sound = True
-        """Whether the records of the bag's index are as long as they say."""
+        """Whether the bag's index lists each chunk once, with as many counts as it says."""
         self._indexing: Chunk | None = None
         """The chunk whose index records come by."""
         self._index_at = self._chunk_count = 0
@@ -83,7 +82,7 @@ class _LayoutReader:
                 or not self._is_record(stop, behind_chunk=inside)
                 or (inside and _is_too_long(header, stop - start))
             ):
-                found = self._next_record(position) if len(self.layout.gaps) < MOST_GAPS else None
+                found = self._next_record(position) if len(self.layout.gaps) < MAX_GAPS else None
                 if header is None or not self._is_sound(header) or (found or start) < start:
                     if position == self.layout.appended_at:
                         return
@@ -142,36 +141,37 @@ class _LayoutReader:
         return (chunks[-1].record if chunks else 0) < self._index_at <= position
 
     def finish(self) -> None:
-        """Hold what was found against the bag's index."""
+        """Compare the chunks that were found with those in the bag's index."""
         layout = self.layout
-        found = {chunk.record: chunk for chunk in layout.chunks}
-        skipped, layout.missing, listed = layout.missing, [], len(self._infos) == self._chunk_count
+        complete = self._index_sound and len(self._infos) == self._chunk_count
+        layout.sound &= not layout.gaps
+        found, absent = {chunk.record: chunk for chunk in layout.chunks}, list[Chunk]()
         others = found.keys() - self._infos.keys()  # by bytes inserted or lost, or a damaged index
         for offset, info in sorted(self._infos.items()):
-            if (chunk := found.get(offset)) is not None and not _is_another(chunk, info):
-                chunk.first_ns, chunk.last_ns = info.first_ns, info.last_ns
-                if chunk.counts and chunk.counts != info.counts and not chunk.doubtful:
-                    chunk.doubtful = chunk.disputed = True
-                chunk.listed = info.counts
-                chunk.counts = chunk.counts or ({} if info.doubtful else info.counts)
-            elif chunk is None and self._is_chunk(offset):  # it was jumped over
+            chunk = found.get(offset)
+            if chunk is None and self._is_chunk(offset):  # the search for the next record missed it
                 header, start, stop = self._head(offset)
                 self._record(_CHUNK, header or {}, offset, start, stop)
                 layout.chunks[-1].counts = info.counts
-            elif layout.is_in_gap(offset):  # else the index is damaged
+            elif chunk is None:
                 info.doubtful |= bool(others)  # then it may be one of these
-                layout.missing.append(info)
-            else:
-                listed = False
-        if self._index_sound and len(self._infos) == self._chunk_count:
-            recorded = Counter[int]()
+                absent.append(info)
+            elif not _is_another(chunk, info):
+                chunk.first_ns, chunk.last_ns = info.first_ns, info.last_ns
+                if chunk.doubtful or not chunk.counts:
+                    chunk.counts, chunk.doubtful = info.counts, info.doubtful
+                elif chunk.counts != info.counts:  # one of the two indexes is damaged
+                    complete, layout.sound, chunk.doubtful = False, False, True
+        if complete:
             for info in self._infos.values():
-                recorded.update(info.counts)
-            layout.recorded = dict(recorded)
-        if not self._infos or not listed:
-            layout.missing += skipped
+                for connection, count in info.counts.items():
+                    layout.recorded[connection] = layout.recorded.get(connection, 0) + count
+        in_gaps = [info for info in absent if layout.is_in_gap(info.record)]
+        whole = 0 < len(self._infos) == self._chunk_count and len(in_gaps) == len(absent)
+        layout.missing = in_gaps if whole else layout.missing + in_gaps
         layout.gaps = []  # each has its chunk among the missing ones
-        layout.in_order()
+        layout.sound &= not (absent or layout.missing)
+        layout.chunks.sort(key=lambda chunk: chunk.start)
         ended = self._infos or 0 < self._index_at <= (layout.cut_at or 0)
         if layout.cut_at is not None and ended and not layout.missing:
             layout.cut_at, layout.index_cut_at = None, layout.cut_at

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from vplog.errors import LogError, plural
 from vplog.logs.formats.budget import Budget
-from vplog.logs.formats.chunk_layout import ResyncSearch
 from vplog.logs.formats.container import Channel, Contents, Message, Notes, Place, by_topic
 from vplog.logs.formats.loss_account import confirmed_span, main_span
+from vplog.logs.formats.salvage import ResyncSearch
 
 MAGIC = b"SQLite format 3\x00"
 _DAMAGE = (sqlite3.Error, OverflowError, UnicodeDecodeError)
