@@ -74,6 +74,8 @@ _OUTSIDE_CHUNKS = re.compile(rb"[\x06-\x0f].{5}\x00{3}", re.DOTALL)
 """The opcode of a record that lies in no chunk, and a length below 2^40 bytes."""
 _CHUNKS = re.compile(rb"[\x06\x07].{5}\x00{3}", re.DOTALL)
 """The opcode of a chunk or a message index, and a length below 2^40 bytes."""
+_MESSAGES = re.compile(rb"\x05.{3}\x00{5}", re.DOTALL)
+"""The opcode of a message, and a length below 2^24 bytes."""
 _UNCHUNKED = re.compile(rb"[\x03-\x05\x09\x0c\x0f].{3}\x00{5}", re.DOTALL)
 """The opcode of a record in the data of a file without chunks, and a length below 2^24 bytes."""
 _BAD_RECORD = (McapError, struct.error, UnicodeDecodeError)
@@ -178,7 +180,7 @@ class _Walk:
         while True:
             opcode, stop = self._bounds(position)
             if not opcode:
-                if data_ended and self._search.first(_CHUNKS, position, self._is_record) is None:
+                if data_ended and not self._has_messages(position):
                     self.layout.index_cut_at = min(position, self._length)
                     self.layout.appended_at = self._search.first(_BEGIN, position)
                     return
@@ -364,13 +366,20 @@ class _Walk:
             first_ns = int.from_bytes(self.at(found + _INDEX_HEAD.size, 8), "little")
             if chunks and chunks[-1].record >= 0 and chunks[-1].first_ns <= first_ns <= chunks[-1].last_ns:
                 self._indexing = chunks[-1]
-                return found  # a damaged index, and no message
-            is_one = self._is_chunk(position, found - position - RECORD.size)
-            self._indexing = Chunk(position, found, record=position, doubtful=not is_one)
-            layout.missing.append(self._indexing)
-        else:
+            else:
+                is_one = self._is_chunk(position, found - position - RECORD.size)
+                self._indexing = Chunk(position, found, record=position, doubtful=not is_one)
+                layout.missing.append(self._indexing)
+                return found
+        least = _CHUNK_HEAD.size + 8 if self._chunked else _MESSAGE_HEAD.size
+        if found - position >= RECORD.size + least:  # else no message has room in it
             layout.gaps.append((position, found))
         return found
+
+    def _has_messages(self, position: int) -> bool:
+        """Return whether a chunk or, in a file without chunks, a message follows from `position` on."""
+        pattern, accept = (_CHUNKS, self._is_record) if self._chunked else (_MESSAGES, self._is_likely)
+        return self._search.first(pattern, position, accept) is not None
 
     def _is_chunk(self, position: int, length: int) -> bool:
         """Return whether the lengths in the head of a chunk agree with that of the record and with each other."""

@@ -173,6 +173,9 @@ class FileLosses:
             by_id, times, damaged = self._count(read)
         for chunk_read in damaged:
             self._add_chunk(chunk_read)
+        # Bytes that follow a damaged chunk without an index are a part of the same loss.
+        open_ends = {chunk.stop for chunk in (self.layout.chunks[read.number] for read in damaged) if chunk.doubtful}
+        self.layout.gaps = [gap for gap in self.layout.gaps if gap[0] not in open_ends]
         counts = dict.fromkeys(self.channels.values(), 0)
         for number in by_id.keys() & self.channels.keys():
             counts[self.channels[number]] += by_id[number]
