@@ -238,16 +238,13 @@ class _Walk:
                 agrees = self._length_by_fields(kind, start) == length and stop <= self._length
             if agrees:
                 return kind, stop
-        known = opcode in _SHAPES
         by_fields = start + (self._length_by_fields(opcode, start) or 0)
         for end in sorted({stop, by_fields}):
-            if ((known and end > start) or end == stop) and self._is_record(end, after=opcode):
+            if end > start and self._is_record(end, after=opcode, longer=end == stop):
                 return opcode, end
-            if known and end > start and not nested and self._bounds(end, nested=True)[0] in _SHAPES:
-                return opcode, end
-        longer = 0 < by_fields < stop and self._is_record(stop, after=opcode, longer=True)
-        private = opcode >= _PRIVATE and stop <= self._length
-        return (opcode, stop) if longer or private else (0, 0)  # longer: with fields of a later version
+            if end > start and opcode in _SHAPES and not nested and self._bounds(end, nested=True)[0] in _SHAPES:
+                return opcode, end  # the next record is damaged too
+        return (opcode, stop) if opcode >= _PRIVATE and stop <= self._length else (0, 0)
 
     def _length_by_fields(self, opcode: int, start: int) -> int | None:
         """Bytes of a record whose fields begin at `start`, by the lengths among them."""
@@ -259,7 +256,7 @@ class _Walk:
         return at - start
 
     def _is_record(self, position: int, after: int = 0, longer: bool = False) -> bool:
-        """Return whether a record lies here whose two lengths agree, or that is `longer` than its fields, or the end of
+        """Return whether a record lies here whose two lengths agree, or that is `longer` than its fields (a later version), or the end of
         the file. After a chunk, records that lie in chunks do not count."""
         head = self.at(position, RECORD.size)
         if len(head) < RECORD.size:
