@@ -256,8 +256,8 @@ class _Walk:
         return at - start
 
     def _is_record(self, position: int, after: int = 0, longer: bool = False) -> bool:
-        """Return whether a record lies here whose two lengths agree, or that is `longer` than its fields (a later version), or the end of
-        the file. After a chunk, records that lie in chunks do not count."""
+        """Return whether a record lies here whose two lengths agree, or the end of the file. A record that is `longer`
+        than its fields is of a later version. After a chunk, records that lie in chunks do not count."""
         head = self.at(position, RECORD.size)
         if len(head) < RECORD.size:
             return position == self._length or (head == MAGIC and position + len(head) == self._length)

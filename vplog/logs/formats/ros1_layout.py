@@ -38,10 +38,6 @@ _RECORD_START = re.compile(
 """Length of a header below 256 bytes, and its first field, one of a chunk's or an index's."""
 _BEGIN = re.compile(re.escape(MAGIC))
 """Magic bytes of a recording: another one may be appended to the first."""
-_HEAD = 256
-"""Bytes in which the fields of the bag's own header end."""
-_PACKED = 1.02
-"""Times the size of a chunk up to which its packed length is believed: lz4 and bzip2 add less than 2 % to noise."""
 _Head = tuple[dict[bytes, bytes] | None, int, int]
 """Header of a record, None where it is damaged, and where its data start and stop."""
 
@@ -72,73 +68,72 @@ class _LayoutReader:
         self._last: tuple[int, _Head] = -1, (None, 0, 0)
 
     def records(self, position: int) -> None:
+        """Read every record from here on, to the end."""
         while position < self._length or position == len(MAGIC):
             header, start, stop = self._head(position)
-            found, inside = None, header is not None and number(header, b"op") == _CHUNK
-            lost = alone = False
-            if (
-                header is None
-                or not self._is_sound(header)
-                or not self._is_record(stop, behind_chunk=inside)
-                or (inside and _is_too_long(header, stop - start))
-            ):
-                found = self._next_record(position) if len(self.layout.gaps) < MAX_GAPS else None
-                if header is None or not self._is_sound(header) or (found or start) < start:
-                    if position == self.layout.appended_at:
-                        return
-                    if found is None:
-                        if self._indexing is not None:
-                            self._indexing.doubtful = True
-                        self.layout.cut_at = position
-                        return
-                    self._skip(position, found)
-                    position = found
-                    continue
-                own = stop
-                stop, lost = self._stop(header, start, stop, found)
-                alone = inside and not _is_too_long(header, stop - start) and stop <= own
-            if inside or not lost:
-                self._record(number(header, b"op"), header, position, start, stop)
-            if lost:
-                self._skip(position, stop, known=alone)
-            position = stop
+            op = number(header, b"op") if header is not None and self._is_sound(header) else -1
+            end = self._end(position, op)
+            if end is None:
+                if self._indexing is not None:
+                    self._indexing.doubtful = True
+                end = self._repaired_end(position, op)
+            if end is None:
+                return
+            if header is not None and op >= 0:
+                self._record(op, header, position, start, end)
+                if op == _CHUNK and end != stop and self._indexing is not None:
+                    self._indexing.doubtful = True  # the first records of its index may be in what was skipped
+            position = end
         if position > self._length or (self._index_at > self._length and not self._infos):
             self.layout.cut_at = self._length
 
-    def _stop(self, header: dict[bytes, bytes], start: int, stop: int, found: int | None) -> tuple[int, bool]:
-        """Where a record stops that has none behind it, and whether more than its own bytes may lie up to there."""
-        op, end = number(header, b"op"), None
+    def _repaired_end(self, position: int, op: int) -> int | None:
+        """Return the end of a record without a valid one after it: where the next valid record begins, unless it is the
+        bag's own, which is filled up with blanks, or a chunk whose size confirms its length. None if nothing follows
+        that can be read."""
+        found = self._next_record(position) if len(self.layout.gaps) < MAX_GAPS else None
+        header, start, stop = self._head(position)
+        if position == self.layout.appended_at:
+            return None
+        if header is None or op not in (_BAG, _CHUNK) or (found is not None and found < start):
+            if found is None:
+                self.layout.cut_at = position
+            else:
+                self._skip(position, found)
+            return found
+        if found is None:
+            return stop
+        if op == _BAG:
+            rest = self.at(start, min(found - start, _MAX_HEADER))
+            return start + len(rest) - len(rest.lstrip(b" "))
+        by_size = start + number(header, b"size")
+        if header[b"compression"] == b"none" and by_size == stop <= found:
+            return stop
+        if found != stop:
+            self._skip(position, found, is_chunk=found <= min(stop, by_size))
+        return found
+
+    def _end(self, position: int, op: int) -> int | None:
+        """Return the end of a record by its length or its fields: if both agree, or a valid record lies there."""
+        header, start, stop = self._head(position)
+        if header is None or op < 0:
+            return None
         if op in _ENTRY:
-            end = start + _ENTRY[op] * number(header, b"count")
-        elif op == _BAG:  # filled up with blanks
-            most = max(stop, found or 0)
-            end = most - len(self.at(start, most - start).lstrip())
-        elif op == _CHUNK and header[b"compression"] == b"none":
-            end = start + number(header, b"size")
-        if end is not None and (
-            end in (stop, found) or (op != _BAG and self._is_record(end, behind_chunk=op == _CHUNK))
-        ):
-            return end, False
-        return stop if found is None else found, found not in (None, stop)
+            by_fields = start + _ENTRY[op] * number(header, b"count")
+            is_whole = by_fields == stop <= self._length
+            return stop if is_whole else next(filter(self._is_record, (stop, by_fields)), None)
+        if op == _CHUNK and stop - start > number(header, b"size") and self._next_record(position) != stop:
+            return None  # it ends after the record that follows it
+        return stop if self._is_record(stop, after_chunk=op == _CHUNK) else None
 
-    def _skip(self, position: int, found: int, known: bool = False) -> None:
-        """Take note of bytes without a record, in which chunks may lie. `known`: the first is a chunk that is read."""
-        self.layout.gaps.append((position, found))
-        if self._indexing is not None:
-            self._indexing.doubtful = True
-        if not known and not self._is_behind_chunks(position) and not self._is_own_header(position, found):
-            self._indexing = Chunk(position, found, record=position, doubtful=True)
+    def _skip(self, position: int, stop: int, is_chunk: bool = False) -> None:
+        """Skip bytes without a valid record, in which chunks may lie unless they are one chunk that is read."""
+        self.layout.gaps.append((position, stop))
+        behind = (self.layout.chunks[-1].record if self.layout.chunks else 0) < self._index_at <= position
+        is_header = position == len(MAGIC) and self.at(stop - 1, 1) == b" "  # the bag's own, filled up with blanks
+        if not (is_chunk or behind or is_header):
+            self._indexing = Chunk(position, stop, record=position, doubtful=True)
             self.layout.missing.append(self._indexing)
-
-    def _is_own_header(self, position: int, found: int) -> bool:
-        """Whether bytes without a record are the bag's own header, which is filled up with blanks."""
-        blanks = self.at(position + _HEAD, min(found - position - _HEAD, _MAX_HEADER))
-        return position == len(MAGIC) and bool(blanks) and not blanks.strip(b" ")
-
-    def _is_behind_chunks(self, position: int) -> bool:
-        """Whether the bag's index lies before a position."""
-        chunks = self.layout.chunks
-        return (chunks[-1].record if chunks else 0) < self._index_at <= position
 
     def finish(self) -> None:
         """Compare the chunks that were found with those in the bag's index."""
@@ -197,13 +192,13 @@ class _LayoutReader:
     def _is_sound(self, header: dict[bytes, bytes]) -> bool:
         return header.keys() >= _FIELDS.get(number(header, b"op"), {b""})
 
-    def _is_record(self, position: int, behind_chunk: bool = True) -> bool:
+    def _is_record(self, position: int, after_chunk: bool = True) -> bool:
         """Whether the head of a record lies here, or the end of the file. Connections lie in chunks too, but behind one
         only where the index begins."""
         header, _, _ = self._head(position)
         if header is None or not self._is_sound(header):
             return position == self._length
-        return not behind_chunk or number(header, b"op") != CONNECTION or 0 < self._index_at <= position
+        return not after_chunk or number(header, b"op") != CONNECTION or 0 < self._index_at <= position
 
     def _is_chunk(self, position: int) -> bool:
         header, _, stop = self._head(position)
@@ -279,11 +274,6 @@ def time_ns(value: bytes) -> int:
     """Nanoseconds of a ROS time: u32 seconds, u32 nanoseconds; 0 where its bytes are not so many."""
     seconds, nanoseconds = struct.unpack("<II", value) if len(value) == 8 else (0, 0)
     return seconds * 1_000_000_000 + nanoseconds
-
-
-def _is_too_long(header: dict[bytes, bytes], length: int) -> bool:
-    """Whether a chunk of so many bytes may be shorter, and its length that up to the index of a later one."""
-    return length > number(header, b"size") * (1 if header[b"compression"] == b"none" else _PACKED)
 
 
 def _is_another(chunk: Chunk, info: Chunk) -> bool:
