@@ -55,8 +55,14 @@ class Chain:
     def __init__(self, parts: Sequence[Container], notes: Notes, metadata: Metadata | None = None) -> None:
         """With `metadata` that count the recorded messages, lost ones are counted."""
         self._parts, self._notes, self._metadata = parts, notes, metadata
+        self._contents: Contents | None = None
 
     def contents(self) -> Contents:
+        """Return the contents of all parts, and account once for what the metadata count and no part holds."""
+        self._contents = self._contents or self._count()
+        return self._contents
+
+    def _count(self) -> Contents:
         found = [part.contents() for part in self._parts]
         counts: Counter[Channel] = Counter()
         for contents in found:

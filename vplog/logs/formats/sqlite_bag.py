@@ -56,6 +56,7 @@ class SqliteBag:
         """The first damage that was met, in a sentence."""
         self._by_id: Counter[int] = Counter()
         """Messages by topic number, once they are counted."""
+        self._contents: Contents | None = None
         log = Path(f"{path}-wal")
         pending = log.is_file() and log.stat().st_size > 0
         try:
@@ -71,6 +72,10 @@ class SqliteBag:
             notes.account.add_appended(self._name, appended_at, path.stat().st_size)
 
     def contents(self) -> Contents:
+        self._contents = self._contents or self._count()
+        return self._contents
+
+    def _count(self) -> Contents:
         self._by_id = Counter(dict.fromkeys(self._topics, 0))
         times: dict[int, list[int]] = {}
         for topic, count, *ends in self._counted():
@@ -89,22 +94,23 @@ class SqliteBag:
         return Contents(dict(sorted(counts.items())), *confirmed_span(ends))
 
     def _counted(self) -> list[tuple]:
-        """Topic number, messages, first and last time, of each topic or, in a damaged file, of each row."""
+        """Return the topic number, messages, first and last time of each topic or, in a damaged file, of each row."""
         try:
             most = self._path.stat().st_size // _LEAST_ROW
             found = [] if self._damage else [*self._execute(_COUNTS, most)]
             count = sum(row[1] for row in found)
             if any(row[4] for row in found) or count == most:
                 self._add_damage("its row numbers do not increase")
-            elif self._most_by_index() > count < self._most_by_index("DISTINCT rowid"):
+            elif self._listed("*") > count < self._listed():
                 self._add_damage("an index of its messages lists more of them")
             if not self._damage:
                 return [row[:4] for row in found]
         except _DAMAGE as error:
             self._add_damage(str(error))
         salvaged = [(topic, 1, time_ns) for _, topic, time_ns, _ in self._salvaged(0)]
-        if 0 < len(salvaged) == self._most_by_index() and {topic for topic, *_ in salvaged} <= self._topics.keys():
-            self._notes.account.add("damaged_bytes", {"": 0}, (self._name, 0), [], self._damage)
+        if 0 < len(salvaged) <= (listed := self._listed()):  # else the index is damaged too
+            lost = listed - sum(topic in self._topics for topic, *_ in salvaged)
+            self._notes.account.add("damaged_bytes", {"": lost}, (self._name, 0), [], self._damage)
         return salvaged
 
     def _add_damage(self, reason: str) -> None:
@@ -112,13 +118,13 @@ class SqliteBag:
         self._damage = self._damage or f"{self._name} is damaged: {reason}."
         self._notes.account.add("damaged_bytes", None, (self._name, 0), [], self._damage)
 
-    def _most_by_index(self, what: str = "*") -> int:
-        """Messages that the longest index of their table lists, or of `what` in it."""
+    def _listed(self, what: str = "DISTINCT rowid") -> int:
+        """Return how many messages the longest index of their table lists (`what` is counted); 0 if none is sound."""
         most = 0
         for _, name, *_ in self._rows("PRAGMA index_list(messages)"):
             index = '"' + name.replace('"', '""') + '"'
             query = f"SELECT count({what}) FROM (SELECT rowid FROM messages INDEXED BY {index})"  # noqa: S608 - quoted
-            most = max(most, *self._first(query) or [0])  # none where the index is what is damaged
+            most = max(most, *self._first(query) or [0])
         return most
 
     def messages(self, channels: Collection[Channel], header_only: Collection[Channel] = ()) -> Iterator[Message]:
@@ -183,7 +189,7 @@ class SqliteBag:
     def _last_row(self) -> int:
         """The highest number of a row, by the table or its indexes; where none is sound, the most there can be."""
         (found,) = self._first("SELECT max(rowid) FROM messages") or (None,)
-        return found if isinstance(found, int) else self._most_by_index() or self._path.stat().st_size // _LEAST_FOUND
+        return found if isinstance(found, int) else self._listed() or self._path.stat().st_size // _LEAST_FOUND
 
     def _row(self, number: int) -> tuple | None:
         """A row by its number; None where it is not there or not whole."""
