@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import random
 import sqlite3
+import struct
 from collections import Counter
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
@@ -498,6 +499,51 @@ def test_pages_of_a_database_in_each_others_place_are_accounted_for(tmp_path: Pa
 def every_message(path: Path, notes: Notes) -> list[Message]:
     container, _ = open_container(path, notes)
     return list(container.messages(container.contents().counts))
+
+
+def test_messages_after_a_false_end_of_the_data_are_read(tmp_path: Path) -> None:
+    """Damage in a file without chunks looks like the end of its data."""
+    form = FORMATS["mcap-unchunked-no-summary"]
+    path = form.write(tmp_path)
+    whole = path.read_bytes()
+    for field in [field for field in FIELDS[".mcap"](whole) if field.name == "message.record_length"][5:15]:
+        start, data_end = field.offset - 1, struct.pack("<BQI", 15, 4, 0)
+        path.write_bytes(whole[:start] + data_end + b"\xff" * 10 + whole[start + len(data_end) + 10 :])
+        notes = Notes()
+        read = Counter((m.channel.topic, m.log_ns, bytes(m.data)) for m in every_message(path, notes))
+        assert not read - WRITTEN
+        assert (WRITTEN - read).total() <= 2  # the damaged message and the one before, whose length may be damaged
+        assert [loss.messages for loss in notes.account.losses] == [None]
+
+
+def test_chunks_in_each_others_place_lose_nothing(tmp_path: Path) -> None:
+    """The index of the file is sound, and its chunks are not where it says."""
+    path = write_mcap(tmp_path / "log.mcap", compression=CompressionType.LZ4)
+    whole = path.read_bytes()
+    a, b, c = chunk_starts(whole, ".mcap")[1:4]
+    path.write_bytes(whole[:a] + whole[b:c] + whole[a:b] + whole[c:])
+    notes = Notes()
+    read = Counter((m.channel.topic, m.log_ns, bytes(m.data)) for m in every_message(path, notes))
+    assert (read, notes.account.losses) == (WRITTEN, [])
+
+
+def test_rows_that_a_damaged_page_lost_are_counted_by_the_index(tmp_path: Path) -> None:
+    path = write_db3(tmp_path / "log.db3")
+    with sqlite3.connect(path) as db:
+        db.execute("CREATE INDEX IF NOT EXISTS timestamp_idx ON messages (timestamp)")
+        (topic,) = db.execute("SELECT min(topic_id) FROM messages").fetchone()
+        rows = [(topic, START_NS + number, bytes(200)) for number in range(300)]
+        db.executemany("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", rows)
+    db.close()
+    written = WRITTEN.total() + len(rows)
+    whole, page = path.read_bytes(), int.from_bytes(path.read_bytes()[16:18], "big")
+    leaves = [at for at in range(page, len(whole), page) if whole[at] == 13 and whole[at + 4] > 9]  # of several rows
+    for at in leaves[1:4]:
+        path.write_bytes(whole[:at] + b"\xff" * page + whole[at + page :])
+        notes = Notes()
+        read = len(every_message(path, notes))
+        (loss,) = notes.account.losses
+        assert read < read + (loss.messages or 0) == written
 
 
 def test_an_index_that_is_cut_off_ends_with_the_file(tmp_path: Path) -> None:

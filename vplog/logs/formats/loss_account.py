@@ -186,7 +186,7 @@ class LossAccount:
         found = [
             ns for places in self._copy().values() for lost in places.values() for span in lost.spans for ns in span
         ]
-        return main_span([ns for ns in found if ns])
+        return confirmed_span([ns for ns in found if ns])
 
     @property
     def sentences(self) -> list[str]:
@@ -197,11 +197,10 @@ class LossAccount:
     def _sentence(self, reason: str, group: list[TopicLoss]) -> str:
         known = [loss.messages for loss in group if loss.messages is not None]
         total = sum(known)
-        what = "an unknown number of messages"
-        if known:
-            what = "no message" if not total else plural(total, "message")
-        if known and len(known) < len(group):
-            what += " and more that cannot be counted,"
+        is_counted = len(known) == len(group)
+        what = plural(total, "message") if total else "no message" if is_counted else "an unknown number of messages"
+        if total and not is_counted:
+            what = f"at least {what}"
         named = [f"{loss.topic}{_count(loss)}" for loss in group if loss.topic]
         which, more = ", ".join(named[:_NAMED]), len(named) - _NAMED
         which += "" if more <= 0 else " and another topic" if more == 1 else f" and {more} more topics"
@@ -239,27 +238,16 @@ def sampled(log_ns: Collection[int]) -> list[int]:
     return [ordered[at] for at in (0, len(ordered) // 2, -1)] if ordered else []
 
 
-def _runs(times: Collection[int]) -> list[list[int]]:
-    """The times in order, in runs without a day between two of them."""
+def confirmed_span(times: Collection[int]) -> Span:
+    """Return the first and last of these log times. A time that is a day from all others is left out, because damage
+    has changed it, unless there are no others."""
     runs: list[list[int]] = []
     for time_ns in sorted(times):
         if runs and time_ns - runs[-1][-1] <= _FARTHEST_NS:
             runs[-1].append(time_ns)
         else:
             runs.append([time_ns])
-    return runs or [[0]]
-
-
-def main_span(times: Collection[int]) -> Span:
-    """Where most of these log times lie, without a day between two of them: damage may have put others anywhere."""
-    longest = max(_runs(times), key=len)
-    return longest[0], longest[-1]
-
-
-def confirmed_span(times: Collection[int]) -> Span:
-    """From the first to the last of these log times, but for one alone a day from all others: damage put it there."""
-    runs = _runs(times)
-    several = [run for run in runs if run[0] < run[-1]] or [max(runs, key=len)]
+    several = [run for run in runs if run[0] < run[-1]] or [max(runs, key=len, default=[0])]
     return several[0][0], several[-1][-1]
 
 

@@ -17,7 +17,7 @@ from typing import BinaryIO, NamedTuple
 
 from vplog.errors import plural
 from vplog.logs.formats.container import Channel, Contents, Notes, by_topic, topics_of
-from vplog.logs.formats.loss_account import Span, confirmed_span, main_span, sampled
+from vplog.logs.formats.loss_account import Span, confirmed_span, sampled
 
 MAX_GAPS = 1000
 """Maximum number of damaged places in one file. A file with more is read up to the last of them."""
@@ -179,7 +179,7 @@ class FileLosses:
         counts = dict.fromkeys(self.channels.values(), 0)
         for number in by_id.keys() & self.channels.keys():
             counts[self.channels[number]] += by_id[number]
-        span = main_span(times)
+        span = confirmed_span(times)
         if unknown := by_id.total() - sum(counts.values()):
             self.notes.account.add("unknown_channel", {"": unknown}, (self.name, 0), [span])
         self._add_damage(sum(counts.values()), span)

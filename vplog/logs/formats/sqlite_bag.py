@@ -13,7 +13,7 @@ from pathlib import Path
 from vplog.errors import LogError, plural
 from vplog.logs.formats.budget import Budget
 from vplog.logs.formats.container import Channel, Contents, Message, Notes, Place, by_topic
-from vplog.logs.formats.loss_account import confirmed_span, main_span
+from vplog.logs.formats.loss_account import confirmed_span
 from vplog.logs.formats.salvage import ResyncSearch
 
 MAGIC = b"SQLite format 3\x00"
@@ -88,7 +88,7 @@ class SqliteBag:
         if not self._damage and (unknown := self._by_id.total() - counts.total()):
             detail = f"{name} has {plural(unknown, 'row')} of topics that it does not list."
             account.add("unknown_channel", None, (name, 0), [], detail)
-        log_span = main_span([time_ns for known in times.values() for time_ns in known])
+        log_span = confirmed_span([time_ns for known in times.values() for time_ns in known])
         account.set_recorded(name, {} if self._damage else by_topic(counts), *log_span)
         ends = [time_ns for topic in times.keys() & self._topics.keys() for time_ns in times[topic]]
         return Contents(dict(sorted(counts.items())), *confirmed_span(ends))
