@@ -51,6 +51,8 @@ class Chunk:
     """Messages per channel id by its index; empty if unknown."""
     doubtful: bool = False
     """True if its index may be incomplete."""
+    counted: bool = False
+    """True if it was read to its end, so that `counts` are right."""
 
 
 @dataclass
@@ -160,8 +162,8 @@ class FileLosses:
     def may_hold(self, chunk: Chunk, wanted: set[Channel]) -> bool:
         """Return False if the index of a chunk names only channels that are defined and not wanted."""
         known = self.channels
-        listed = chunk.counts if self.layout.sound and not chunk.doubtful else ()
-        return not listed or any(known.get(i) in wanted or i not in known for i in listed)
+        listed = chunk.counts if chunk.counted or (self.layout.sound and not chunk.doubtful) else ()
+        return (not listed and not chunk.counted) or any(known.get(i) in wanted or i not in known for i in listed)
 
     def contents(self, read: Callable[[int], ChunkRead], define: Callable[[Set[int]], None]) -> Contents:
         """Return the number of messages, and account for all that are lost. Chunks without an index, and all chunks of
@@ -206,8 +208,10 @@ class FileLosses:
             times += sampled(chunk_read.log_ns)
             if self._is_damaged(chunk_read):
                 damaged.append(chunk_read._replace(log_ns=[]))
-            elif chunk.counts and not chunk.doubtful and chunk.counts != chunk_read.counts:
-                self.layout.recorded = {}  # the index is what is damaged
+            elif not chunk.cut:
+                if chunk.counts and not chunk.doubtful and chunk.counts != chunk_read.counts:
+                    self.layout.recorded = {}  # the index is what is damaged
+                chunk.counts, chunk.doubtful, chunk.counted = dict(chunk_read.counts), False, True
         return counts, times, damaged
 
     def check(self, chunk_read: ChunkRead) -> None:
