@@ -9,6 +9,7 @@ import re
 import sqlite3
 import struct
 import sys
+import tracemalloc
 from contextlib import closing, suppress
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
@@ -112,6 +113,22 @@ MANY = {
     ),
     "messages in a packed file": lambda: zstandard.compress(mcap(mcap_chunk(300_000 * EMPTY_MESSAGE, b""))),
 }
+
+
+def test_a_chunk_in_the_summary_is_not_unpacked(tmp_path: Path) -> None:
+    data = mcap(mcap_chunk(EMPTY_MESSAGE))
+    bomb = mcap_chunk(bytes(2**26))
+    huge = struct.pack("<BQQQQIIQ", 6, 40, 0, 0, 0, 0, 0, 2**63)
+    for record in (bomb, huge):
+        footer = struct.pack("<BQQQI", 2, 20, len(data), 0, 0) + b"\x89MCAP0\r\n"
+        (tmp_path / "a.mcap").write_bytes(data + record + footer)
+        tracemalloc.start()
+        try:
+            with suppress(LogError):
+                McapFile(tmp_path / "a.mcap", Notes())
+            assert tracemalloc.get_traced_memory()[1] < 2**24
+        finally:
+            tracemalloc.stop()
 
 
 @pytest.mark.parametrize("kind", MANY)

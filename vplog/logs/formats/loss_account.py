@@ -1,4 +1,4 @@
-"""Messages of a log that could not be used: counted by topic, with log times, in one sentence for each reason."""
+"""The messages of a log that could not be used, by reason and topic, with log times and a sentence per reason."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ _OPEN = ("cut", "missing_file", "damaged_bytes", "unknown_channel", "damaged_chu
 
 @dataclass
 class LossAccount:
-    """The losses of one log while it is read. What is found twice, in two passes over a file, is counted once."""
+    """The losses of one log while it is read. A loss that two passes over a file find is counted once."""
 
     start_ns: int | None = None
     """Log time that sentences count from."""
@@ -88,15 +88,15 @@ class LossAccount:
         spans: list[Span],
         detail: str = "",
     ) -> None:
-        """Messages lost by topic; None where their number is unknown; 0 of no topic where none is lost. `key`,
-        a file or topic and a place in it, makes the same loss found again replace itself."""
+        """Add lost messages by topic. `counts` is None if their number is unknown, and {"": 0} if none is lost. `key`
+        is a file or topic and a place in it; a loss with the same reason and key is replaced."""
         self._found.get((reason, ""), {}).pop(key, None)  # their topic, or how many, may be known by now
         spans = [(min(span), max(span)) for span in spans]  # damage may have turned them around
         for topic, count in ({"": None} if counts is None else counts).items():
             self._found.setdefault((reason, topic), {})[key] = _Lost(count, spans, detail)
 
     def add_appended(self, file: str, at: int, length: int) -> None:
-        """Bytes behind the end of a recording, from `at` to the file's `length`: another one was appended to it."""
+        """Add the bytes after the end of a recording, from `at` to the file's `length`: an appended recording."""
         detail = (
             f"{file} ends at byte {at} of {length}, and another recording follows, which is not read. Split it there."
         )
@@ -233,7 +233,7 @@ def _count(loss: TopicLoss) -> str:
 
 
 def sampled(log_ns: Collection[int]) -> list[int]:
-    """The first, the middle and the last time of a chunk, one of which may be damaged."""
+    """Return the first, the middle and the last time of a chunk, one of which may be damaged."""
     ordered = sorted(log_ns)
     return [ordered[at] for at in (0, len(ordered) // 2, -1)] if ordered else []
 
@@ -252,7 +252,7 @@ def confirmed_span(times: Collection[int]) -> Span:
 
 
 def merged(spans: list[Span]) -> list[Span]:
-    """The spans in order, overlapping ones joined, at most _MOST_SPANS."""
+    """Return the spans in order, with overlapping ones joined, at most _MOST_SPANS."""
     result: list[Span] = []
     for start, stop in sorted(spans):
         if result and (start <= result[-1][1] or len(result) == _MOST_SPANS):
@@ -263,7 +263,7 @@ def merged(spans: list[Span]) -> list[Span]:
 
 
 def runs_of(lost: np.ndarray, log_ns: Ints) -> list[Span]:
-    """Log times of the runs of lost messages; `lost` (M,) bool and log_ns (M,) in file order."""
+    """Return the log times of the runs of lost messages; `lost` (M,) bool and log_ns (M,) are in file order."""
     edges = np.diff(np.concatenate([[0], lost.astype(np.int8), [0]]))
     starts, stops = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
     times = [log_ns[a:b] for a, b in zip(starts, stops, strict=True)]

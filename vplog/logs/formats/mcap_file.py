@@ -202,12 +202,12 @@ class ChunkReader:
         return Counter(self._ids)
 
     def read(self, data: bytes) -> list[Message]:
-        """The messages of the chunk, of which `data` are all bytes."""
+        """Return the messages of the chunk; `data` are all of its bytes."""
         self._parse(data)
         return self._without_damaged()
 
     def read_in_place(self, read: Callable[[int, int], bytes]) -> list[Message]:
-        """The messages of a chunk that is not packed, from what `read(start, length)` gives of its bytes."""
+        """Return the messages of a chunk that is not compressed; `read(start, length)` returns bytes of it."""
         while (left := self.end - self.position) >= RECORD.size:
             before = self.position
             data = read(before, min(_WINDOW, left))
@@ -222,7 +222,7 @@ class ChunkReader:
         return self._without_damaged()
 
     def _without_damaged(self) -> list[Message]:
-        """The messages found, without the one before damage: its length may be what is damaged."""
+        """Return the messages found, without the one before damage, because its length may be damaged."""
         self._budget.charge_messages(self.number, len(self._ids))
         if self.position < self.end and not self._cut and self._ids and self._channel(self._ids.pop()):
             self._messages.pop()
@@ -236,7 +236,7 @@ class ChunkReader:
         return self._used[number]
 
     def _parse(self, data: bytes) -> None:
-        """On through `data`, which lie at `position` in the chunk, up to the first record that more is needed of."""
+        """Parse `data`, which lie at `position` in the chunk, up to the first record that needs more bytes."""
         base, at, size, left = self.position, 0, len(data), self.end - self.position
         max_messages = self._budget.max_messages
         while at + _MESSAGE.size <= size:
@@ -275,6 +275,6 @@ class ChunkReader:
             self._used.pop(int.from_bytes(data[:2], "little"), None)  # the number of the channel, which may be new
 
     def _is_needed(self, channel_id: int, there: int, length: int) -> bool:
-        """Whether more of a message is needed than the bytes that are there."""
+        """Return whether more of a message is needed than the bytes that are there."""
         channel = self._channel(channel_id)
         return channel is not None and (channel not in self._header_only or there < HEADER_BYTES or length < _WINDOW)

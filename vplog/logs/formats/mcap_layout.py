@@ -78,7 +78,7 @@ _MESSAGES = re.compile(rb"\x05.{3}\x00{5}", re.DOTALL)
 """The opcode of a message, and a length below 2^24 bytes."""
 _UNCHUNKED = re.compile(rb"[\x03-\x05\x09\x0c\x0f].{3}\x00{5}", re.DOTALL)
 """The opcode of a record in the data of a file without chunks, and a length below 2^24 bytes."""
-_BAD_RECORD = (McapError, struct.error, UnicodeDecodeError)
+_BAD_RECORD = (McapError, struct.error, UnicodeDecodeError, OverflowError)
 """Errors of the mcap library for records that it cannot read."""
 _PARSED: dict[int, type[records.Schema | records.Channel | records.Statistics | records.ChunkIndex]] = {
     Opcode.SCHEMA: records.Schema,
@@ -144,7 +144,7 @@ class _Walk:
             return
         summary = io.BytesIO(data)
         try:
-            for record in StreamReader(summary, skip_magic=True).records:
+            for record in StreamReader(summary, skip_magic=True, emit_chunks=True).records:
                 self._take(record)
         except _BAD_RECORD:
             self._summary_sound = False

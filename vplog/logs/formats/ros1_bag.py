@@ -29,7 +29,7 @@ class Ros1Bag:
         self._file = path.open("rb")
         self._channels: dict[int, Channel] = {}
         self._doubtful: dict[int, Channel] = {}
-        """Connections whose type is damaged, for those that no other record defines."""
+        """Connections whose type is damaged. They are used for ids that no other record defines."""
         self._unread: dict[int, str] = {}
         """By number of a chunk that could not be unpacked: the end of the sentence about it."""
         self._contents: Contents | None = None
@@ -72,7 +72,7 @@ class Ros1Bag:
         return self._data.part(*place)
 
     def _connect(self, header: dict[bytes, bytes], data: bytes) -> None:
-        """The first sound definition of a connection holds, and a damaged one where there is no sound one."""
+        """Take the first sound definition of each connection, and keep damaged ones."""
         about = fields(data) or {}
         topic, kind = (each.decode("utf-8", "replace") for each in (header.get(b"topic", b""), about.get(b"type", b"")))
         known = self._channels if b"type" in about else self._doubtful
@@ -105,7 +105,7 @@ class Ros1Bag:
         return found, ChunkRead(row, counts, [], last_ns, problem)
 
     def _unpack(self, row: int) -> bytes:
-        """The records of one chunk. Raises BadChunkError where it is damaged."""
+        """Return the records of one chunk. Raises BadChunkError if it is damaged."""
         chunk = self._layout.chunks[row]
         data = self._at(chunk.start, chunk.stop - chunk.start)
         charge = partial(self._budget.charge_bytes, row)

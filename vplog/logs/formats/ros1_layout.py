@@ -1,7 +1,7 @@
-"""Layout of the chunks of a ROS 1 bag (wiki.ros.org/Bags/Format/2.0): read record by record, over damage too.
+"""Chunks of a ROS 1 bag (wiki.ros.org/Bags/Format/2.0), found record by record and over damage.
 
-A record holds where another lies behind it. Where none does, reading goes on at the next bytes that can be the head of
-a chunk, or of a record of an index.
+A record is valid if another one follows it, or if its fields confirm its length. Otherwise the walk resumes at the next
+bytes that can be the head of a chunk or of a record of an index.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _RECORD_START = re.compile(
 _BEGIN = re.compile(re.escape(MAGIC))
 """Magic bytes of a recording: another one may be appended to the first."""
 _Head = tuple[dict[bytes, bytes] | None, int, int]
-"""Header of a record, None where it is damaged, and where its data start and stop."""
+"""Header of a record (None if it is damaged), and the start and stop of its data."""
 
 
 def read_layout(file: BinaryIO, length: int, connect: Callable[[dict[bytes, bytes], bytes], None], name: str) -> Layout:
@@ -172,7 +172,7 @@ class _LayoutReader:
             layout.cut_at, layout.index_cut_at = None, layout.cut_at
 
     def _head(self, position: int) -> _Head:
-        """Header of the record at `position`, and where its data start and stop."""
+        """Return the header of the record at `position`, and the start and stop of its data."""
         if position == self._last[0]:  # just looked at from the record before
             return self._last[1]
         self._last = position, self._parsed(position)
@@ -193,8 +193,8 @@ class _LayoutReader:
         return header.keys() >= _FIELDS.get(number(header, b"op"), {b""})
 
     def _is_record(self, position: int, after_chunk: bool = True) -> bool:
-        """Whether the head of a record lies here, or the end of the file. Connections lie in chunks too, but behind one
-        only where the index begins."""
+        """Return whether a record or the end of the file is here. Connections lie in chunks too; after a chunk, they
+        count only in the index of the bag."""
         header, _, _ = self._head(position)
         if header is None or not self._is_sound(header):
             return position == self._length
@@ -207,7 +207,8 @@ class _LayoutReader:
         )
 
     def _next_record(self, position: int) -> int | None:
-        """The next chunk, or record of an index, behind `position`; connections may as well lie in a chunk."""
+        """Return the offset of the next chunk or record of an index after `position`, or None. Connections do not
+        count, because they lie in chunks as well."""
         found = self._search.first(_RECORD_START, position + 1, self._is_record)
         appended_at = self._search.first(_BEGIN, position, stop=found)
         if appended_at is None:
@@ -252,7 +253,7 @@ class _LayoutReader:
 
 
 def fields(data: bytes) -> dict[bytes, bytes] | None:
-    """The `name=value` fields of a header; None where it is damaged."""
+    """Return the `name=value` fields of a header, or None if it is damaged."""
     found: dict[bytes, bytes] = {}
     position = 0
     while position < len(data):
@@ -266,16 +267,16 @@ def fields(data: bytes) -> dict[bytes, bytes] | None:
 
 
 def number(header: dict[bytes, bytes], name: bytes) -> int:
-    """A little-endian field of 1 to 8 bytes; -1 where it is missing."""
+    """Return a little-endian field of 1 to 8 bytes, or -1 if it is missing."""
     return int.from_bytes(header[name][:8], "little") if name in header else -1
 
 
 def time_ns(value: bytes) -> int:
-    """Nanoseconds of a ROS time: u32 seconds, u32 nanoseconds; 0 where its bytes are not so many."""
+    """Return the ns of a ROS time (u32 seconds, u32 nanoseconds), or 0 if it does not have 8 bytes."""
     seconds, nanoseconds = struct.unpack("<II", value) if len(value) == 8 else (0, 0)
     return seconds * 1_000_000_000 + nanoseconds
 
 
 def _is_another(chunk: Chunk, info: Chunk) -> bool:
-    """Whether a chunk is not the one that the bag's index lists at its place: none of their times are the same."""
+    """Return whether a chunk has other times than the one that the bag's index lists at its place."""
     return bool(chunk.counts) and (chunk.last_ns < info.first_ns <= info.last_ns or chunk.first_ns > info.last_ns > 0)
