@@ -66,7 +66,7 @@ class RecordedLog:
     ) -> None:
         self.name, self.account = name, notes.account
         self._path, self._kind, self._notes = path, kind, notes
-        self._contents: Contents = container.contents()
+        self._contents: Contents = container.contents().with_image_offset(choice.image_offset_ns)
         self._container = messages_unpacked(container, self._contents, notes)
         self._candidates = read_candidates(self._container, self._contents)
         if (count := len(self._candidates)) > MOST_TOPICS:
@@ -263,7 +263,7 @@ class RecordedLog:
             return self._contents.truth
         chosen = select(self._candidates, TopicChoice(odometry=self._truth_name), self._path.name)
         found = read_content(self._container, self._contents, chosen, Notes()).odometry
-        return None if found is None else Trajectory(found.stamp_ns, found.odom_from_body)
+        return None if found is None else found.trajectory
 
     @cached_property
     def _truth_name(self) -> str:
