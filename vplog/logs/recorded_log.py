@@ -26,13 +26,11 @@ from vplog.logs.messages.records import CalibrationMessage
 from vplog.logs.odometry_sources import PROPERTIES, is_truth
 from vplog.logs.rectification import (
     CHECKED_FRAMES,
-    MOST_ROWS_PX,
     MOST_TURN_RAD,
     NoPairError,
     Pair,
     Side,
     pair_of,
-    row_error_px,
 )
 from vplog.logs.scans import ScanReader
 from vplog.logs.stamps import rows_of
@@ -422,10 +420,12 @@ class RecordedLog:
             right_from_left = content.tree.between(other, frame) if other and frame else None
             right_from_left = self._sidecar.right_from_left(image.topic, right.topic) if both else right_from_left
             pair = pair_of(Side(left, own), Side(camera, theirs), right_from_left)
-            error_px = row_error_px(self._rectified(pair))
-            if error_px is not None and error_px > MOST_ROWS_PX:
-                raise NoPairError(
-                    f"rectified by its calibration, its rows lie {error_px:.1f} px off those of the left image"
+            pair = pair.with_common_rows(self._rectified(pair))
+            if pair.right_down_px:
+                self._notes.add(
+                    f"{right.topic}: rectified by the calibration, its rows lie {abs(pair.right_down_px):.1f} px "
+                    f"{'above' if pair.right_down_px > 0 else 'below'} those of the left images; they are moved by as "
+                    "much. A new calibration would be better."
                 )
         except (NoPairError, LogError) as error:
             self._notes.add(f"The right image is not used: {str(error).rstrip('.')}.")
