@@ -56,7 +56,8 @@ def align_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None) 
         return unit_ns
     header_ns = header_ns * unit_ns
     offset_ns = log_ns.astype(np.float64) - header_ns  # to 256 ns, and without overflow
-    level_ns = _running_median(offset_ns)
+    is_calm = len(offset_ns) < 2 or np.abs(np.diff(offset_ns)).max() <= MIN_STEP_NS  # nearly always, and faster
+    level_ns = offset_ns if is_calm else _running_median(offset_ns)
     noise_ns = float(np.median(np.abs(offset_ns - level_ns))) / 2  # the running median has less than half of it
     change_ns = float(np.median(np.abs(np.diff(level_ns)))) if len(level_ns) > 1 else 0.0
     threshold_ns = max(MIN_STEP_NS, OUTLIER_FACTOR * noise_ns, OUTLIER_FACTOR * change_ns)
@@ -119,7 +120,10 @@ def _are_whole_seconds(header_ns: Ints, late_ns: Ints) -> bool:
 
     The delays of such stamps vary by up to a second. Those of a receiver that measures on the second do not.
     """
-    if len(late_ns) <= OUTLIER_FACTOR or (header_ns % SECOND_NS >= SECOND_NS // 1000).any():
+    rest_ns = header_ns % SECOND_NS
+    if len(late_ns) <= OUTLIER_FACTOR or (rest_ns >= SECOND_NS // 1000).any():
+        return False
+    if rest_ns.any() and np.median(np.diff(header_ns)) > SECOND_NS / 2:  # a camera that is triggered every second
         return False
     return SECOND_NS / 3 < float(np.subtract(*np.quantile(late_ns, (0.9, 0.1)))) < SECOND_NS
 
@@ -136,17 +140,16 @@ def _window(log_ns: Ints) -> int:
     return max(_MIN_RUN, int(min(MAX_DELAY_NS / max(period_ns, 1.0), len(log_ns))))
 
 
-def _steps(
-    header_ns: Ints | Floats, log_ns: Ints, level_ns: Floats, threshold_ns: float, longest_ns: float
-) -> tuple[Ints, Floats, list[float]]:
-    """Find the steps of the header's clock, given the running median (M,) of the offset.
+def _candidates(
+    header_ns: Ints | Floats, log_ns: Ints, level_ns: Floats, threshold_ns: float
+) -> tuple[Ints, Ints, Bools]:
+    """Find the places where the header's clock may have been set, given the running median (M,) of the offset.
 
-    Returns the first message (K,) and the change of the offset (K,) of each step, and the changes over gaps that are a
-    step or a longer delay.
+    Returns the first message after the old level and the first on the new level (K,), and whether a gap lies between.
     """
     rows = np.flatnonzero(np.abs(np.diff(level_ns)) > threshold_ns) + 1
     if not len(rows):
-        return rows, np.zeros(0), []
+        return rows, rows, np.zeros(0, bool)
     # of the two clocks, the one whose own step is unusual was set; the running median may move the place of a step
     steps_ns = np.stack([np.diff(header_ns), np.diff(log_ns)])
     change_ns = np.abs(steps_ns[1] - steps_ns[0])
@@ -157,10 +160,21 @@ def _steps(
     is_back = steps_ns[0, places] < 0
     rows, is_gap = rows[is_header | is_back], (is_log & ~is_back)[is_header | is_back]
     is_first = np.diff(rows, prepend=-_MIN_RUN) >= _MIN_RUN  # a few messages between two changes show no level
-    first, last, is_gap = rows[is_first], rows[np.append(is_first[1:], True)[: len(rows)]], is_gap[is_first]
+    return rows[is_first], rows[np.append(is_first[1:], True)[: len(rows)]], is_gap[is_first]
+
+
+def _steps(
+    header_ns: Ints | Floats, log_ns: Ints, level_ns: Floats, threshold_ns: float, longest_ns: float
+) -> tuple[Ints, Floats, list[float]]:
+    """Estimate the steps of the header's clock, given the running median (M,) of the offset.
+
+    Returns the first message (K,) and the change of the offset (K,) of each step, and the changes over gaps that are a
+    step or a longer delay.
+    """
+    first, last, is_gap = _candidates(header_ns, log_ns, level_ns, threshold_ns)
     offset_ns = np.asarray(log_ns - header_ns, np.float64)
     changes_ns, window, unclear_ns = np.zeros(len(first)), _window(log_ns), list[float]()
-    for _ in range(MAX_STEPS):  # without the changes that are no steps, the windows beside the others are longer
+    for _ in range(MAX_STEPS if len(first) else 0):  # without changes that are no steps, windows beside steps grow
         starts, stops = np.append(0, last), np.append(first, len(offset_ns))
         # without a step, the offset changes by more than the longest delay only if a simulation has another rate
         longest = int(np.argmax(stops - starts))
@@ -169,9 +183,7 @@ def _steps(
             offset_ns = np.asarray(log_ns - header_ns - moved_ns / passed_ns * (log_ns - log_ns[0]), np.float64)
         before = _quantiles(offset_ns, np.maximum(starts[:-1], first - window), first)
         after = _quantiles(offset_ns, last, np.minimum(stops[1:], last + window))
-        changes_ns = (
-            after[:, 0] - before[:, 0]
-        )  # transport only adds to the offset, so its low quantile shows the clocks
+        changes_ns = after[:, 0] - before[:, 0]  # transport only adds to the offset, so low quantiles show the clocks
         spread_ns = np.maximum(np.ptp(before, axis=1), np.ptp(after, axis=1))
         is_clear = np.abs(changes_ns) > np.clip(spread_ns, threshold_ns, longest_ns)
         is_long = np.abs(changes_ns) > longest_ns
@@ -186,8 +198,8 @@ def _steps(
 
 def _quantiles(offset_ns: Floats, starts: Ints, stops: Ints) -> Floats:
     """Return the 10 % and 90 % quantiles (K, 2) of the offset between the rows `starts` and `stops` (K,)."""
-    quantiles = [np.quantile(offset_ns[a:b], (0.1, 0.9)) for a, b in zip(starts, stops, strict=True)]
-    return np.array(quantiles).reshape(-1, 2)
+    ordered = (np.sort(offset_ns[start:stop]) for start, stop in zip(starts, stops, strict=True))
+    return np.array([part[[len(part) // 10, -1 - len(part) // 10]] for part in ordered]).reshape(-1, 2)
 
 
 def _count_log_steps(header_ns: Ints, log_ns: Ints, offset_ns: Floats) -> int:
