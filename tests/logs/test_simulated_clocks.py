@@ -8,7 +8,7 @@ import pytest
 from tests.logs.drives import START_NS
 from tests.logs.simulated_clocks import FAULTS, SECOND, UNITS_PER_S, recover
 from vplog.logs.formats.container import Notes
-from vplog.logs.stamps import Stamps
+from vplog.logs.stamps import Stamps, set_common_clock
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -42,3 +42,15 @@ def test_a_simulation_that_starts_at_0_keeps_its_first_message() -> None:
     stamps.extend(true_ns.tolist(), (START_NS + 2 * true_ns).tolist())
     np.testing.assert_array_equal(stamps.order("/t", notes := Notes())[0], true_ns)
     assert notes.lines == []
+
+
+def test_a_simulation_that_is_restarted_loses_no_message() -> None:
+    """The second part is longer; on its clock the stamps of the first would be negative."""
+    true_ns = SECOND // 10 * np.arange(300)
+    restarted = Stamps()
+    restarted.extend(
+        np.where(true_ns < 10 * SECOND, true_ns, true_ns - 10 * SECOND).tolist(), (START_NS + true_ns).tolist()
+    )
+    set_common_clock([restarted])
+    np.testing.assert_array_equal(restarted.order("/t", notes := Notes())[0], true_ns)
+    assert notes.lines == ["/t: the clock of the header stamps was set by -10.000 s; the stamps are shifted back."]

@@ -80,8 +80,11 @@ def align_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None) 
         clock_ns.append(next((known_ns for known_ns in clock_ns if abs(known_ns - after_ns) <= threshold_ns), after_ns))
     clocks = np.array(clock_ns)[np.searchsorted(starts, rows, "right")]
     values, inverse, counts = np.unique(clocks[valid], return_inverse=True, return_counts=True)
-    target_ns = values[np.argmax(counts)]
-    base_ns = np.median((log_ns - header_ns)[valid][inverse == np.argmax(counts)]) - target_ns
+    # if a simulation begins again at 0, stamps before it would be negative on its last clock
+    fits = values <= (header_ns + clocks)[valid].min()
+    longest = np.argmax(counts * fits if fits.any() else counts)
+    target_ns = values[longest]
+    base_ns = np.median((log_ns - header_ns)[valid][inverse == longest]) - target_ns
     if reference_ns is not None and len(values) > 1:
         nearest_ns = values[np.argmin(np.abs(values + base_ns - reference_ns))]
         is_near = abs(nearest_ns + base_ns - reference_ns) <= MAX_DELAY_NS
@@ -173,7 +176,8 @@ def _steps(
     """
     first, last, is_gap = _candidates(header_ns, log_ns, level_ns, threshold_ns)
     offset_ns = np.asarray(log_ns - header_ns, np.float64)
-    changes_ns, window, unclear_ns = np.zeros(len(first)), _window(log_ns), list[float]()
+    changes_ns = spread_ns = np.zeros(len(first))
+    window, unclear_ns = _window(log_ns), list[float]()
     for _ in range(MAX_STEPS if len(first) else 0):  # without changes that are no steps, windows beside steps grow
         starts, stops = np.append(0, last), np.append(first, len(offset_ns))
         # without a step, the offset changes by more than the longest delay only if a simulation has another rate
@@ -190,10 +194,22 @@ def _steps(
         unclear_ns += changes_ns[is_clear & is_gap & ~is_long].tolist()
         # if the offset changes over most gaps, delays vary as much as small steps
         is_step = is_long if len(unclear_ns) > int((is_clear & ~is_gap).sum()) else is_clear & (is_long | ~is_gap)
-        first, last, is_gap, changes_ns = first[is_step], last[is_step], is_gap[is_step], changes_ns[is_step]
+        first, last, is_gap = first[is_step], last[is_step], is_gap[is_step]
+        changes_ns, spread_ns = changes_ns[is_step], spread_ns[is_step]
         if is_step.all():
             break
-    return first, changes_ns, unclear_ns
+    by_period_ns = _changes_by_period(header_ns, first, last)
+    is_regular = ~is_gap & (np.abs(by_period_ns - changes_ns) <= spread_ns / 3)
+    return first, np.where(is_regular, by_period_ns, changes_ns), unclear_ns
+
+
+def _changes_by_period(header_ns: Ints | Floats, first: Ints, last: Ints) -> Floats:
+    """Return the changes (K,) of the offset if no message is missing, which do not depend on the delays."""
+    steps_ns, each = np.diff(header_ns), np.arange(_MIN_RUN)
+    period_ns = float(np.median(steps_ns[steps_ns > 0])) if (steps_ns > 0).any() else 0.0
+    before = header_ns[(first[:, None] - 1 - each).clip(0)] + period_ns * (each + 1 + (last - first)[:, None])
+    after = header_ns[(last[:, None] + each).clip(max=len(header_ns) - 1)] - period_ns * each
+    return np.asarray(np.median(before, axis=1) - np.median(after, axis=1))
 
 
 def _quantiles(offset_ns: Floats, starts: Ints, stops: Ints) -> Floats:

@@ -149,7 +149,8 @@ def set_common_clock(topics: Iterable[Stamps], shared: Iterable[Stamps] = ()) ->
             messages[next((ns for ns in messages if abs(ns - offset_ns) <= SECOND_NS), offset_ns)] += count
     if not messages:
         return
-    common_ns = max(messages, key=lambda ns: (messages[ns], -ns))
+    first_ns = min(min(topic.log_ns) for topic in topics)  # no stamp is negative on a clock with an offset up to this
+    common_ns = max(messages, key=lambda ns: (ns <= first_ns + MAX_DELAY_NS, messages[ns], -ns))
     on_common = [topic for topic in topics if any(abs(ns - common_ns) <= SECOND_NS for ns in topic.clocks())]
     first_ns, last_ns = min(min(topic.log_ns) for topic in on_common), max(max(topic.log_ns) for topic in on_common)
     for topic in topics:
