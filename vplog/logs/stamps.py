@@ -57,7 +57,9 @@ class Stamps:
 
     def add(self, header_ns: int, log_ns: int, position: int | None = None) -> None:
         """Add a message by its stamp, its log time and its position in the file (default: the next)."""
-        self.extend([header_ns], [log_ns], None if position is None else [position])
+        self._positions.append(len(self.log_ns) if position is None else position)
+        self.header_ns.append(header_ns)
+        self.log_ns.append(min(max(log_ns, 0), LAST_NS))
 
     def extend(self, header_ns: list[int], log_ns: list[int], positions: list[int] | None = None) -> None:
         """Add messages. Log times before 1970 or after 2262 are damage, and are moved into that range."""
@@ -107,7 +109,7 @@ class Stamps:
         header_ns, log_ns = np.array(self.header_ns, np.int64), np.array(self.log_ns, np.int64)
         if not len(log_ns):
             return NONE, NONE
-        aligned = self._align(self.common.offset_ns if self.common else None)
+        aligned = self._align(self.common.offset_ns if self.common and len(self.clocks()) > 1 else None)
         if isinstance(aligned, str):
             notes.add(f"{topic} {aligned}; its log times are used instead.")
             return _in_order(topic, notes, log_ns, np.arange(len(log_ns)), log_ns)
