@@ -92,6 +92,11 @@ class Odometry:
     increments: bool = False
     """Where `covariance` is known to be that of the motion since the row before; in a log its values tell."""
 
+    @property
+    def trajectory(self) -> Trajectory:
+        """Its poses alone."""
+        return Trajectory(self.stamp_ns, self.odom_from_body)
+
 
 UNKNOWN_VARIANCE = 1e3
 """m^2, rad^2 or those of velocities; drivers write 1e3, 99999, 1e6 or more on an axis that they do not measure."""

@@ -195,10 +195,10 @@ def run(
         coverage = do(cover, keyframes, references, library is not None, features)
         descriptors = do(describe, state, log, features)
         proposals = do(find_candidates, state, descriptors, keyframes, pipeline.propose, pipeline.sequence)
-        drive = DriveFeatures(keyframes, camera, features, pipeline.verify)
+        drive = DriveFeatures(keyframes, camera, features, pipeline.verify, odometry.trajectory)
         if not odometry.metric:
             odometry, keyframes = in_one_scale(odometry, keyframes, camera, do(scale_ratios, proposals, drive))
-            drive = replace(drive, keyframes=keyframes)
+            drive = replace(drive, keyframes=keyframes, odometry=odometry.trajectory)
         closures = do(verify, proposals, drive)
         views = [View.of(log, drive, descriptors), *(do(describe_cameras, views, state) if views else [])]
         if len(views) > 1:

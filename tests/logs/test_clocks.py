@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tests.logs.drives import START_NS, Drive, ros_messages, write_ros2
 from vplog import logs
-from vplog.logs.clocks import align_clock
+from vplog.logs.clocks import AlignedStamps, align_clock
 from vplog.logs.formats.container import Notes
 from vplog.logs.stamps import Stamps, rate_hz, set_common_clock
 
@@ -47,11 +47,11 @@ def test_a_clock_that_is_set_is_followed(count: int, jumps: list[tuple[int, int]
     for at, step in jumps:
         header_ns[at:] += step
     found = align_clock(header_ns, log_ns)
-    assert found is not None
+    assert isinstance(found, AlignedStamps)
     assert found.valid.all()
     errors = found.stamp_ns - true_ns
     assert errors.max() - errors.min() <= JITTER_NS
-    assert bool(found.jumps_ns) == (len(np.unique(header_ns - true_ns)) > 1)
+    assert any("was set by" in remark for remark in found.remarks) == (len(np.unique(header_ns - true_ns)) > 1)
 
 
 @given(st.integers(20, 80), st.data())
@@ -65,7 +65,7 @@ def test_stray_stamps_are_told_and_nothing_else(count: int, data: st.DataObject)
         header_ns[row] += step + step // 4  # by less than 2 s a message may be late
     header_ns = np.maximum(header_ns, 1)
     found = align_clock(header_ns, log_ns)
-    assert found is not None
+    assert isinstance(found, AlignedStamps)
     assert np.flatnonzero(~found.valid).tolist() == rows
     np.testing.assert_array_equal(found.stamp_ns[found.valid], true_ns[found.valid])
 
@@ -76,7 +76,7 @@ def test_any_clock_that_runs_is_left_as_it_is(offset_ns: int, rate: float) -> No
     true_ns, log_ns = times(50)
     header_ns = ((true_ns - START_NS) * rate).astype(np.int64) + START_NS + offset_ns
     found = align_clock(header_ns, log_ns)
-    assert found is not None
+    assert isinstance(found, AlignedStamps)
     assert found.valid.all()
     np.testing.assert_array_equal(found.stamp_ns, header_ns)
 
@@ -114,7 +114,6 @@ def test_few_messages_with_one_stamp_have_a_clock_that_stands(messages: int, kep
         (lambda true: np.full(len(true), true[0]), "has header stamps that do not advance"),
         (lambda true: true // SECOND * SECOND + true % SECOND // 1000, "has header stamps in whole seconds"),
         (lambda true: true // SECOND * SECOND + true % SECOND // 10**6, "has header stamps in whole seconds"),
-        (lambda true: true // 1000, "has header stamps in another unit than ns"),
         (lambda true: true[0] + (true - true[0]) // 1000, "has header stamps in another unit than ns"),
         (lambda true: true + 50 * SECOND * (np.arange(len(true)) // 10) ** 2, "has header stamps that follow no clock"),
     ],

@@ -442,6 +442,16 @@ def test_start_and_stop_leave_images_out(tmp_path: Path) -> None:
         logs.open(tmp_path, TopicChoice(start_s=9)).stamps()
 
 
+def test_an_image_offset_moves_the_stamps_and_nothing_else(tmp_path: Path) -> None:
+    stamps = kitti(tmp_path)
+    given, moved = (logs.open(tmp_path, TopicChoice(image_offset_s=offset)) for offset in (None, -0.05))
+    np.testing.assert_array_equal(moved.stamps(), stamps - 50_000_000)
+    for name in ("image", "right"):
+        before, after = ([getattr(one.decode(), name) for one in log.frames(log.stamps())] for log in (given, moved))
+        np.testing.assert_array_equal(np.array(before), np.array(after))
+    assert moved.file_names() == given.file_names()
+
+
 def test_clips_are_to_be_joined_to_one_drive(tmp_path: Path) -> None:
     clips = [tmp_path / "a.mp4", tmp_path / "b.mp4"]
     for clip in clips:

@@ -17,6 +17,7 @@ from vplog.features.sift import SiftSettings
 from vplog.features.stereo_depth import StereoSettings, stereo_depth
 from vplog.logs import TopicChoice
 from vplog.logs.frames import RecordedFrame
+from vplog.logs.rectification import rows_apart_px
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -294,6 +295,21 @@ def test_a_calibrated_camera_that_nothing_places_is_said(tmp_path: Path) -> None
     assert "/stereo/rear/image_raw is calibrated but not used: no static transforms lead from base_link" in line
 
 
+@pytest.mark.parametrize("tilt_rad", [0.02, -0.03])
+def test_right_images_that_are_a_constant_number_of_rows_off_are_moved(tilt_rad: float, tmp_path: Path) -> None:
+    """As of a stereo head that was knocked: the calibration is of another tilt."""
+    left, (rotation, projection) = calibrated(PINHOLES, RIGHT_FROM_LEFT)
+    tilted = Rotation.from_euler("x", tilt_rad).as_matrix() @ rotation
+    for name, right in (("sound", rotation), ("tilted", tilted)):
+        log = logs.open(drive(tmp_path / name, PINHOLES, RIGHT_FROM_LEFT, rp=[left, (right, projection)]))
+        pictures = [(frame.image, frame.right) for one in log.frames(log.stamps()) if (frame := one.decode())]
+        apart_px = np.median(rows_apart_px([(one, other) for one, other in pictures if other is not None]))
+        assert abs(apart_px) < 1.0
+        moved = [line for line in log.warnings if "they are moved by as much" in line]
+        assert len(moved) == (name == "tilted")
+        assert all(("above" if tilt_rad > 0 else "below") in line for line in moved)
+
+
 def test_what_is_no_pair_is_said_and_left_out(tmp_path: Path) -> None:
     def why(name: str, right_from_left: np.ndarray = RIGHT_FROM_LEFT, **options: Any) -> str:
         log = logs.open(drive(tmp_path / name, PINHOLES, right_from_left, **options))
@@ -304,10 +320,8 @@ def test_what_is_no_pair_is_said_and_left_out(tmp_path: Path) -> None:
 
     assert "neither P of the calibration" in why("no-baseline")
     rp = calibrated(PINHOLES, RIGHT_FROM_LEFT)
-    shifted = rp[1][1].copy()
-    shifted[1, 2] += 0.9  # within what is believed of P, and the images do not bear it out with the next
-    tilted = Rotation.from_euler("x", 0.02).as_matrix() @ rp[1][0]
-    assert "its rows lie" in why("unfit", rp=[rp[0], (tilted, shifted)])
+    rolled = Rotation.from_euler("z", 0.08).as_matrix() @ rp[1][0]
+    assert "its rows lie" in why("unfit", rp=[rp[0], (rolled, rp[1][1])])
     assert "to the left of" in why("swapped", np.linalg.inv(STRAIGHT), tf=True)
     below = matrix(np.array([0.0, -0.3, 0.0]), Rotation.identity())
     assert "beside" in why("below", below, tf=True)

@@ -61,9 +61,9 @@ def test_header_stamps_that_are_all_zero_give_way_to_log_times() -> None:
     stamp_ns, rows = stamps([0, 0], [7, 9]).order("/t", notes)
     assert (stamp_ns.tolist(), rows.tolist()) == ([7, 9], [0, 1])
     assert "log times" in notes.lines[0]
-    stamp_ns, rows = stamps([0, 5], [7, 9]).order("/t", notes)
-    assert (stamp_ns.tolist(), rows.tolist()) == ([5], [1])
-    assert "Lost: 1 message without a header stamp, at t=0.000 s: /t 1." in notes.lines
+    stamp_ns, rows = stamps([0, 5 * 10**9], [7 * 10**9, 9 * 10**9]).order("/t", notes)
+    assert (stamp_ns.tolist(), rows.tolist()) == ([5 * 10**9], [1])
+    assert "Lost: 1 message without a header stamp, at t=7.000 s: /t 1." in notes.lines
 
 
 def test_pairs_are_nearest_within_half_a_period() -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import lru_cache
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.loops.scene import NOISE_PX, camera, empty, keyframes, pose, proposals, scene, verify, view
-from vplog.data import Camera, Closures, Features, Keyframes, Verdict
+from vplog.data import Camera, Closures, Features, Keyframes, Trajectory, Verdict
 from vplog.errors import LogError
 from vplog.execution.execution import Execution
 from vplog.geometry import se3
@@ -290,6 +291,19 @@ def test_a_camera_that_disagrees_with_the_odometry_is_said_to_be_wrong_in_the_wa
     )
     calibration_share(drive_of(keyframes(poses), wrong, views.__getitem__, EXACT), Execution())
     assert [warned in record.getMessage() for record in caplog.records] == [True] * bool(warned)
+
+
+def test_late_images_are_said_to_be_late(caplog: pytest.LogCaptureFixture) -> None:
+    rng, path = np.random.default_rng(15), lambda at: pose(0.1 * at, yaw=0.35 * np.sin(at / 3))
+    lens, place = camera(), scene(rng, 4000)
+    rows, times = np.arange(40), np.arange(-10.0, 50.0, 0.1)
+    drive = keyframes([path(row) for row in rows])
+    views = [view(place, one, lens, rng, depth=True) for one in drive.odom_from_body]
+    second_ns, at_ns = int(drive.stamp_ns[1] - drive.stamp_ns[0]), int(drive.stamp_ns[0])
+    track = Trajectory(at_ns + (times * second_ns).astype(np.int64), np.array([path(at + 0.4) for at in times]))
+    calibration_share(drive_of(drive, lens, views.__getitem__, EXACT), Execution(), track)
+    (said,) = [record.getMessage() for record in caplog.records]
+    assert re.search(r"are 0\.(3[5-9]|4[0-5]) s .* late against the odometry\. --image-offset-s -0\.", said), said
 
 
 def test_a_wrong_focal_length_is_noticed_and_claims_less(caplog: pytest.LogCaptureFixture) -> None:

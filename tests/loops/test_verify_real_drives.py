@@ -82,7 +82,7 @@ def test_a_real_revisit_is_found_and_the_opposite_direction_is_not(
     seen = {row: extract(image) for row, image in images.items()}
     # no turns are at hand in these few images, so nothing is asked of the calibration check
     settings = VerifySettings()
-    settings = settings.model_copy(update={"calibration": settings.calibration.model_copy(update={"angle": 3.0})})
+    settings = settings.model_copy(update={"calibration": settings.calibration.model_copy(update={"pairs": 0})})
     ledger = verify(proposals(REVISITS + OPPOSITE), frames, camera, seen.__getitem__, settings, Execution(2))
     assert ledger.verdict[:3] == [Verdict.ACCEPTED] * 3
     assert Verdict.ACCEPTED not in ledger.verdict[3:]
@@ -106,7 +106,7 @@ def test_neighbouring_revisits_agree_as_closely_as_they_claim(
     frames, camera, truth, images = kitti
     seen = {row: extract(image) for row, image in images.items() if abs(row - 788) < 5 or abs(row - 65) < 5}
     settings = VerifySettings()
-    settings = settings.model_copy(update={"calibration": settings.calibration.model_copy(update={"angle": 3.0})})
+    settings = settings.model_copy(update={"calibration": settings.calibration.model_copy(update={"pairs": 0})})
     ledger = verify(proposals(REVISITS[:2]), frames, camera, seen.__getitem__, settings)
     assert ledger.verdict == [Verdict.ACCEPTED] * 2
     (first, second), (query, match) = ledger.match_from_query, (ledger.query, ledger.match)

@@ -524,7 +524,9 @@ def test_the_command_of_a_run_has_all_that_it_was_given(tmp_path: Path) -> None:
     """So that a run with decisions differs from it in these alone."""
     changed = ["places.references=3", "gps.use=true"]
     pipeline = load_pipeline("default", [*changed, "decisions.file=d.csv"])
-    topics = TopicChoice(image="/a b", odometry="visual", masks={"": tmp_path / "m.png"}, gps_any_status=True)
+    topics = TopicChoice(
+        image="/a b", odometry="visual", masks={"": tmp_path / "m.png"}, gps_any_status=True, image_offset_s=-0.4
+    )
     words = provenance.arguments([tmp_path / "1.bag", tmp_path / "2.bag"], topics, pipeline, tmp_path / "library")
     command = command_of({"arguments": words}, "out", "--decisions", "d.csv")
     given = main._parser().parse_args(shlex.split(command)[1:])

@@ -253,7 +253,7 @@ def topics_of(arguments: argparse.Namespace) -> TopicChoice:
     chosen |= {"image": first, "cameras": more or None, "mask": masks.pop("", None), "mask_topics": masks}
     others = (
         *("odometry_file", "calibration_file", "start_s", "stop_s"),
-        *("wheelbase_m", "track_m", "wheel_radius_m", "camera_height_m", "gps_any_status"),
+        *("wheelbase_m", "track_m", "wheel_radius_m", "camera_height_m", "gps_any_status", "image_offset_s"),
     )
     return TopicChoice(**chosen, masks=dict(arguments.mask), **{name: getattr(arguments, name) for name in others})
 
@@ -273,6 +273,7 @@ def topic_options() -> argparse.ArgumentParser:
         option(topics, f"--{name}-m", positive, "M", f"metres between {what}, for odometry of wheels")
     text = "height of a single camera over the ground, which gives its visual odometry metres"
     option(topics, "--camera-height-m", positive, "M", text)
+    option(topics, "--image-offset-s", seconds, "S", "add S seconds to the stamps of the images")
     flag(topics, "--gps-any-status", "use satellite fixes even if their status says that there is no fix")
     option(topics, "--start", not_negative, "S", "leave out images before S seconds of the log", dest="start_s")
     option(topics, "--stop", not_negative, "S", "leave out images from S seconds of the log on", dest="stop_s")
@@ -354,4 +355,7 @@ def number(fits: Callable[[float], bool], words: str) -> Callable[[str], float]:
 
 not_negative = number(lambda value: 0 <= value < math.inf, "of 0 or more")
 positive = number(lambda value: 0 < value < math.inf, "above 0")
+_MOST_OFFSET_S = 1e9
+"""s; thirty years, from any clock that starts at zero to one of today."""
+seconds = number(lambda value: abs(value) <= _MOST_OFFSET_S, f"between -{_MOST_OFFSET_S:g} and {_MOST_OFFSET_S:g}")
 share = number(lambda value: 0 < value < 1, "between 0 and 1")

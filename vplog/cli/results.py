@@ -26,11 +26,6 @@ _SOLVERS = ("gnc", "pcm", "dcs", "cauchy", "geman_mcclure", "lm")
 """The kinds of graph/solve.py, here too since that imports numpy."""
 _ALIGNMENTS = ("se3", "sim3", "origin")
 """Alignments of evaluate/trajectory.py, here too since that imports numpy."""
-_MOST_OFFSET_S = 1e9
-"""s; thirty years, from any clock that starts at zero to one of today."""
-_seconds = parser.number(
-    lambda value: abs(value) <= _MOST_OFFSET_S, f"between -{_MOST_OFFSET_S:g} and {_MOST_OFFSET_S:g}"
-)
 _FOLDERS = ("colmap", "nerfstudio")
 _FORMATS = ("tum", "kitti", "euroc", "g2o", "geojson", "geoparquet", "kml", "utm", "rrd", "foxglove-layout", *_FOLDERS)
 """Formats of export.py, here too since that imports numpy."""
@@ -166,7 +161,7 @@ def _add_truth_options(verb: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--align", choices=_ALIGNMENTS, help="alignment of the ATE (default: se3; sim3 of a run without metres)"
     )
-    option(sub, "--truth-offset-s", _seconds, "S", "add to the truth's stamps (default: 0)")
+    option(sub, "--truth-offset-s", parser.seconds, "S", "add to the truth's stamps (default: 0)")
 
 
 @contextmanager

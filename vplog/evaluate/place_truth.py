@@ -268,7 +268,7 @@ def _odometry(query: Log, other: Log) -> tuple[Trajectory, Trajectory]:
         odometry = log.odometry()
         if odometry is None or not len(odometry.stamp_ns):
             raise TruthError(f"{log.name} has no odometry, so --truth poses is not possible. Choose another truth.")
-        return Trajectory(odometry.stamp_ns, odometry.odom_from_body)
+        return odometry.trajectory
 
     return read(query), read(other)
 

@@ -1,188 +1,246 @@
-"""Clock steps of header stamps, found against the log times and removed.
+"""Clock steps of header stamps, estimated from their difference to the log times.
 
-The log time is late by the transport but steady: between two messages of a topic both should advance alike, and their
-difference, the offset, stays at one level.
+A message is logged at most MAX_DELAY_NS after its header stamp. The offset, log time minus header stamp, is therefore
+piecewise constant. It leaves its level for a moment if a delay changes, and for good if a clock is set.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
+from scipy.ndimage import median_filter
 
-from vplog.data import Ints
+from vplog.data import Bools, Floats, Ints
+from vplog.errors import plural
 
-LEAST_JUMP_NS = 1_000_000_000
-"""ns; their difference changes by less than a second when a computer is busy, and by hours when a clock is set."""
-LATE_NS = 2_000_000_000
-"""ns that messages may be later than others of the log: slow estimators, and links that send again what was lost."""
-_PERIODS = 10
-"""A jump is also longer than so many periods of the topic: slow topics may be late by one."""
-_LEAST_RUN = 5
-"""Messages of one clock in a row; fewer are damaged stamps, not a clock that was set."""
-STEP_PERIODS = 3
-"""A step back is at least so many periods of the topic: less is within what messages come out of order by."""
-_LEVEL = 30
-"""Messages before and behind a step by which the offset is known: a burst is over by then."""
-LEAST_STEP_NS = 128_000_000
-"""ns; a smaller offset NTP slews, a larger one it steps (RFC 5905, STEPT)."""
-GAP_NS = 10**9
-"""ns without a message that count as a gap, where it is also GAP_PERIODS of the topic's own."""
-GAP_PERIODS = 10
-LONGEST_PAUSE_NS = 3600 * 10**9
-"""Longest time in ns between two parts of one drive: odometry is seldom kept running through a longer pause."""
-_SHORT = 10
-"""Small steps count as clock steps where less than a tenth of the messages are in runs too short to show a clock."""
-_NEAR = 4
-"""Neighbours of a short run whose clock it may be on: reordered messages at a step make a few short runs."""
-_MOST_CLOCKS = 20
-"""A clock is set a few times in a drive; what jumps to more values than these is none."""
-
-
-@dataclass(frozen=True)
-class Clock:
-    """The clock of a topic's header stamps, by the log times, and the time its stamps cover."""
-
-    offset_ns: int
-    """Log time less header stamp, the median."""
-    first_ns: int
-    last_ns: int
+LAST_NS = int(np.iinfo(np.int64).max)
+SECOND_NS = 10**9
+MIN_STEP_NS = 128_000_000
+"""Smallest clock step: NTP changes the rate of a clock for smaller errors (RFC 5905, STEPT)."""
+MAX_DELAY_NS = 2 * SECOND_NS
+"""Longest delay between header stamp and log time: slow estimators, and links that repeat lost packets."""
+MAX_STEPS = 20
+"""Largest number of clock steps in a drive. Times that jump more often follow no clock."""
+OUTLIER_FACTOR = 10
+"""Ratio to the usual value from which a change is a step, a pause is a gap, and repeated stamps are a stopped clock."""
+_MIN_RUN = 5
+"""Messages in a row that show a level. Fewer have damaged stamps."""
+_NS_PER_UNIT = {1: "ns", 10**3: "us", 10**6: "ms", 10**9: "s"}
 
 
 @dataclass(frozen=True, eq=False)
 class AlignedStamps:
-    """Stamps of one topic on one clock."""
+    """Header stamps of one topic on one clock."""
 
     stamp_ns: Ints
     """(M,) in file order."""
-    valid: np.ndarray
-    """(M,) bool, false for outliers, whose time is not known."""
+    valid: Bools
+    """(M,) False for outliers, whose time is unknown."""
     offset_ns: int
-    """Offset of the clock that all are on."""
-    jumps_ns: list[int]
-    """By how much the header's clock was set each time; the stamps behind are shifted back by as much."""
-    log_jumps: int
-    """Times that the recorder's clock was set; the stamps are right without it."""
-    unclear_ns: list[int]
-    """By how much the offset changes over gaps, where the clock may have been set or the messages be later since."""
+    """Median log time minus header stamp, on the clock of `stamp_ns`."""
     counts: dict[int, int]
-    """Messages by the offset of the clock that they came on."""
+    """Number of messages logged on each clock, by the offset of the clock. There are several if it was set."""
+    remarks: list[str]
+    """What was changed or is unclear, each as a sentence without the name of the topic."""
 
 
-def align_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None) -> AlignedStamps | None:
-    """The header stamps without jumps of their clock; None where they follow no clock. Both (M,) in ns, M >= 1. Of
-    several clocks, `reference_ns` is the offset of the one to end on; None takes that of most messages."""
-    step, log_step = np.diff(header_ns), np.diff(log_ns)
-    period = float(np.median(np.minimum(np.abs(step), np.abs(log_step)))) if len(step) else 0.0
-    jump_ns = max(LEAST_JUMP_NS, _PERIODS * period)
-    # what steps without end, late messages for one, has no small steps
-    found = _levels(header_ns, log_ns, LEAST_STEP_NS) or _levels(header_ns, log_ns, jump_ns)
-    if found is None:
-        return None
-    runs, clocks, limit, unclear = found
-    counts: Counter[int] = Counter()
-    for run, clock in zip(runs, clocks, strict=True):
-        if clock is not None:
-            counts[clock] += run.stop - run.start
-    chosen = max(counts, key=lambda offset: (counts[offset], -offset))
-    if reference_ns is not None and len(counts) > 1:
-        near = min(counts, key=lambda offset: (abs(offset - reference_ns), offset))
-        chosen = near if abs(near - reference_ns) <= limit else reference_ns
-    stamp_ns, valid = header_ns.copy(), np.zeros(len(header_ns), bool)
-    for number, run in enumerate(runs):
-        offset = _offset_of(int(np.median(log_ns[run] - header_ns[run])), clocks, number, limit)
-        if offset is not None:
-            shifted = [int(extreme) + offset - chosen for extreme in (header_ns[run].min(), header_ns[run].max())]
-            valid[run] = min(shifted) >= 0 and max(shifted) < 2**63
-            stamp_ns[run] += offset - chosen if valid[run.start] else 0
-    order = [clock for clock in clocks if clock is not None]
-    jumps = [before - behind for before, behind in pairwise(order) if before != behind]
-    log_jumps = _log_jumps(header_ns, log_ns, jump_ns)
-    return AlignedStamps(stamp_ns, valid, chosen, jumps, log_jumps, unclear, counts)
+def align_clock(header_ns: Ints, log_ns: Ints, reference_ns: int | None = None) -> AlignedStamps | str:
+    """Remove clock steps from the header stamps, or return the reason why the stamps are not times.
+
+    `header_ns` and `log_ns` are (M,) in file order, M >= 1. If the clock was set, stamps are shifted to the clock of
+    most messages, or to the one with offset `reference_ns`.
+    """
+    unit_ns = _unit_ns(header_ns, log_ns)
+    if isinstance(unit_ns, str):
+        return unit_ns
+    header_ns = header_ns * unit_ns
+    offset_ns = log_ns.astype(np.float64) - header_ns  # to 256 ns, and without overflow
+    is_calm = len(offset_ns) < 2 or np.abs(np.diff(offset_ns)).max() <= MIN_STEP_NS  # nearly always, and faster
+    level_ns = offset_ns if is_calm else _running_median(offset_ns)
+    noise_ns = float(np.median(np.abs(offset_ns - level_ns))) / 2  # the running median has less than half of it
+    change_ns = float(np.median(np.abs(np.diff(level_ns)))) if len(level_ns) > 1 else 0.0
+    threshold_ns = max(MIN_STEP_NS, OUTLIER_FACTOR * noise_ns, OUTLIER_FACTOR * change_ns)
+    longest_ns = max(MAX_DELAY_NS, threshold_ns)
+    # messages that changed places at a step belong to the level that their own offset is nearest to
+    each = np.arange(len(offset_ns))
+    rows = np.clip(each + np.array([[0], [1 - _MIN_RUN], [_MIN_RUN - 1]]), 0, len(offset_ns) - 1)
+    rows = rows[np.abs(level_ns[rows] - offset_ns).argmin(0), each]
+    late_ns = offset_ns - level_ns[rows]
+    valid = (late_ns <= longest_ns) & (late_ns >= -max(MAX_DELAY_NS / 2, threshold_ns))
+    if not valid.all():  # the log times may be damaged instead
+        valid |= 2 * np.abs(header_ns - _running_median(header_ns)) < np.abs(late_ns)
+    regular_ns = np.where(np.abs(offset_ns - level_ns) <= threshold_ns, header_ns, log_ns - level_ns)
+    starts, sizes_ns, unclear_ns = _steps(regular_ns, log_ns, level_ns, threshold_ns, longest_ns)
+    if len(starts) > MAX_STEPS or not valid.any():
+        return "has header stamps that follow no clock"
+    clock_ns = [0.0]  # offset after each step; a clock that is set back to an earlier offset is the same one
+    for size_ns in sizes_ns.tolist():
+        after_ns = clock_ns[-1] + size_ns
+        clock_ns.append(next((known_ns for known_ns in clock_ns if abs(known_ns - after_ns) <= threshold_ns), after_ns))
+    clocks = np.array(clock_ns)[np.searchsorted(starts, rows, "right")]
+    values, inverse, counts = np.unique(clocks[valid], return_inverse=True, return_counts=True)
+    # if a simulation begins again at 0, stamps before it would be negative on its last clock
+    fits = values <= (header_ns + clocks)[valid].min()
+    longest = np.argmax(counts * fits if fits.any() else counts)
+    target_ns = values[longest]
+    base_ns = np.median((log_ns - header_ns)[valid][inverse == longest]) - target_ns
+    if reference_ns is not None and len(values) > 1:
+        nearest_ns = values[np.argmin(np.abs(values + base_ns - reference_ns))]
+        is_near = abs(nearest_ns + base_ns - reference_ns) <= MAX_DELAY_NS
+        target_ns = nearest_ns if is_near else reference_ns - base_ns
+    shift_ns = clocks - target_ns
+    valid &= (header_ns + shift_ns >= 0) & (header_ns + shift_ns < LAST_NS) & (np.abs(shift_ns) < LAST_NS)
+    stamp_ns = header_ns + np.where(valid, shift_ns, 0).astype(np.int64)
+    if _are_whole_seconds(header_ns, (log_ns - stamp_ns)[valid]):
+        return "has header stamps in whole seconds"
+    remarks = _remarks(unit_ns, -np.diff(clock_ns), _count_log_steps(header_ns, log_ns, offset_ns), unclear_ns)
+    of_clock = {int(value + base_ns): int(count) for value, count in zip(values, counts, strict=True)}
+    return AlignedStamps(stamp_ns, valid, int(target_ns + base_ns), of_clock, remarks)
 
 
-def _runs(header_ns: Ints, log_ns: Ints, least_ns: float) -> tuple[list[slice], set[int]]:
-    """Messages between steps of the headers by `least_ns` or more that the log times do not take, and steps back; and
-    the first message of each run that follows a gap."""
-    step, log_step = np.diff(header_ns), np.diff(log_ns)
-    size = np.abs(step - log_step)
-    usual, log_usual = (float(np.median(one[one > 0])) if (one > 0).any() else 0.0 for one in (step, log_step))
-    rows = np.flatnonzero((size > least_ns) & ((step < 0) | (2 * np.abs(step - usual) >= size))) + 1
-    gaps = rows[(step[rows - 1] >= 0) & (2 * np.abs(log_step - log_usual) > size)[rows - 1]]
-    return [slice(a, b) for a, b in pairwise([0, *rows.tolist(), len(header_ns)])], set(gaps.tolist())
+def _unit_ns(header_ns: Ints, log_ns: Ints) -> int | str:
+    """Return the ns per unit of the stamps, or the reason why the stamps are not times."""
+    count, distinct = len(header_ns), len(np.unique(header_ns))
+    if distinct * OUTLIER_FACTOR < count or (distinct == 1 and len(np.unique(log_ns)) > 2):
+        return "has header stamps that do not advance"
+    if count <= OUTLIER_FACTOR:
+        return 1
+    order = np.argsort(log_ns, kind="stable")
+    header_ns, log_ns = header_ns[order], log_ns[order]
+    # a clock that is set back advances between, and the messages of a burst in any order advance on the whole
+    if np.median(np.diff(header_ns)) < 0 and np.median(header_ns[count // 2 :]) < np.median(header_ns[: count // 2]):
+        return "has header stamps that run backwards"
+    lag = min(_window(log_ns), count // 4)
+    advance, passed_ns = (np.median(times[lag:] - times[:-lag]) for times in (header_ns, log_ns))
+    unit_ns = next((unit for unit in _NS_PER_UNIT if passed_ns < 2 * unit * advance < 4 * passed_ns), 1)
+    fits = unit_ns * float(np.abs(header_ns).max()) <= LAST_NS
+    return unit_ns if fits else "has header stamps in another unit than ns"
 
 
-def _levels(
-    header_ns: Ints, log_ns: Ints, least_ns: float
-) -> tuple[list[slice], list[int | None], float, list[int]] | None:
-    """Runs of messages between steps of `least_ns` or more, the offset of the clock that each is on (None of runs too
-    short to show one), half the least step, and the ns by which the offset changes over gaps by no more than messages
-    may be late; None where the offset stays at no level. The clock of a run is another than that before where the
-    offset stays at another level, by more than it varies."""
-    runs, gaps = _runs(header_ns, log_ns, least_ns)
-    offset, lengths = log_ns - header_ns, [run.stop - run.start for run in runs]
-    least = min(_LEAST_RUN, max(lengths))
-    if least_ns < LEAST_JUMP_NS and sum(length for length in lengths if length < least) * _SHORT > len(offset):
-        return None
-    levels: list[list[Ints]] = []
-    sizes, unclear = [2 * max(LEAST_JUMP_NS, least_ns)], []
-    place: list[int | None] = []
-    for run in runs:
-        own = offset[run]
-        if len(own) < least:
-            place.append(None)
-            continue
-        last = levels[-1][-1] if levels else own
-        change = _change(last[-_LEVEL:], own[:_LEVEL])
-        if not levels or abs(change) >= (LATE_NS if run.start in gaps else least_ns):
-            sizes += [abs(change)] if levels else []
-            levels.append([])
-        elif abs(change) >= least_ns:
-            unclear.append(int(change))
-        elif abs(np.median(own) - np.median(last)) > max(least_ns, float(np.ptp(last))):
-            return None
-        levels[-1].append(own)
-        place.append(len(levels) - 1)
-    if len(levels) > _MOST_CLOCKS:
-        return None
-    clocks: list[int] = []
-    for level in levels:
-        median = int(np.median(np.concatenate(level)))
-        clocks.append(next((known for known in clocks if abs(known - median) <= least_ns), median))
-    return runs, [None if one is None else clocks[one] for one in place], min(sizes) / 2, unclear
+def _are_whole_seconds(header_ns: Ints, late_ns: Ints) -> bool:
+    """Return whether stamps were cut to whole seconds, or have us or ms in the place of ns.
+
+    The delays of such stamps vary by up to a second. Those of a receiver that measures on the second do not.
+    """
+    rest_ns = header_ns % SECOND_NS
+    if len(late_ns) <= OUTLIER_FACTOR or (rest_ns >= SECOND_NS // 1000).any():
+        return False
+    if rest_ns.any() and np.median(np.diff(header_ns)) > SECOND_NS / 2:  # a camera that is triggered every second
+        return False
+    return SECOND_NS / 3 < float(np.subtract(*np.quantile(late_ns, (0.9, 0.1)))) < SECOND_NS
 
 
-def _change(before_ns: Ints, behind_ns: Ints) -> float:
-    """By how much the median of the offset changes; 0 where it varies by as much."""
-    low, level, high = np.transpose([np.quantile(window, (0.1, 0.5, 0.9)) for window in (before_ns, behind_ns)])
-    change = float(level[1] - level[0])
-    return change if abs(change) > 2 * float((high - low).max()) else 0.0
+def _running_median(times_ns: Ints | Floats) -> Floats:
+    """Return the median (M,) of the messages around each, from which runs shorter than _MIN_RUN disappear."""
+    return np.asarray(median_filter(times_ns.astype(np.float64), 2 * _MIN_RUN - 1, mode="mirror"))
 
 
-def _offset_of(own: int, clocks: list[int | None], number: int, limit: float) -> int | None:
-    """The offset that a run is shifted by: that of its clock, or of a neighbouring one that it is late on; its own
-    where the clock was set before and behind it; None for outliers."""
-    clock = clocks[number]
-    if clock is not None:
-        return clock
-    before = next((one for one in clocks[number::-1] if one is not None), None)
-    behind = next((one for one in clocks[number:] if one is not None), None)
-    nearby = [one for one in (before, behind, *clocks[max(number - _NEAR, 0) : number + _NEAR]) if one is not None]
-    near = min(nearby, key=lambda one: (abs(own - one), one))
-    if abs(own - near) <= limit:
-        return near
-    if min(nearby) < own < max(nearby):
-        return own
-    return near if 0 < own - near <= max(limit, LATE_NS) else None
+def _window(log_ns: Ints) -> int:
+    """Return the number of messages that are logged within MAX_DELAY_NS, at least _MIN_RUN."""
+    lag = max(len(log_ns) // MAX_STEPS, 1)  # so that few differences span a step
+    period_ns = float(np.median(np.abs(log_ns[lag:] - log_ns[:-lag]))) / lag if len(log_ns) > lag else 0.0
+    return max(_MIN_RUN, int(min(MAX_DELAY_NS / max(period_ns, 1.0), len(log_ns))))
 
 
-def _log_jumps(header_ns: Ints, log_ns: Ints, limit: float) -> int:
-    """The number of times that the recorder's clock was set while the headers' went on."""
-    step, log_step = np.diff(header_ns), np.diff(log_ns)
-    set_at = (
-        np.flatnonzero((np.abs(step - log_step) > limit) & (np.abs(step) <= limit) & (np.abs(log_step) > limit)) + 1
-    )
-    least_ns = np.minimum.reduceat(log_ns - header_ns, np.append(0, set_at))  # the last of a burst is as late as ever
-    return int((np.abs(np.diff(least_ns)) > limit).sum())
+def _candidates(
+    header_ns: Ints | Floats, log_ns: Ints, level_ns: Floats, threshold_ns: float
+) -> tuple[Ints, Ints, Bools]:
+    """Find the places where the header's clock may have been set, given the running median (M,) of the offset.
+
+    Returns the first message after the old level and the first on the new level (K,), and whether a gap lies between.
+    """
+    rows = np.flatnonzero(np.abs(np.diff(level_ns)) > threshold_ns) + 1
+    if not len(rows):
+        return rows, rows, np.zeros(0, bool)
+    # of the two clocks, the one whose own step is unusual was set; the running median may move the place of a step
+    steps_ns = np.stack([np.diff(header_ns), np.diff(log_ns)])
+    change_ns = np.abs(steps_ns[1] - steps_ns[0])
+    near = np.clip(rows[:, None] - 1 + np.arange(1 - _MIN_RUN, _MIN_RUN), 0, len(change_ns) - 1)
+    places = near[np.arange(len(near)), change_ns[near].argmax(1)]
+    usual_ns = [np.median(steps[steps > 0]) if (steps > 0).any() else 0 for steps in steps_ns]
+    is_header, is_log = (2 * np.abs(steps_ns.T - usual_ns)[places] >= change_ns[places, None]).T
+    is_back = steps_ns[0, places] < 0
+    rows, is_gap = rows[is_header | is_back], (is_log & ~is_back)[is_header | is_back]
+    is_first = np.diff(rows, prepend=-_MIN_RUN) >= _MIN_RUN  # a few messages between two changes show no level
+    return rows[is_first], rows[np.append(is_first[1:], True)[: len(rows)]], is_gap[is_first]
+
+
+def _steps(
+    header_ns: Ints | Floats, log_ns: Ints, level_ns: Floats, threshold_ns: float, longest_ns: float
+) -> tuple[Ints, Floats, list[float]]:
+    """Estimate the steps of the header's clock, given the running median (M,) of the offset.
+
+    Returns the first message (K,) and the change of the offset (K,) of each step, and the changes over gaps that are a
+    step or a longer delay.
+    """
+    first, last, is_gap = _candidates(header_ns, log_ns, level_ns, threshold_ns)
+    offset_ns = np.asarray(log_ns - header_ns, np.float64)
+    changes_ns = spread_ns = np.zeros(len(first))
+    window, unclear_ns = _window(log_ns), list[float]()
+    for _ in range(MAX_STEPS if len(first) else 0):  # without changes that are no steps, windows beside steps grow
+        starts, stops = np.append(0, last), np.append(first, len(offset_ns))
+        # without a step, the offset changes by more than the longest delay only if a simulation has another rate
+        longest = int(np.argmax(stops - starts))
+        moved_ns, passed_ns = (times[stops[longest] - 1] - times[starts[longest]] for times in (level_ns, log_ns))
+        if abs(moved_ns) > MAX_DELAY_NS and passed_ns > 0:
+            offset_ns = np.asarray(log_ns - header_ns - moved_ns / passed_ns * (log_ns - log_ns[0]), np.float64)
+        before = _quantiles(offset_ns, np.maximum(starts[:-1], first - window), first)
+        after = _quantiles(offset_ns, last, np.minimum(stops[1:], last + window))
+        changes_ns = after[:, 0] - before[:, 0]  # transport only adds to the offset, so low quantiles show the clocks
+        spread_ns = np.maximum(np.ptp(before, axis=1), np.ptp(after, axis=1))
+        is_clear = np.abs(changes_ns) > np.clip(spread_ns, threshold_ns, longest_ns)
+        is_long = np.abs(changes_ns) > longest_ns
+        unclear_ns += changes_ns[is_clear & is_gap & ~is_long].tolist()
+        # if the offset changes over most gaps, delays vary as much as small steps
+        is_step = is_long if len(unclear_ns) > int((is_clear & ~is_gap).sum()) else is_clear & (is_long | ~is_gap)
+        first, last, is_gap = first[is_step], last[is_step], is_gap[is_step]
+        changes_ns, spread_ns = changes_ns[is_step], spread_ns[is_step]
+        if is_step.all():
+            break
+    by_period_ns = _changes_by_period(header_ns, first, last)
+    is_regular = ~is_gap & (np.abs(by_period_ns - changes_ns) <= spread_ns / 3)
+    return first, np.where(is_regular, by_period_ns, changes_ns), unclear_ns
+
+
+def _changes_by_period(header_ns: Ints | Floats, first: Ints, last: Ints) -> Floats:
+    """Return the changes (K,) of the offset if no message is missing, which do not depend on the delays."""
+    steps_ns, each = np.diff(header_ns), np.arange(_MIN_RUN)
+    period_ns = float(np.median(steps_ns[steps_ns > 0])) if (steps_ns > 0).any() else 0.0
+    before = header_ns[(first[:, None] - 1 - each).clip(0)] + period_ns * (each + 1 + (last - first)[:, None])
+    after = header_ns[(last[:, None] + each).clip(max=len(header_ns) - 1)] - period_ns * each
+    return np.asarray(np.median(before, axis=1) - np.median(after, axis=1))
+
+
+def _quantiles(offset_ns: Floats, starts: Ints, stops: Ints) -> Floats:
+    """Return the 10 % and 90 % quantiles (K, 2) of the offset between the rows `starts` and `stops` (K,)."""
+    ordered = (np.sort(offset_ns[start:stop]) for start, stop in zip(starts, stops, strict=True))
+    return np.array([part[[len(part) // 10, -1 - len(part) // 10]] for part in ordered]).reshape(-1, 2)
+
+
+def _count_log_steps(header_ns: Ints, log_ns: Ints, offset_ns: Floats) -> int:
+    """Return how often the least offset changes by more than a delay while the header's clock goes on."""
+    header_step_ns, log_step_ns = np.diff(header_ns), np.diff(log_ns.astype(np.float64))
+    is_step = (np.abs(header_step_ns) <= MAX_DELAY_NS) & (np.abs(log_step_ns - header_step_ns) > MAX_DELAY_NS)
+    least_ns = np.minimum.reduceat(offset_ns, np.append(0, np.flatnonzero(is_step) + 1))
+    return int((np.abs(np.diff(least_ns)) > MAX_DELAY_NS).sum())
+
+
+def _remarks(unit_ns: int, steps_ns: Floats, log_steps: int, unclear_ns: list[float]) -> list[str]:
+    remarks = []
+    if unit_ns != 1:
+        remarks.append(f"the header stamps are in {_NS_PER_UNIT[unit_ns]}, not in ns; they are converted.")
+    if len(steps_ns):
+        largest = ", ".join(f"{step_ns / 1e9:+.3f} s" for step_ns in steps_ns[:_MIN_RUN].tolist())
+        more = f" and {len(steps_ns) - _MIN_RUN} times more" if len(steps_ns) > _MIN_RUN else ""
+        remarks.append(f"the clock of the header stamps was set by {largest}{more}; the stamps are shifted back.")
+    if log_steps:
+        places = plural(log_steps, "place")
+        remarks.append(f"the log times jump in {places}; the header stamps do not, and are used.")
+    if unclear_ns:
+        remarks.append(
+            f"after {plural(len(unclear_ns), 'gap')} the log times are further from the header stamps, by up to "
+            f"{max(unclear_ns, key=abs) / 1e9:+.3f} s. Was a clock set, or is the transport slower since? The stamps "
+            "are not changed."
+        )
+    return remarks

@@ -16,7 +16,6 @@ import zstandard
 from vplog.errors import LogError, nearest_path, plural
 from vplog.logs import image_folder
 from vplog.logs.calibration_file import read_calibrations
-from vplog.logs.clocks import LONGEST_PAUSE_NS
 from vplog.logs.datasets import colmap, euroc, kitti, stereo_folders, tum_rgbd, utm_images, video, vslam_lab
 from vplog.logs.datasets.images import read as read_images
 from vplog.logs.datasets.streams import DataSet, DataSetContainer
@@ -36,6 +35,7 @@ from vplog.logs.formats.ros2_folder import (
 from vplog.logs.formats.sqlite_bag import SqliteBag
 from vplog.logs.messages.records import kind_of
 from vplog.logs.recorded_log import RecordedLog
+from vplog.logs.recorder_clock import LONGEST_PAUSE_NS
 from vplog.logs.topic_selection import EVERY_IMAGE, TopicChoice
 from vplog.storage.remote_path import RemotePath, located, names_below
 

@@ -52,6 +52,8 @@ class Images:
     """Places of all messages, the empty and damaged ones too."""
     rows: list[int] = field(default_factory=list)
     """Rows of `stream` that the places are."""
+    offset_ns: int = 0
+    """ns to add to the stamps."""
 
     def add(self, message: Message, position: int) -> None:
         """Add a message. Raises BadMessageError."""
@@ -70,7 +72,8 @@ class Images:
         if self.channel is None:
             return NONE, [], NONE
         stamp_ns, rows = self.stamps.order(self.channel.topic, notes)
-        return stamp_ns, [self.places[row] for row in rows.tolist()], np.array(self.rows, np.int64)[rows]
+        places = [self.places[row] for row in rows.tolist()]
+        return stamp_ns + self.offset_ns, places, np.array(self.rows, np.int64)[rows]
 
 
 @dataclass
@@ -133,6 +136,8 @@ class TopicCollector:
 
     def __init__(self, chosen: Selection) -> None:
         self.images = {part: Images(getattr(chosen, part)) for part in PARTS}
+        for part in PARTS[1:]:
+            self.images[part].offset_ns = chosen.image_offset_ns
         self.by_channel = {one.channel: one for one in self.images.values() if one.channel}
         self._calibrations = {
             one: Calibrations(one) for one in (chosen.camera_info, chosen.right_info, chosen.depth_info) if one
@@ -220,8 +225,9 @@ class TopicCollector:
 
     def calibrations(self, channel: Channel | None, part: str, notes: Notes) -> list[CalibrationMessage]:
         """The calibrations of a channel, stamped as the images of this part."""
-        known = self._calibrations.get(channel) if channel else None
-        return known.finish(self.images[part].stamps, self._others[known.channel], notes) if known else []
+        known, images = self._calibrations.get(channel) if channel else None, self.images[part]
+        found = known.finish(images.stamps, self._others[known.channel], notes) if known else []
+        return [replace(one, stamp_ns=one.stamp_ns + images.offset_ns) for one in found]
 
     def stamps(self) -> list[tuple[str, Stamps]]:
         """Every topic that is followed over time, with its stamps."""

@@ -17,7 +17,7 @@ import numpy as np
 
 from vplog.data import Ints
 from vplog.errors import LogError
-from vplog.logs.clocks import LONGEST_PAUSE_NS
+from vplog.logs.recorder_clock import LONGEST_PAUSE_NS
 from vplog.logs.topic_selection import EVERY_IMAGE
 from vplog.storage.image_file import PNG
 

@@ -26,13 +26,11 @@ from vplog.logs.messages.records import CalibrationMessage
 from vplog.logs.odometry_sources import PROPERTIES, is_truth
 from vplog.logs.rectification import (
     CHECKED_FRAMES,
-    MOST_ROWS_PX,
     MOST_TURN_RAD,
     NoPairError,
     Pair,
     Side,
     pair_of,
-    row_error_px,
 )
 from vplog.logs.scans import ScanReader
 from vplog.logs.stamps import rows_of
@@ -66,7 +64,7 @@ class RecordedLog:
     ) -> None:
         self.name, self.account = name, notes.account
         self._path, self._kind, self._notes = path, kind, notes
-        self._contents: Contents = container.contents()
+        self._contents: Contents = container.contents().with_image_offset(choice.image_offset_ns)
         self._container = messages_unpacked(container, self._contents, notes)
         self._candidates = read_candidates(self._container, self._contents)
         if (count := len(self._candidates)) > MOST_TOPICS:
@@ -263,7 +261,7 @@ class RecordedLog:
             return self._contents.truth
         chosen = select(self._candidates, TopicChoice(odometry=self._truth_name), self._path.name)
         found = read_content(self._container, self._contents, chosen, Notes()).odometry
-        return None if found is None else Trajectory(found.stamp_ns, found.odom_from_body)
+        return None if found is None else found.trajectory
 
     @cached_property
     def _truth_name(self) -> str:
@@ -422,10 +420,12 @@ class RecordedLog:
             right_from_left = content.tree.between(other, frame) if other and frame else None
             right_from_left = self._sidecar.right_from_left(image.topic, right.topic) if both else right_from_left
             pair = pair_of(Side(left, own), Side(camera, theirs), right_from_left)
-            error_px = row_error_px(self._rectified(pair))
-            if error_px is not None and error_px > MOST_ROWS_PX:
-                raise NoPairError(
-                    f"rectified by its calibration, its rows lie {error_px:.1f} px off those of the left image"
+            pair = pair.with_common_rows(self._rectified(pair))
+            if pair.right_down_px:
+                self._notes.add(
+                    f"{right.topic}: rectified by the calibration, its rows lie {abs(pair.right_down_px):.1f} px "
+                    f"{'above' if pair.right_down_px > 0 else 'below'} those of the left images; they are moved by as "
+                    "much. A new calibration would be better."
                 )
         except (NoPairError, LogError) as error:
             self._notes.add(f"The right image is not used: {str(error).rstrip('.')}.")

@@ -32,6 +32,8 @@ CHECKED_FRAMES = 5
 """Frames, spread over the drive, whose rows are compared."""
 MOST_ROWS_PX = 2.0
 """px; well rectified images are half a px off, and a match further away than this is none for stereo depth."""
+_COMMON_ROWS_PX = MOST_ROWS_PX / 2
+"""px by which rows of both images may be apart and still count as common."""
 _SAME_PX = 0.25
 """px by which a pixel may move in rectification and still count as in its place: below a feature's noise."""
 
@@ -62,14 +64,34 @@ class Pair:
     """The left one, rectified, with the baseline."""
     maps: tuple[Maps | None, Maps | None]
     """Maps of cv2.remap for left and right images; None where they are rectified already."""
+    right_down_px: float = 0.0
+    """px by which rectified right images are moved down to share rows with the left ones."""
 
     def rectify(self, image: Bytes, side: int) -> Bytes:
         """(H, W) or (H, W, 3) uint8 the left (0) or right (1) image on the common rows."""
-        found = self.maps[side]
-        if found is None:
-            return image
         # what lies outside the lens' view repeats its border: a black edge would be full of features
-        return np.asarray(cv2.remap(image, *found, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+        if (found := self.maps[side]) is not None:
+            image = np.asarray(cv2.remap(image, *found, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+        if side == 1 and self.right_down_px:
+            down, size = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, self.right_down_px]]), image.shape[1::-1]
+            image = np.asarray(cv2.warpAffine(image, down, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+        return image
+
+    def with_common_rows(self, rectified: Iterable[tuple[Bytes, Bytes]]) -> Pair:
+        """Return the pair with its right images moved down by the px that rectified left and right images show.
+
+        Raises NoPairError if rows are still `MOST_ROWS_PX` apart.
+        """
+        apart = rows_apart_px(rectified)
+        if len(apart) < _LEAST_MATCHES:
+            return self
+        down_px = float(np.median(apart))
+        down_px = down_px if abs(down_px) > _COMMON_ROWS_PX else 0.0
+        if (error_px := float(np.median(np.abs(apart - down_px)))) > MOST_ROWS_PX:
+            raise NoPairError(
+                f"rectified by its calibration, its rows lie {error_px:.1f} px off those of the left image"
+            )
+        return replace(self, right_down_px=down_px)
 
 
 def pair_of(left: Side, right: Side, right_from_left: Floats | None) -> Pair:
@@ -107,7 +129,7 @@ def pair_of(left: Side, right: Side, right_from_left: Floats | None) -> Pair:
     matrices = [p[:, :3] for p in projections]
     (left_fy, left_cy), (right_fy, right_cy) = ((k[1, 1], k[1, 2]) for k in matrices)
     height = right.camera.height  # rows of rectified images correspond only where these parts of the matrices are equal
-    if abs(left_cy - right_cy) + abs(left_fy / right_fy - 1) * height / 2 > 1.0:  # px at the edge: half of rows_px
+    if abs(left_cy - right_cy) + abs(left_fy / right_fy - 1) * height / 2 > _COMMON_ROWS_PX:  # at the edge
         raise NoPairError(f"P of the calibration of {right.camera.name} does not put the two images on common rows")
     maps = tuple(_maps(side, r, k) for side, r, k in zip((left, right), rotations, matrices, strict=True))
     turned = np.eye(4) if maps[0] is None else se3.pose(rotations[0].T, np.zeros(3))
@@ -123,8 +145,8 @@ def pair_of(left: Side, right: Side, right_from_left: Floats | None) -> Pair:
     return Pair(camera, (maps[0], maps[1]))
 
 
-def row_error_px(rectified: Iterable[tuple[Bytes, Bytes]]) -> float | None:
-    """Median distance of the rows of matching features in left and right images, px; None where too few match."""
+def rows_apart_px(rectified: Iterable[tuple[Bytes, Bytes]]) -> Floats:
+    """(K,) px by which features of left images lie below their matches in right ones."""
     orb, matcher = cv2.ORB.create(nfeatures=_CHECKED_FEATURES), cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
     apart: list[float] = []
     for left, right in rectified:
@@ -133,8 +155,8 @@ def row_error_px(rectified: Iterable[tuple[Bytes, Bytes]]) -> float | None:
         if found is None or theirs is None or not len(points) or not len(others):
             continue
         good = (match for match in matcher.match(found, theirs) if match.distance <= _NEAR_BITS)
-        apart += [abs(points[m.queryIdx].pt[1] - others[m.trainIdx].pt[1]) for m in good]
-    return float(np.median(apart)) if len(apart) >= _LEAST_MATCHES else None
+        apart += [points[m.queryIdx].pt[1] - others[m.trainIdx].pt[1] for m in good]
+    return np.array(apart)
 
 
 def _projection(side: Side) -> Floats:

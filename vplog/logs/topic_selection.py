@@ -52,6 +52,7 @@ OPTIONS = {
     "calibration_file": "calibration", "imu": "imu-topic", "start_s": "start", "stop_s": "stop",
     "mask": "mask-topic", "wheelbase_m": "wheelbase-m", "track_m": "track-m", "wheel_radius_m": "wheel-radius-m",
     "camera_height_m": "camera-height-m", "gps_any_status": "gps-any-status",
+    "image_offset_s": "image-offset-s",
 }  # fmt: skip
 """Option of the command line for each field of TopicChoice."""
 _NO_LIDAR = re.compile(r"depth|camera|stereo|radar|map|cluster|obstacle|segment|ground|filtered", re.IGNORECASE)
@@ -101,10 +102,17 @@ class TopicChoice(Settings):
     """m; for wheel speeds in sensor_msgs/JointState."""
     camera_height_m: float | None = Field(default=None, gt=0, le=100)
     """m of the camera over flat ground, by which the visual odometry of a single camera has metres."""
+    image_offset_s: float | None = Field(default=None, ge=-1e4, le=1e4)
+    """s to add to the stamps of all images, for cameras whose clock or driver is late."""
     start_s: float | None = Field(default=None, ge=0, le=1e9)
     """s after the first image, before which images are left out."""
     stop_s: float | None = Field(default=None, ge=0, le=1e9)
     """s after the first image, from which on images are left out."""
+
+    @property
+    def image_offset_ns(self) -> int:
+        """ns to add to the stamps of images."""
+        return round((self.image_offset_s or 0.0) * 1e9)
 
     def of_camera(self, topic: str) -> TopicChoice:
         """Choice of topics with a further camera as the one in use, and no others. Of all its images, as the keyframes
@@ -173,6 +181,8 @@ class Selection:
     gps: Channel | None = None
     gps_any_status: bool = False
     """As in TopicChoice."""
+    image_offset_ns: int = 0
+    """ns to add to the stamps of images."""
     right: Channel | None = None
     right_info: Channel | None = None
     depth_info: Channel | None = None
@@ -266,6 +276,7 @@ def select(candidates: list[Candidate], choice: TopicChoice, log: str) -> Select
         kind=kind,
         geometry=geometry,
         gps_any_status=choice.gps_any_status,
+        image_offset_ns=choice.image_offset_ns,
     )
 
 

@@ -9,11 +9,6 @@ from vplog.data import Floats, Ints, Keyframes
 from vplog.geometry import se3
 from vplog.settings import Settings
 
-_FEWEST = 8
-"""Pairs from which a median is robust."""
-_NOISE_M = 0.1
-"""m; the way between two images by their depth is off by some cm."""
-
 
 class CalibrationSettings(Settings):
     """Comparison of the camera's rotations with the odometry's.
@@ -37,6 +32,19 @@ class CalibrationSettings(Settings):
     takes to write the stamp. It moves a closure along the drive by speed times this."""
 
 
+def compared_pairs(keyframes: Keyframes, settings: CalibrationSettings) -> Ints:
+    """(P, 2) int64 rows (earlier, later) of keyframes between which motions of camera and odometry are compared.
+
+    They are the `turning_pairs`, and the neighbours between which the body's rates of turning and its velocities change
+    most, which shows a time offset.
+    """
+    change = np.diff(body_twists(keyframes), axis=0)
+    rates = np.linalg.norm(change[:, :3], axis=1), np.linalg.norm(change[:, 3:], axis=1)
+    earlier = np.concatenate([np.argsort(-rate, kind="stable")[: settings.pairs // 2] for rate in rates])
+    changing = np.column_stack([earlier, earlier + 1])
+    return np.unique(np.concatenate([turning_pairs(keyframes, settings), changing]), axis=0).astype(np.int64)
+
+
 def turning_pairs(keyframes: Keyframes, settings: CalibrationSettings) -> Ints:
     """(P, 2) int64 rows (earlier, later) of keyframes that turn by about `angle` within `reach`, spread evenly."""
     count = len(keyframes.stamp_ns)
@@ -50,37 +58,6 @@ def turning_pairs(keyframes: Keyframes, settings: CalibrationSettings) -> Ints:
     if len(earlier) > settings.pairs:
         earlier = earlier[np.linspace(0, len(earlier) - 1, settings.pairs).astype(np.int64)]
     return np.column_stack([earlier, later[earlier]]).astype(np.int64)
-
-
-def rotation_share(odometry_motion: Floats, image_motion: Floats, settings: CalibrationSettings) -> float:
-    """Relative disagreement of the camera's rotations with the odometry's, at least `least_share`.
-
-    `odometry_motion` and `image_motion` (P, 4, 4) are motions of the camera over turning pairs, the latter from images
-    alone.
-    """
-    if len(odometry_motion) < _FEWEST:
-        return settings.least_share
-    expected, found = se3.so3_log(odometry_motion[:, :3, :3]), se3.so3_log(image_motion[:, :3, :3])
-    ratio = (found * expected).sum(axis=1) / (expected**2).sum(axis=1)
-    return float(np.clip(abs(np.median(ratio) - 1.0), settings.least_share, settings.most_share))
-
-
-def axes_apart(odometry_motion: Floats, image_motion: Floats) -> float:
-    """rad, the median angle between the axes about which a camera turns by odometry and by images, as in
-    `rotation_share`; 0 of too few."""
-    if len(odometry_motion) < _FEWEST:
-        return 0.0
-    axes = [se3.so3_log(motion[:, :3, :3]) for motion in (odometry_motion, image_motion)]
-    a, b = (axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-9) for axis in axes)
-    return float(np.median(np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0))))
-
-
-def times_as_far(odometry_motion: Floats, image_motion: Floats) -> float:
-    """Median ratio of the ways of a camera (P, 4, 4) by the metres of its images and by odometry; 1 of too few that are
-    longer than `_NOISE_M`."""
-    by_odometry, by_images = (np.linalg.norm(motion[:, :3, 3], axis=1) for motion in (odometry_motion, image_motion))
-    moved = by_odometry > _NOISE_M
-    return float(np.median(by_images[moved] / by_odometry[moved])) if moved.sum() >= _FEWEST else 1.0
 
 
 def motion_covariance(match_from_query: Floats, share: float) -> Floats:

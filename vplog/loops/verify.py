@@ -6,19 +6,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vplog.data import Camera, Closures, Floats, Int32s, Ints, Keyframes
+from vplog.data import Camera, Closures, Floats, Int32s, Ints, Keyframes, Trajectory
 from vplog.execution.run_warnings import warn
 from vplog.features.matching import PairMatches
 from vplog.geometry import se3
+from vplog.geometry.motion_comparison import Motions, compare_motions
 from vplog.loops import undistort
 from vplog.loops.calibration import (
-    axes_apart,
     body_twists,
+    compared_pairs,
     motion_covariance,
-    rotation_share,
     stamp_covariance,
-    times_as_far,
-    turning_pairs,
 )
 from vplog.loops.candidate import Drive, Row, VerifySettings, check_queries, check_reverse
 from vplog.loops.landmarks import FeaturesOf, for_stereo
@@ -31,9 +29,11 @@ _WARNED_SHARE = 0.05
 """Relative disagreement of camera and odometry that is warned of: five times a careful calibration's error."""
 _WARNED_AXES_RAD = np.radians(30.0)
 """Angle between the axes of their rotations that is a wrong mount's: noise has some degrees."""
-_WARNED_SCALES = 0.6, 1.6
-"""Ratio of the metres of depth and odometry beyond which one is in another unit: wheels slip by less, and a focal
-length that is 30 % off makes 0.7."""
+_WARNED_OFFSET_S = 0.05
+"""Offset of the images' stamps that is warned of: at 10 m/s half a metre."""
+_WARNED_LENGTHS = 0.4
+"""Relative difference of the metres of depth and odometry that is warned of: wheels slip by less, and a focal length
+that is 30 % off makes 0.7."""
 
 
 def drive_of(
@@ -98,27 +98,40 @@ def _by(key: Int32s, other: Int32s, rows: Ints) -> list[Ints]:
     return np.split(order, np.flatnonzero(np.diff(key[order])) + 1) if len(rows) else []
 
 
-def calibration_share(drive: Drive, execution: Execution) -> float:
-    """Relative disagreement of a calibrated camera's rotations with the odometry's, over turning pairs."""
+def calibration_share(drive: Drive, execution: Execution, odometry: Trajectory | None = None) -> float:
+    """Return the relative error of a calibrated camera's turns, and warn if its motions differ from the odometry's.
+
+    The motions are those between pairs of keyframes. `odometry` has odom_from_body between the keyframes as well; None
+    interpolates between them.
+    """
     keyframes, camera, settings = drive.keyframes, drive.camera, drive.settings.calibration
-    pairs = turning_pairs(keyframes, settings)
-    turns = execution.map(lambda pair: check_queries(drive, drive, pair[0], pair[1:]), pairs.tolist())
-    good = [(at, row) for at, (row,) in enumerate(turns) if row.pose.match_from_query is not None]
-    earlier, later = pairs[[at for at, _ in good]].T
-    by_images = np.array([row.pose.match_from_query for _, row in good]).reshape(-1, 4, 4)
-    by_odometry = se3.between(*(keyframes.odom_from_body[rows] @ camera.body_from_camera for rows in (earlier, later)))
-    share = rotation_share(by_odometry, by_images, settings)
-    metric = [row.scale != "odometry" for _, row in good]
-    far = times_as_far(by_odometry[metric], by_images[metric])
-    if (apart := axes_apart(by_odometry, by_images)) > _WARNED_AXES_RAD:
+    pairs = compared_pairs(keyframes, settings)
+    found = execution.map(lambda pair: check_queries(drive, drive, pair[0], pair[1:]), pairs.tolist())
+    good = [(at, row) for at, (row,) in enumerate(found) if row.pose.match_from_query is not None]
+    earlier, later = keyframes.stamp_ns[pairs[[at for at, _ in good]].T]
+    motions = np.array([row.pose.match_from_query for _, row in good]).reshape(-1, 4, 4)
+    metric = np.array([row.scale != "odometry" for _, row in good], bool)
+    track = odometry or Trajectory(keyframes.stamp_ns, keyframes.odom_from_body)
+    compared = compare_motions(track, Motions(earlier, later, motions, metric), camera.body_from_camera)
+    if compared is None:
+        return settings.least_share
+    offset, turned, lengths, turns = compared.offset_s, compared.turned_rad, compared.lengths, compared.turns
+    share = float(np.clip(abs(turns.value - 1.0), settings.least_share, settings.most_share))
+    if turned.differs(0.0, _WARNED_AXES_RAD):
         warn(
-            f"Camera {camera.name!r} turns about another axis than the odometry, {np.degrees(apart):.0f} degrees off. "
-            "Check its mount: the static transforms, or --calibration."
+            f"Camera {camera.name!r} turns about another axis than the odometry, {np.degrees(turned.value):.0f} "
+            "degrees off. Check its mount: the static transforms, or --calibration."
         )
-    elif not _WARNED_SCALES[0] < far < _WARNED_SCALES[1]:
+    elif offset.differs(0.0, _WARNED_OFFSET_S):
         warn(
-            f"Camera {camera.name!r} moves {far:.2g} times as far by its depth as by odometry. Check the unit of the "
-            "depth, or the baseline, and the scale of the odometry."
+            f"The stamps of camera {camera.name!r} are {abs(offset.value):.2f} s (standard deviation "
+            f"{offset.sigma:.2f} s) {'late' if offset.value < 0 else 'early'} against the odometry. --image-offset-s "
+            f"{offset.value:.2f} corrects them."
+        )
+    elif lengths.differs(1.0, _WARNED_LENGTHS):
+        warn(
+            f"Camera {camera.name!r} moves {lengths.value:.2g} times as far by its depth as by odometry. Check the "
+            "unit of the depth, or the baseline, and the scale of the odometry."
         )
     elif share > _WARNED_SHARE:
         or_more = " or more" if share == settings.most_share else ""

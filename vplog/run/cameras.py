@@ -114,7 +114,9 @@ def read_cameras(
             warn(f"Camera {topic} is not used: {error}")
             continue
         row = row[np.searchsorted(selected.stamp_ns, pictures.stamp_ns)]
-        found.append(View(other, DriveFeatures(pictures, camera, features, settings.verify), row, images))
+        found.append(
+            View(other, DriveFeatures(pictures, camera, features, settings.verify, odometry.trajectory), row, images)
+        )
         for warning in other.warnings:
             if warning not in log.warnings:
                 warn(warning)

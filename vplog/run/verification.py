@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vplog.data import Camera, Closures, Ints, Keyframes, Verdict
+from vplog.data import Camera, Closures, Ints, Keyframes, Trajectory, Verdict
 from vplog.execution.execution import Execution
 from vplog.loops.candidate import Drive
 from vplog.loops.propose import Proposals
@@ -30,6 +30,8 @@ class DriveFeatures:
     camera: Camera
     features: Extracted
     settings: VerifySettings
+    odometry: Trajectory
+    """odom_from_body, between the keyframes as well."""
 
 
 def for_verification(drive: DriveFeatures) -> Drive:
@@ -74,7 +76,7 @@ def calibrated(drive: DriveFeatures, steps: Steps) -> float:
 @step("calibrate", lambda *_: json_codec(float, float))
 def calibrate(drive: DriveFeatures, *, execution: Execution) -> float:
     """Relative error of rotations by the calibration, see `loops.verify.calibration_share`."""
-    return calibration_share(for_verification(drive), execution)
+    return calibration_share(for_verification(drive), execution, drive.odometry)
 
 
 @step("verify", lambda *_: closures_codec(), items=lambda proposals, *_: len(proposals.query))

@@ -190,7 +190,7 @@ def evaluate_poses(
             )
         after = Trajectory(after.stamp_ns, se3.stretched(after.world_from_body, scale, mount))
         odometry = replace(odometry, odom_from_body=se3.stretched(odometry.odom_from_body, scale, mount))
-    before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
+    before = odometry.trajectory
     keyframes, world_from_body = tables.read_keyframes(folder / "keyframes.parquet")
     ledger = tables.read_closures(folder / "closures.parquet")
     settings = run_record.recorded(record, folder / "run.json", dict, "settings", "propose")
@@ -399,7 +399,7 @@ def _against_gps(
         raise TruthError(f"{record.get('log')} has no GPS fixes. Give a truth file: --truth FILE.tum")
     if (mount := unit_camera(record)) is not None:  # the antenna is taken to be at the camera, whose path has one unit
         fixes = replace(fixes, antenna_m=mount[:3, 3])
-    before = Trajectory(odometry.stamp_ns, odometry.odom_from_body)
+    before = odometry.trajectory
     in_run = record.get("gps") is not None or (record.get("topics") or {}).get("odometry") == "gps"
     warnings = [_OWN_FIXES] * in_run + run_record.piece_warnings(record)
     matched = matched_fixes(after, fixes)

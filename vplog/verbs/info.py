@@ -16,9 +16,8 @@ from vplog.data import Bytes, Camera, Frame, Gps, Ints, LogInfo, Odometry, Odome
 from vplog.errors import LogError
 from vplog.geometry.masking import masked
 from vplog.logs import TopicChoice
-from vplog.logs.clocks import GAP_NS, GAP_PERIODS
 from vplog.logs.odometry_sources import PROPERTIES, evidence_text
-from vplog.logs.stamps import rate_hz
+from vplog.logs.stamps import gap_ns, rate_hz
 from vplog.odometry.visual import visual_odometry
 from vplog.results.html import render
 from vplog.results.previews import jpeg
@@ -367,8 +366,7 @@ def _gaps(found: LogInfo, stamp_ns: Ints, odometry: Odometry | None, gps: Gps | 
     gaps = []
     for part, stamps in by_part:
         steps = np.diff(stamps)
-        limit = max(GAP_NS, GAP_PERIODS * float(np.median(steps))) if len(steps) else 0.0
-        gaps += [(int(steps[row]), int(stamps[row]), part) for row in np.flatnonzero(steps > limit)]
+        gaps += [(int(steps[row]), int(stamps[row]), part) for row in np.flatnonzero(steps > gap_ns(stamps))]
     longest = sorted(gaps, reverse=True)[:_MOST_GAPS]
     return [
         {"what": part, "after_s": round((at - found.start_ns) / 1e9, 3), "seconds": round(step / 1e9, 3)}

@@ -14,6 +14,7 @@ import numpy as np
 
 from vplog.data import Bytes, Ints
 from vplog.errors import LogError, plural
+from vplog.logs.datasets import gopro
 from vplog.logs.datasets.streams import DataSet, Stream, raw_image
 from vplog.logs.formats.container import Channel
 from vplog.logs.image_folder import first_bytes
@@ -76,7 +77,8 @@ def read(path: Path) -> DataSet:
     remarks = list[str]()
     frames = VideoFrames(path, remarks.append)
     channel = Channel("video", "sensor_msgs/Image", "ros1")
-    return DataSet("video", [Stream(channel, frames.stamp_ns, frames.message, lambda _: MAX_PIXELS)], remarks=remarks)
+    images = Stream(channel, frames.stamp_ns, frames.message, lambda _: MAX_PIXELS)
+    return DataSet("video", [images, *gopro.streams_of(frames.metadata())], remarks=remarks)
 
 
 class VideoFrames:
@@ -138,6 +140,16 @@ class VideoFrames:
         first, *_ = ticks = self._ticks.tolist()  # Python's integers do not overflow
         times, parts = 10**9 * self._tick_s.numerator, self._tick_s.denominator
         return np.array([(tick - first) * times // parts for tick in ticks], np.int64)
+
+    def metadata(self) -> Iterator[tuple[int, int, bytes]]:
+        """Yield stamp and duration in ns, as `stamp_ns`, and data of the packets of a GoPro's metadata track."""
+        with self._opened() as container, suppress(self._av.error.FFmpegError):
+            tracks = [one for one in container.streams.data if one.metadata.get("handler_name") == gopro.HANDLER]
+            first_s, last_ns = self._ticks.tolist()[0] * self._tick_s, int(self.stamp_ns[-1])
+            for one in container.demux(tracks[:1]) if tracks else ():
+                stamp_ns = -1 if one.pts is None else int(10**9 * (one.pts * one.time_base - first_s))
+                if one.size and 0 <= stamp_ns <= last_ns:
+                    yield stamp_ns, min(int(10**9 * (one.duration or 0) * one.time_base), last_ns), bytes(one)
 
     def message(self, row: int) -> ImageMessage:
         """Its image, of no px where it does not decode. Rows are best read in increasing order."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
 from vplog.data import Gps, Trajectory
@@ -67,6 +67,15 @@ class Contents:
     @property
     def messages(self) -> int:
         return sum(self.counts.values())
+
+    def with_image_offset(self, offset_ns: int) -> Contents:
+        """The contents with image files by their stamps plus `offset_ns`."""
+        files = {topic: _later(names, offset_ns) for topic, names in self.files.items()}
+        return replace(self, names=_later(self.names, offset_ns), files=files) if offset_ns else self
+
+
+def _later(names: Mapping[int, str], offset_ns: int) -> dict[int, str]:
+    return {stamp_ns + offset_ns: name for stamp_ns, name in names.items()}
 
 
 @dataclass

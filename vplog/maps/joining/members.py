@@ -14,7 +14,7 @@ from vplog import logs
 from vplog.data import Int32s, Ints
 from vplog.errors import LogError, ResultError
 from vplog.features.store import FeatureStore
-from vplog.loops.calibration import turning_pairs
+from vplog.loops.calibration import compared_pairs
 from vplog.loops.verify import VerifySettings, calibration_share, drive_of
 from vplog.maps.storage.layout import described_with, folder_name
 from vplog.pipeline import Pipeline
@@ -157,7 +157,7 @@ def camera_trust(member: Member, verify: VerifySettings, execution: Execution) -
     if unknown.camera["matrix"] is None:
         return unknown
     with opened_drive(member, unknown, verify, execution) as (drive, fetch):
-        pairs, around = turning_pairs(drive.keyframes, verify.calibration), verify.landmarks.neighbours
+        pairs, around = compared_pairs(drive.keyframes, verify.calibration), verify.landmarks.neighbours
         near = pairs[:, :1] + np.arange(-around, around + 1)
         rows = np.concatenate([near.ravel(), pairs[:, 1]])
         fetch(np.unique(rows[(rows >= 0) & (rows < len(drive.keyframes.stamp_ns))]))
