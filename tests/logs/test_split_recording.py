@@ -97,6 +97,19 @@ def test_numbered_files_of_two_days_are_not_one_drive(kind: str, tmp_path: Path)
         logs.open(day)
 
 
+@pytest.mark.parametrize("kind", ["mcap", "db3"])
+def test_parts_that_the_metadata_do_not_list_are_read(kind: str, tmp_path: Path) -> None:
+    """As after a crash of the recorder, and beside a file that is none of its parts."""
+    first, second = (KINDS[kind](tmp_path, i, part) for i, part in enumerate((FIRST, SECOND)))
+    second.rename(first.parent / second.name)
+    (first.parent / f"other_1.{kind}").write_bytes(first.read_bytes())
+    log = logs.open(first.parent)
+    assert isinstance(log, RecordedLog)
+    np.testing.assert_array_equal([f.decode().image for f in log.frames(log.stamps())], DRIVE.images)
+    assert f"does not list {second.name}; they are read" in " ".join(log.warnings)
+    assert log.losses == []
+
+
 def test_one_account_of_losses(tmp_path: Path) -> None:
     a, b = (KINDS["protobuf"](tmp_path, i, part) for i, part in enumerate((FIRST, SECOND)))
     (tmp_path / "none.mcap").touch()

@@ -432,6 +432,9 @@ def _open_bag(folder: Path, metadata: Metadata, choice: TopicChoice, notes: Note
             notes.account.add("missing_file", None, (file.name, 0), [], f"Left out: {error}")
     if not parts:
         raise failures[0]
+    if metadata.unlisted:
+        names = ", ".join(metadata.unlisted[:_LISTED])
+        notes.add(f"metadata.yaml of {name} does not list {names}; they are read as the parts behind those it lists.")
     for missing in metadata.missing:
         detail = f"{name} lacks {missing}, which metadata.yaml names."
         notes.account.add("missing_file", None, (missing, 0), [], detail)

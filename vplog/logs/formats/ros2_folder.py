@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,8 @@ _MOST_MESSAGES = 2**48
 _DEEPEST = 64
 """Levels of lists and maps in metadata.yaml; rosbag2 writes 8."""
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_PART = re.compile(r"(.*)_(\d{1,9})(\.[a-z0-9.]+)")
+"""Name of a part of a bag, NAME_0.mcap."""
 _TRIED = 10
 """Messages that are looked at for whether each is packed: a damaged one does not decide it."""
 
@@ -47,6 +49,8 @@ class Metadata:
     start_ns: int
     """Start time of the recording; 0 where unknown."""
     end_ns: int
+    unlisted: list[str] = field(default_factory=list)
+    """Names of the files that are further parts and that metadata.yaml does not list, as after a crash."""
 
 
 class Chain:
@@ -157,6 +161,12 @@ def read_metadata(folder: Path) -> Metadata:
         raise MetadataError(f"{folder / 'metadata.yaml'} names {lacks}, and no such file is in the folder.")
     start_ns, length_ns = _nanoseconds(tree.get("starting_time")), _nanoseconds(tree.get("duration"))
     end_ns = start_ns + length_ns if start_ns and length_ns else 0
+    kinds = {_PART.sub(r"\1\3", file.name) for file in named if _PART.fullmatch(file.name)}
+    unlisted = [file for file in folder.iterdir() if file not in named and _PART.fullmatch(file.name)]
+    unlisted = [file for file in unlisted if _PART.sub(r"\1\3", file.name) in kinds and file.is_file()]
+    if unlisted:  # the counts do not include them
+        unlisted.sort(key=lambda file: int(_PART.sub(r"\2", file.name)))
+        return Metadata([*files, *unlisted], missing, {}, start_ns, 0, [file.name for file in unlisted])
     return Metadata(files, missing, _recorded(tree), start_ns, end_ns)
 
 
