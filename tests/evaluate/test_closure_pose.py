@@ -2,20 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.evaluate.drawn import KINDS, Drawn, draw
 from tests.graph.drive import ledger
-from vplog.data import Trajectory
+from vplog.data import Floats, Trajectory
 from vplog.evaluate.body_truth import BodyTruth, TruthAt, body_truth
 from vplog.evaluate.closure_pose import pose_bounds, pose_errors
 from vplog.evaluate.closures import ClosureScore, Judgement, score_closures
 from vplog.geometry import se3
+from vplog.geometry.pose_conventions import AS_GIVEN
 
 SEEDS = range(2)
+
+
+def with_rotations(change: Callable[[Floats], Floats]) -> Callable[[Floats], Floats]:
+    return lambda poses: se3.pose(change(poses[:, :3, :3]), poses[:, :3, 3])
+
+
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+WRITTEN: dict[str, Callable[[Floats], Floats]] = {
+    "body_from_world (inverted)": se3.inverse,
+    "with conjugated quaternions": with_rotations(lambda rotations: np.swapaxes(rotations, 1, 2)),
+    "with quaternions in the order w x y z": with_rotations(
+        lambda rotations: Rotation.from_quat(np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=1)).as_matrix()
+    ),
+    "in left-handed axes (mirrored)": lambda poses: MIRROR @ poses @ MIRROR,
+}
+"""Poses world_from_body as other conventions write them."""
 
 
 def judged(drive: Drawn, truth: Trajectory) -> tuple[ClosureScore, Judgement, BodyTruth]:
@@ -83,6 +102,43 @@ def test_a_marker_as_far_from_the_body_as_it_moves_is_estimated(seed: int) -> No
     assert of_body.frame == "estimated"
     np.testing.assert_array_equal(found.right, drive.right)
     np.testing.assert_array_equal(found.wrong, ~drive.right)
+
+
+@pytest.mark.parametrize("written", WRITTEN)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_truth_in_another_convention_is_converted(kind: str, written: str) -> None:
+    drive = draw(kind, 5)
+    poses = WRITTEN[written](drive.truth.world_from_body)
+    _, found, of_body = judged(drive, Trajectory(drive.truth.stamp_ns, poses))
+    np.testing.assert_array_equal(found.right, drive.right)
+    assert (of_body.convention, of_body.frame) == (written, "body")
+    assert of_body.as_read is not None
+    np.testing.assert_allclose(of_body.as_read.world_from_body, drive.truth.world_from_body, atol=1e-6)
+
+
+@pytest.mark.parametrize("written", WRITTEN)
+def test_a_straight_road_does_not_tell_the_convention_of_the_truth(written: str) -> None:
+    seconds = np.arange(0.0, 60.0, 0.1)
+    poses = np.tile(np.eye(4), (len(seconds), 1, 1))
+    poses[:, 0, 3] = 5.0 * seconds
+    stamps, rng = (seconds * 1e9).astype(np.int64), np.random.default_rng(0)
+    noise = se3.exp(rng.normal(0.0, [1e-3] * 3 + [1e-2] * 3, (len(seconds), 6)))
+    of_body = body_truth(Trajectory(stamps, poses @ noise), Trajectory(stamps, poses), np.eye(4))
+    assert (of_body.convention, of_body.unit, of_body.has_other_scale) == (AS_GIVEN, "m", False)
+    of_body = body_truth(Trajectory(stamps, WRITTEN[written](poses @ noise)), Trajectory(stamps, poses), np.eye(4))
+    assert of_body.convention in (AS_GIVEN, written)
+
+
+@pytest.mark.parametrize(("times", "unit", "differs"), [(1000.0, "mm", False), (100.0, "cm", False), (1.3, "m", True)])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_scale_of_the_truth_is_found(kind: str, times: float, unit: str, differs: bool) -> None:
+    drive = draw(kind, 6)
+    marker = se3.exp(np.array([0.3, -0.2, 0.5, 0.1, 0.0, 0.2]))
+    for poses in (drive.truth.world_from_body, drive.truth.world_from_body @ marker):
+        _, found, of_body = judged(drive, Trajectory(drive.truth.stamp_ns, se3.stretched(poses, times)))
+        assert (of_body.unit, of_body.has_other_scale) == (unit, differs)
+        assert of_body.scale == pytest.approx((times if differs else 1.0) / 1.02, rel=0.03)
+        assert differs or (found.right == drive.right).all()
 
 
 @pytest.mark.parametrize("scale", [0.3, 7.0])

@@ -28,16 +28,25 @@ if TYPE_CHECKING:
     from vplog.verbs.demo.record import Demo
 
 
+def _inverted(truth: Trajectory) -> Trajectory:
+    return Trajectory(truth.stamp_ns, se3.inverse(truth.world_from_body))
+
+
 def _wxyz(truth: Trajectory) -> Trajectory:
-    vectors = se3.vectors(truth.world_from_body)
-    swapped = vectors[:, [6, 3, 4, 5]] / np.linalg.norm(vectors[:, 3:], axis=1, keepdims=True)
-    x, y, z, w = swapped.T
-    R = np.stack(
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-         2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-         2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=1,
-    ).reshape(-1, 3, 3)  # fmt: skip
-    return Trajectory(truth.stamp_ns, se3.pose(R, vectors[:, :3]))
+    quaternions = np.roll(se3.quaternion(truth.world_from_body[:, :3, :3]), 1, axis=1)
+    return Trajectory(truth.stamp_ns, se3.pose(se3.rotation(quaternions), truth.world_from_body[:, :3, 3]))
+
+
+def _two(truth: Trajectory) -> Trajectory:
+    """That of two drives, the later poses of each between those of the other."""
+    stamps = np.concatenate([truth.stamp_ns, truth.stamp_ns + 7_000_000])
+    poses = np.concatenate([truth.world_from_body, truth.world_from_body[::-1]])
+    order = np.argsort(stamps)
+    return Trajectory(stamps[order], poses[order])
+
+
+def _stretched(times: float) -> Callable[[Trajectory], Trajectory]:
+    return lambda truth: Trajectory(truth.stamp_ns, se3.stretched(truth.world_from_body, times))
 
 
 def _part(truth: Trajectory) -> Trajectory:
@@ -53,8 +62,9 @@ def _other(truth: Trajectory) -> Trajectory:
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (_wxyz, "does not move as the odometry does"),
+        (_stretched(1.3), "The path of the truth is"),
         (_other, "does not move as the odometry does"),
+        (_two, "the file holds two trajectories"),
         (_part, "The truth covers"),
     ],
     ids=lambda one: getattr(one, "__name__", ""),
@@ -68,6 +78,23 @@ def test_a_truth_of_another_motion_or_of_a_part_is_spoken_of(
     report(finished, tmp_path / "page.html", str(tmp_path / "other.tum"))
     assert text in (tmp_path / "page.html").read_text()
     assert diff(finished, finished, str(tmp_path / "other.tum"))["warnings"] == found["warnings"]
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [(_wxyz, "in the order w x y z"), (_inverted, "body_from_world"), (_stretched(1000.0), "in mm")],
+)
+def test_a_truth_in_another_convention_or_unit_is_converted(
+    change: Callable[[Trajectory], Trajectory], text: str, finished: Path, drive: Demo, tmp_path: Path
+) -> None:
+    truth = read_truth(str(drive.truth))
+    write_tum(tmp_path / "other.tum", change(truth))
+    write_tum(tmp_path / "same.tum", truth)
+    found, same = (evaluate(finished, str(tmp_path / name)) for name in ("other.tum", "same.tum"))
+    assert len(found["warnings"]) == 1
+    assert text in found["warnings"][0]
+    assert found["closures"] | {"criterion": None} == same["closures"] | {"criterion": None}
+    assert found["ate_after"]["rmse_m"] == pytest.approx(same["ate_after"]["rmse_m"], rel=1e-3)
 
 
 def test_the_right_truth_needs_no_word(finished: Path, drive: Demo) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from vplog.data import Bools, Floats, Ints, Trajectory
 from vplog.evaluate.pairs import bracketing, poses_at
 from vplog.geometry import se3
+from vplog.geometry.pose_conventions import AS_GIVEN, POSE_CONVENTIONS
 
 _OTHER_MOTION = 1.0 / 3.0
 """Disagreement with the odometry from which the truth may not be this drive's: the right one of a drive whose odometry
@@ -21,7 +22,14 @@ _ALIKE_NS, _ALIKE_M = 30 * 10**9, 0.1
 """Longest time of the motions that tell that, over which the odometry hardly drifts; and their least mean length: of
 turns on the spot the shifts are noise."""
 _BETTER = 0.5
-"""Another frame must halve the disagreement with the odometry to be taken: chance does not."""
+"""Largest ratio of the disagreements with the odometry at which another frame or convention is chosen: noise does not
+halve it."""
+_MAX_SCALE_ERROR = 0.2
+"""Largest relative error of the length of odometry: uncalibrated wheels and visual odometry have up to a tenth."""
+_ALTERNATES = 0.5
+"""Ratio of the distances between every second pose and between neighbours; half of that of noise."""
+_UNITS_PER_M = {"mm": 1000.0, "cm": 100.0}
+"""Units of length in which trackers write ground truth."""
 _MOTIONS = 400
 """Motions that truth and odometry are compared on; six unknowns are well determined by a tenth of them."""
 _MOTION_SHARE = 20
@@ -76,9 +84,34 @@ class BodyTruth:
     """Median of what its motions of up to `_ALIKE_NS` and those of the odometry differ by, rad and shares of their
     length; 0 where they are shorter than `_ALIKE_M`."""
 
+    convention: str = AS_GIVEN
+    """The key of POSE_CONVENTIONS in which the file has its poses; they are converted."""
+    unit: str = "m"
+    """Unit of length of the file, by the path of the odometry; it is converted to m."""
+    scale: float = 1.0
+    """Length of the path of the ground truth, after conversion to m, per m of the odometry."""
+    as_read: Trajectory | None = None
+    """The poses of the file, converted to world_from_frame in m but still of `frame`; None without odometry."""
+
+    @property
+    def holds_two_trajectories(self) -> bool:
+        """True if poses alternate between two places, as those of two trajectories in one file do.
+
+        The distance between every second pose is twice the distance between neighbours on a smooth path, and as long
+        as that if poses are noise.
+        """
+        positions = self.trajectory.world_from_body[:, :3, 3]
+        second, neighbour = (np.linalg.norm(positions[k:] - positions[:-k], axis=1).sum() for k in (2, 1))
+        return bool(second < _ALTERNATES * neighbour)
+
     @property
     def is_of_other_motion(self) -> bool:
         return self.disagreement > _OTHER_MOTION
+
+    @property
+    def has_other_scale(self) -> bool:
+        """True if the lengths of ground truth and odometry differ by more than odometry is wrong."""
+        return self.scale > 0 and abs(np.log(self.scale)) > np.log1p(_MAX_SCALE_ERROR)
 
     def at(self, stamp_ns: Ints) -> TruthAt:
         """Poses at the stamps.
@@ -109,8 +142,8 @@ class BodyTruth:
 def body_truth(truth: Trajectory, odometry: Trajectory, body_from_camera: Floats | None = None) -> BodyTruth:
     """The truth of a file as poses of the body, by the odometry (odom_from_body) of the drive.
 
-    Its frame is that of the body, or of the camera, or one that is estimated (hand-eye), each only where it halves the
-    disagreement of the motions.
+    Poses in another of POSE_CONVENTIONS, or in mm or cm, are converted. The frame is the body's, the camera's, or
+    estimated (hand-eye). Each of these replaces the default only if it halves the disagreement of the motions.
     """
     rows = np.flatnonzero((truth.stamp_ns >= odometry.stamp_ns[0]) & (truth.stamp_ns <= odometry.stamp_ns[-1]))
     if len(rows) < 3 or len(odometry.stamp_ns) < 2:
@@ -119,7 +152,11 @@ def body_truth(truth: Trajectory, odometry: Trajectory, body_from_camera: Floats
     turned = [se3.angle(se3.between(poses[:1], poses)).max() for poses in (true, moved)]
     if turned[0] < np.radians(0.01) and turned[1] > np.radians(_LEAST_TURN_DEG):
         return BodyTruth(truth, oriented=False)
-    frame, truth_from_body, scale = _frame(true, moved, body_from_camera)
+    convention, frame, truth_from_body, scale = _frame(true, moved, body_from_camera)
+    unit, per_m = _unit(scale)
+    convert, scale = POSE_CONVENTIONS[convention], scale / per_m
+    truth_from_body[:3, 3] /= per_m
+    truth, true = Trajectory(truth.stamp_ns, _in_m(convert(truth.world_from_body), per_m)), _in_m(convert(true), per_m)
     period_ns = max(int(np.median(np.diff(truth.stamp_ns[rows]))), 1)
     a, b = _motions(true, moved, min(max(1, _ALIKE_NS // period_ns), _longest(len(rows))))
     long = np.linalg.norm(a[:, :3, 3], axis=1).mean() > _ALIKE_M
@@ -128,7 +165,10 @@ def body_truth(truth: Trajectory, odometry: Trajectory, body_from_camera: Floats
     poses[:, :3, 3] *= scale if scale > 0 else 1.0
     odometry = Trajectory(odometry.stamp_ns, poses)
     poses = truth.world_from_body @ truth_from_body
-    found = BodyTruth(Trajectory(truth.stamp_ns, poses), odometry, frame, disagreement=apart)
+    found = BodyTruth(
+        Trajectory(truth.stamp_ns, poses), odometry, frame, disagreement=apart, convention=convention, unit=unit,
+        scale=scale, as_read=truth,
+    )  # fmt: skip
     frames = [truth_from_body, np.eye(4)] + ([] if body_from_camera is None else [se3.inverse(body_from_camera)])
     return replace(found, noise=_noise(found.trajectory, odometry), offset_s=_offset_s(truth, odometry, frames))
 
@@ -192,19 +232,40 @@ def _motions(true: Floats, moved: Floats, step: int) -> tuple[Floats, Floats]:
     return se3.between(true[first], true[first + step]), se3.between(moved[first], moved[first + step])
 
 
-def _frame(true: Floats, moved: Floats, body_from_camera: Floats | None) -> tuple[str, Floats, float]:
-    """Frame of the truth's poses (T, 4, 4), by those of the odometry: a name, truth_from_body (4, 4), and the true
-    metres of one of the odometry's, which has no metres of its own where a single camera made it."""
-    a, b = _motions(true, moved, _longest(len(true)))
-    weight, frames = _weights(a), [("body", np.eye(4)), ("estimated", _hand_eye(a, b, _weights(b)))]
+def _frame(true: Floats, moved: Floats, body_from_camera: Floats | None) -> tuple[str, str, Floats, float]:
+    """Return how the poses of the truth (T, 4, 4) are to be read, by those of the odometry.
+
+    That is the key of POSE_CONVENTIONS, the name of the frame, truth_from_body (4, 4), and the length in the truth per
+    m of the odometry, which is arbitrary for monocular odometry. Estimated frames come last, because their six unknowns
+    fit more: in the plane they explain another convention, too.
+    """
+    step, mounts = _longest(len(true)), {"body": np.eye(4)}
     if body_from_camera is not None:
-        frames.insert(1, ("camera", se3.inverse(body_from_camera)))
-    best, least = ("body", np.eye(4), 1.0), np.inf
-    for name, truth_from_body in frames:
-        apart, scale = _disagreement(a, b, truth_from_body, weight)
-        if apart < least:
-            best, least = (name, truth_from_body, scale), _BETTER * apart
+        mounts["camera"] = se3.inverse(body_from_camera)
+    motions = {name: _motions(convert(true), moved, step) for name, convert in POSE_CONVENTIONS.items()}
+    tried = [(name, frame, mounts[frame]) for name in motions for frame in mounts]
+    tried += [(name, "estimated", _hand_eye(a, b, _weights(b))) for name, (a, b) in motions.items()]
+    best, least = (AS_GIVEN, "body", np.eye(4), 1.0), np.inf
+    for convention, frame, truth_from_body in tried:
+        a, b = motions[convention]
+        apart, scale = _disagreement(a, b, truth_from_body, _weights(a))
+        if apart < least and (convention == AS_GIVEN or apart < _OTHER_MOTION):
+            best, least = (convention, frame, truth_from_body, scale), _BETTER * apart
     return best
+
+
+def _unit(scale: float) -> tuple[str, float]:
+    """Return the unit of the truth and its number per m, if lengths in the truth are `scale` times the odometry's."""
+    for unit, per_m in _UNITS_PER_M.items():
+        if scale > 0 and abs(np.log(scale / per_m)) < np.log1p(_MAX_SCALE_ERROR):
+            return unit, per_m
+    return "m", 1.0
+
+
+def _in_m(poses: Floats, per_m: float) -> Floats:
+    poses = poses.copy()
+    poses[:, :3, 3] /= per_m
+    return poses
 
 
 def _weights(motions: Floats) -> Floats:

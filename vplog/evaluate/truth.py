@@ -12,6 +12,7 @@ from vplog.data import Floats, Gps, Ints, Trajectory
 from vplog.errors import TruthError, nearest
 from vplog.evaluate.trajectory import Ate, Matched, ate_together
 from vplog.geometry import geodesy, se3
+from vplog.geometry.pose_conventions import AS_GIVEN
 from vplog.geometry.tum import read_tum
 from vplog.storage.remote_path import located
 from vplog.storage.urls import shown
@@ -85,8 +86,34 @@ def truth_warnings(found: dict[str, Any]) -> list[str]:
             "The run has no metres of its own: Sim(3) alignment finds them, and all lengths and figures are multiplied "
             f"by {found['scale']:.4g}."
         )
+    if truth["two_trajectories"]:
+        return [
+            *warnings,
+            "The poses of the truth alternate between two places, so the file holds two trajectories and no figure "
+            "means anything. Give a file with one trajectory.",
+        ]
+    if truth["convention"] != AS_GIVEN:
+        warnings.append(
+            f"The poses of the truth are {truth['convention']}. They were converted to world_from_body with "
+            "quaternions x y z w, because only then do they move as the odometry does. Convert the file to "
+            "silence this warning."
+        )
+    if truth["unit"] != "m":
+        warnings.append(
+            f"The truth is in {truth['unit']}, because its path is that much longer than the odometry's. It was "
+            "converted to m. Convert the file to silence this warning."
+        )
+    if truth["length_scale"] is not None:
+        warnings.append(
+            f"The path of the truth is {truth['length_scale']:.3g} times as long as the odometry's, so closures with "
+            "correct lengths are judged false. Check the scale of the truth, and the wheel radius or baseline."
+        )
     if truth["frame"] != "body":
-        what = "the camera" if truth["frame"] == "camera" else "another point of the body, found by the odometry"
+        what = (
+            "the camera"
+            if truth["frame"] == "camera"
+            else "another point or other axes of the body, found by the odometry"
+        )
         warnings.append(f"The truth is that of {what}: closures and drift are the body's, ATE and RPE are not.")
     if truth["offset_s"] is not None:
         warnings.append(

@@ -202,6 +202,7 @@ def evaluate_poses(
         world_from_body = se3.stretched(solved, scale, mount)
     cameras = _cameras(folder)
     of_body = body_truth(known, before, next(iter(cameras), None))
+    known = of_body.as_read or known
     score, judged = closures.score_closures(keyframes, ledger, of_body, stops, options, cameras)
     found = {
         "truth": shown(truth),
@@ -213,6 +214,10 @@ def evaluate_poses(
             "odometry": (record.get("topics") or {}).get("odometry") == "truth",
             "disagreement": round(of_body.disagreement, 3),
             "other_motion": of_body.is_of_other_motion,
+            "two_trajectories": of_body.holds_two_trajectories,
+            "convention": of_body.convention,
+            "unit": of_body.unit,
+            "length_scale": round(of_body.scale, 4) if of_body.has_other_scale else None,
         },
         **_trajectories(before, after, known, of_body, options),
         "closures": asdict(score),
