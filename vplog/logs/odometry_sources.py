@@ -14,7 +14,7 @@ import numpy as np
 
 from vplog.data import Floats, Gps, Ints, Odometry, OdometrySource, Trajectory
 from vplog.errors import plural
-from vplog.geometry import se3
+from vplog.geometry.pose_conventions import AS_GIVEN, POSE_CONVENTIONS
 from vplog.logs.continuity import find_jumps
 from vplog.logs.dead_reckoning import dead_reckoned, gyro_agrees, odometry_of_fixes, turned_by_gyro
 from vplog.logs.formats.container import Channel, Contents, Notes
@@ -68,7 +68,7 @@ _ASKEW = 0.2
 """That part from which steps do not lie along one axis of the body."""
 _SPARSE, _STILL, _PLACED = "poses a second that differ", "never moves", "is placed in"
 _TURNS, _FORTH = "turns, but never moves", "goes back and forth"
-_W_FIRST = "does not point where it goes"
+_OTHER_CONVENTION = "points where it goes only if its poses are read as those"
 _STEP_M, _TIMES, _EXCESS_M = 0.2, 3.0, 10.0
 """m of a step that is more than noise; and how many times, and m, the path of these is longer than that over poses a
 second apart where two nodes publish what has drifted apart."""
@@ -82,7 +82,7 @@ _LEAST_FACTOR = 0.01
 """Least factor: nothing measured makes a source impossible where it is the only one."""
 _DOUBTS = {
     _STILL: "did its estimator run?", _TURNS: "did its estimator run?", _PLACED: "is it a part of the robot?",
-    _W_FIRST: "are its quaternions in the order w x y z?", _FORTH: "do two nodes publish it?",
+    _OTHER_CONVENTION: "are they written so?", _FORTH: "do two nodes publish it?",
     _HEADLESS: "is it a receiver's, which does not know where the body heads?",
 }  # fmt: skip
 """Question to the user where the evidence against the source that is taken begins so."""
@@ -118,8 +118,8 @@ def score_source(
     long = np.flatnonzero(step_m > _STEP_M)
     if float(step_m[long].sum()) > max(_TIMES * apart_m, apart_m + _EXCESS_M) and _returns(poses[:, :3, 3], long):
         evidence[_FORTH] = _LEAST_FACTOR
-    if source_kind in ("poses", "tf") and path_m > _LEAST_PATH_M and _has_w_first(poses):
-        evidence[_W_FIRST] = 0.1
+    if source_kind in ("poses", "tf") and path_m > _LEAST_PATH_M and (convention := _convention(poses)) != AS_GIVEN:
+        evidence[f"{_OTHER_CONVENTION} {convention}"] = 0.1
     if source_kind not in ("gps", "truth") and path_m > _LEAST_PATH_M and _is_headless(poses, source_kind == "twist"):
         evidence[_HEADLESS] = _LEAST_FACTOR
     if jumps:
@@ -151,13 +151,22 @@ def _returns(position: Floats, steps: Ints) -> bool:
     return bool(len(steps)) and bool(np.median(back / length) < _NEAR)
 
 
-def _has_w_first(poses: Floats) -> bool:
-    """Whether the path bends and the body does not point along it, but does with quaternions read as w x y z."""
-    steps = np.diff(poses[:, :3, 3], axis=0)[:, None]
-    logged = poses[:-1, :3, :3]
-    other = se3.rotation(np.roll(se3.quaternion(logged), -1, axis=1))
-    along = _bend(steps[:, 0]), _bend((steps @ logged)[:, 0]), _bend((steps @ other)[:, 0])
-    return along[0] > _BENT and along[1] > _ASKEW and along[2] < _BENT
+def _convention(poses: Floats) -> str:
+    """Return the key of POSE_CONVENTIONS in which poses (T, 4, 4) move along one axis of the body on a path that bends.
+
+    Only conventions of the quaternions are tried, because without another sensor one cannot tell which path is right.
+    Return AS_GIVEN if they do so as given, if they do so in no convention, or if the path hardly bends.
+    """
+    steps = np.diff(poses[:, :3, 3], axis=0)
+    reads = {name: convert(poses) for name, convert in POSE_CONVENTIONS.items()}
+    bends = {
+        name: _bend((steps[:, None] @ read[:-1, :3, :3])[:, 0])
+        for name, read in reads.items()
+        if np.array_equal(read[:, :3, 3], poses[:, :3, 3])
+    }
+    best = min(bends, key=lambda name: bends[name])
+    differs = _bend(steps) > _BENT and bends[AS_GIVEN] > _ASKEW and bends[best] < _BENT
+    return best if differs else AS_GIVEN
 
 
 def _bend(steps: Floats) -> float:
