@@ -93,7 +93,7 @@ def damaged(rng: random.Random, path: Path, kind: str) -> bytes:
 
 def read(folder: Path) -> dict[str, Any]:
     """Return what this version reads of each file: digests of messages, and losses."""
-    result = {}
+    result = dict[str, Any]()
     for name in json.loads((folder / "truth.json").read_text()):
         began, notes, found = time.process_time(), Notes(), Counter[str]()
         try:
