@@ -21,7 +21,7 @@ _PRIOR = np.array([1.0, *[1.0] * 3, 3.0, 0.3, *[0.5] * 3])
 """Standard deviations before the drive is seen: time offset in s, rotation of the mount in rad (3), logs of the ratios
 of lengths and of turns, and the lever arm in m (3)."""
 _DETERMINED = 0.5
-"""Share of the prior's standard deviation below which a quantity is determined."""
+"""A quantity is determined if its standard deviation is below this share of the prior's."""
 _LEAST_NOISE = np.array([1e-3, 1e-2])
 """Smallest noise of motions: rad, and the share of a length. A few motions that agree would give less."""
 _FEWEST = 8
@@ -30,7 +30,7 @@ _MOST_S, _MOST_SHARE, _STEPS = 2.0, 0.1, 40
 """Largest time offset that is looked for, in s and as a share of the track's time, and the steps of that search on
 either side: a step of 0.05 s is a tenth of a quick turn."""
 _ROUNDS = 3
-"""Estimates of the motions and of their noise in turn."""
+"""Number of fits. Each takes its noise from the errors of the one before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +89,7 @@ def compare_motions(track: Trajectory, motions: Motions, body_from_sensor: Float
     if inside.sum() < _FEWEST:
         return None
     fit = _Fit(track, motions.rows(inside), body_from_sensor, most_ns / 1e9)
-    best = min((fit.solved(start) for start in fit.starts()), key=lambda one: one[0])
-    _, values, covariance = best
+    _, values, covariance = min((fit.solved(start) for start in fit.starts()), key=lambda one: one[0])
     sigma = np.sqrt(np.diagonal(covariance))
     sigma = np.where(sigma < _DETERMINED * _PRIOR, sigma, np.inf)
     turned = float(np.linalg.norm(values[1:4]))
@@ -103,7 +102,7 @@ def compare_motions(track: Trajectory, motions: Motions, body_from_sensor: Float
 
 
 class _Fit:
-    """The least-squares problem; its unknowns (9,) are in the order of `_PRIOR`, less those that are given."""
+    """The least-squares problem. Its unknowns (9,) are in the order of `_PRIOR`, and 0 at the given values."""
 
     def __init__(self, track: Trajectory, motions: Motions, body_from_sensor: Floats, most_s: float) -> None:
         self._track, self._motions, self._given, self._most_s = track, motions, body_from_sensor, most_s
@@ -116,7 +115,7 @@ class _Fit:
         return self._given @ se3.pose(se3.so3_exp(values[1:4]), values[6:9])
 
     def of_body(self, offset_s: float) -> Floats:
-        """(M, 4, 4) motions of the track over the times of the sensor's."""
+        """Motions of the track (M, 4, 4) between the sensor's stamps plus an offset."""
         offset_ns = round(float(np.clip(offset_s, -self._most_s, self._most_s)) * 1e9)
         stamps, poses = self._track.stamp_ns, self._track.world_from_body
         ends = (self._motions.first_ns, self._motions.last_ns)
@@ -132,7 +131,7 @@ class _Fit:
         return np.concatenate([turned, np.where(self._motions.metric[:, None], shifted, 0.0)], axis=1)
 
     def starts(self) -> list[Floats]:
-        """The best time offset with the given mount, and that with the mount that the axes of the turns imply."""
+        """Return two starts: the best time offset with the given mount, and with the mount that the turns imply."""
         offsets, found = np.linspace(-self._most_s, self._most_s, 2 * _STEPS + 1).tolist(), []
         bodies = [self.of_body(offset) for offset in offsets]
         for aligned in (False, True):
@@ -147,14 +146,12 @@ class _Fit:
         return found
 
     def _log_lengths(self, body: Floats) -> float:
-        """Log of the median ratio of the sensor's lengths and those of motions (M, 4, 4) of the body."""
+        """Log of the ratio between the median lengths of the sensor's motions and of the body's (M, 4, 4)."""
         metric = self._motions.metric
+        if not metric.any():
+            return 0.0
         sensor, track = (np.linalg.norm(one[metric, :3, 3], axis=1) for one in (self._motions.first_from_last, body))
-        return (
-            float(np.log(np.maximum(np.median(sensor), 1e-9) / np.maximum(np.median(track), 1e-9)))
-            if metric.any()
-            else 0.0
-        )
+        return float(np.log(max(np.median(sensor), 1e-9) / max(np.median(track), 1e-9)))
 
     def solved(self, values: Floats) -> tuple[float, Floats, Floats]:
         """Cost, unknowns (9,) and their covariance (9, 9) of the robust fit from a start."""

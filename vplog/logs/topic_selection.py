@@ -102,7 +102,7 @@ class TopicChoice(Settings):
     """m; for wheel speeds in sensor_msgs/JointState."""
     camera_height_m: float | None = Field(default=None, gt=0, le=100)
     """m of the camera over flat ground, by which the visual odometry of a single camera has metres."""
-    image_offset_s: float | None = Field(default=None, ge=-1e4, le=1e4)
+    image_offset_s: float | None = Field(default=None, ge=-1e9, le=1e9)
     """s to add to the stamps of all images, for cameras whose clock or driver is late."""
     start_s: float | None = Field(default=None, ge=0, le=1e9)
     """s after the first image, before which images are left out."""
