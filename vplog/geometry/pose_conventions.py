@@ -32,7 +32,7 @@ POSE_CONVENTIONS: dict[str, Callable[[Floats], Floats]] = {
     "with quaternions in the order w x y z": _w_first,
     "in left-handed axes (mirrored)": _mirrored,
 }
-"""Functions that convert poses (..., 4, 4) in each convention to world_from_body (..., 4, 4), by their description.
+"""The function that converts poses (..., 4, 4) to world_from_body, for each convention by its name in warnings.
 
-Other axes of the world or of the body, such as NED or FRD, are not listed because they are rotations of the mount.
+Axes such as NED or FRD need no entry. They are rotations of the world or of the sensor's mount.
 """

@@ -219,7 +219,7 @@ def _quantiles(offset_ns: Floats, starts: Ints, stops: Ints) -> Floats:
 
 
 def _count_log_steps(header_ns: Ints, log_ns: Ints, offset_ns: Floats) -> int:
-    """Return how often the least offset changes by more than a delay while the header's clock goes on."""
+    """Count the steps of the recorder's clock: the offset changes by more than a delay, and the header has no step."""
     header_step_ns, log_step_ns = np.diff(header_ns), np.diff(log_ns.astype(np.float64))
     is_step = (np.abs(header_step_ns) <= MAX_DELAY_NS) & (np.abs(log_step_ns - header_step_ns) > MAX_DELAY_NS)
     least_ns = np.minimum.reduceat(offset_ns, np.append(0, np.flatnonzero(is_step) + 1))

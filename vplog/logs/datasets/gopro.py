@@ -29,7 +29,7 @@ _FRAME = "gopro"
 
 
 class Samples(NamedTuple):
-    """Measurements of one kind in one packet."""
+    """Consecutive measurements of one sensor, from one packet of the metadata track."""
 
     key: str
     """`GPS5`, `GYRO` or `ACCL`."""

@@ -151,12 +151,12 @@ class McapFile:
         return data
 
     def _add_damaged_chunk(self, number: int, error: BadChunkError) -> None:
-        """Remember why a chunk is left out, and its schemas and channels, which other chunks need."""
+        """Record why a damaged chunk is left out. Its schemas and channels are kept, since other chunks refer to them."""
         self._reader(number, len(error.data), doubtful=True).read(error.data)
         self._unread[number] = f", left out: {error}"
 
     def _is_read_in_place(self, number: int) -> bool:
-        """Return whether a chunk's messages can be found in the file without reading all of it."""
+        """Return whether single messages can be read from the file: the chunk is local, uncompressed and sound."""
         chunk = self._layout.chunks[number]
         if not self._local or not _is_plain(chunk) or chunk.cut:
             return False

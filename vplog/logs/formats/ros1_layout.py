@@ -59,7 +59,7 @@ class _LayoutReader:
         self._infos: dict[int, Chunk] = {}
         """By offset of its record: chunks as the bag's index lists them."""
         self._index_sound = True
-        """Whether the bag's index lists each chunk once, with as many counts as it says."""
+        """True unless the index lists a chunk twice, or has another number of counts for a chunk than it announces."""
         self._indexing: Chunk | None = None
         """The chunk whose index records come by."""
         self._index_at = self._chunk_count = 0
