@@ -151,7 +151,7 @@ class McapFile:
         return data
 
     def _add_damaged_chunk(self, number: int, error: BadChunkError) -> None:
-        """Record why a damaged chunk is left out. Its schemas and channels are kept, since other chunks refer to them."""
+        """Record why a damaged chunk is left out. Its schemas and channels are kept for other chunks."""
         self._reader(number, len(error.data), doubtful=True).read(error.data)
         self._unread[number] = f", left out: {error}"
 
