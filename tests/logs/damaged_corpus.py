@@ -146,7 +146,7 @@ def _sources(folder: Path) -> list[Path]:
         found += [path] if path.is_file() else []
     drive = Drive()
     found += [write_ros1(folder / f"drive_{kind}.bag", ros_messages(drive, 1), kind) for kind in ("", "lz4", "bz2")]
-    return [*found, next(write_ros2(folder / "db3", ros_messages(drive, 2) * 3, "sqlite3").glob("*.db3"))]
+    return [*found, next(write_ros2(folder / "drive_db3", ros_messages(drive, 2) * 3, "sqlite3").glob("*.db3"))]
 
 
 def _messages(path: Path, notes: Notes) -> list[tuple[str, str]]:
