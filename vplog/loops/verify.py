@@ -125,7 +125,7 @@ def calibration_share(drive: Drive, execution: Execution, odometry: Trajectory |
     elif offset.differs(0.0, _WARNED_OFFSET_S):
         warn(
             f"The stamps of camera {camera.name!r} are {abs(offset.value):.2f} s (standard deviation "
-            f"{offset.sigma:.2f} s) {'late' if offset.value < 0 else 'early'} against the odometry. --image-offset-s "
+            f"{offset.sigma:.3f} s) {'late' if offset.value < 0 else 'early'} against the odometry. --image-offset-s "
             f"{offset.value:.2f} corrects them; if you gave an offset, add it."
         )
     elif lengths.differs(1.0, _WARNED_LENGTHS):
